@@ -158,7 +158,8 @@ impl CheckoutService {
         let failed = |error| machine(url, &error);
         let restored = file_restore::prepare(instance.path()).map_err(failed)?;
         let paths = [path.as_bytes(), b"\0"].concat();
-        let call = checkout_command(&repository, revision, &paths, (restored.path(), &restored.path().join("files")));
+        let folders = (restored.path(), &*restored.path().join("files"));
+        let call = checkout_command(&repository, revision, &paths, folders, &[]);
         repository.run(call.map_err(failed)?, |_| ()).await.map_err(|source| git_failed(url, &source))?;
         file_restore::install(restored, instance.project(), path.to_owned()).await.map_err(failed)
     }

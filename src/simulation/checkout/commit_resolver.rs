@@ -202,7 +202,7 @@ impl Search<'_> {
         }
         let name = self.world.repository();
         let names = (&*format!("the history of {name}"), &*format!("The history of {name}"));
-        self.fetch(&history, revision::FETCH_HISTORY.map(str::to_owned).into(), names).await?;
+        self.fetch(&history, revision::fetch_history(), names).await?;
         self.is_reachable(&history, commit).await
     }
 

@@ -7,7 +7,6 @@
 use url::Url;
 
 use super::checkout_error::{CheckoutError, moved};
-use super::git::Call;
 use super::repository::{REMOTE, Repository};
 use crate::shared::domain::{AdmissionRules, Load, ProjectUrl};
 use crate::simulation::config::{Mirrors, Remote};
@@ -38,8 +37,6 @@ pub async fn follow(
 
 /// The `Location` to which a Git host redirects requests for a repository.
 async fn location(repository: &Repository) -> Option<String> {
-    let trace = [("GIT_TRACE_CURL", "1"), ("GIT_TRACE_CURL_NO_DATA", "1")];
-    let environment = trace.map(|(name, value)| (name.into(), value.into())).to_vec();
     let mut location = None;
     let on_line = |line: &str| {
         let header = line.split_once("Recv header: ").and_then(|(_, header)| header.split_once(": "));
@@ -49,9 +46,11 @@ async fn location(repository: &Repository) -> Option<String> {
             location = Some(value.to_owned());
         }
     };
-    let call = repository.call(&["ls-remote", "--quiet", "--", REMOTE, "HEAD"]);
+    let mut call = repository.call(&["ls-remote", "--quiet", "--", REMOTE, "HEAD"]);
+    let trace = ["GIT_TRACE_CURL", "GIT_TRACE_CURL_NO_DATA"];
+    call.spec.environment.extend(trace.map(|name| (name.into(), "1".into())));
     // It fails again, since the forge sends it elsewhere.
-    repository.run(Call { environment, ..call }, on_line).await.ok();
+    repository.run(call, on_line).await.ok();
     location
 }
 

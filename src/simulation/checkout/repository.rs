@@ -6,18 +6,20 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use parking_lot::Mutex;
+use rustix::process::Resource;
 use tokio::sync::{Notify, OwnedMutexGuard, Semaphore, watch};
 
 use super::disk::{blocking, remove_leftovers};
-use super::git::{Call, Git, LITTLE_MEMORY, MAX_MEMORY, stall_timeout};
+use super::git::{Git, LITTLE_MEMORY, stall_timeout};
 use super::git_error::GitError;
 use super::single_flight::{OnProgress, SingleFlight};
 use crate::simulation::config::{Remote, SimulationConfig};
-use crate::simulation::process::remove_tree;
+use crate::simulation::process::{Run, remove_tree};
 
 /// A cached repository. It is not evicted from the cache until this is dropped.
 pub struct Repository {
-    path: PathBuf,
+    /// Its folder.
+    pub path: PathBuf,
     /// The remote. Its URL may have several spellings.
     remote: Mutex<Remote>,
     git: Arc<Git>,
@@ -61,26 +63,20 @@ impl Repository {
     }
 
     /// A git command on this repository.
-    pub fn call(&self, arguments: &[impl AsRef<OsStr>]) -> Call<'_> {
-        let Remote { location, protocol } = self.remote();
-        Call {
-            repository: &self.path,
-            settings: vec![format!("remote.{REMOTE}.url={location}")],
-            arguments: arguments.iter().map(Into::into).collect(),
-            protocol,
-            memory: MAX_MEMORY,
-            file_size: None,
-            time: self.config.timing.checkout,
-            environment: Vec::new(),
-            may_block: false,
-        }
+    pub fn call(&self, arguments: &[impl AsRef<OsStr>]) -> Run {
+        self.configured(&[format!("remote.{REMOTE}.url={}", self.remote().location)], arguments)
+    }
+
+    /// A git command on this repository that does not ask the remote, with these settings, each as `name=value`.
+    pub fn configured(&self, settings: &[String], arguments: &[impl AsRef<OsStr>]) -> Run {
+        self.git.command((&self.path, self.remote().protocol), settings, arguments)
     }
 
     /// Runs a command to its end. Returns its answer. `on_line` receives each line of standard error.
     ///
     /// # Errors
     /// When git fails.
-    pub async fn run(&self, call: Call<'_>, on_line: impl FnMut(&str)) -> Result<Vec<u8>, GitError> {
+    pub async fn run(&self, call: Run, on_line: impl FnMut(&str)) -> Result<Vec<u8>, GitError> {
         self.git.run(call, on_line).await
     }
 
@@ -89,9 +85,11 @@ impl Repository {
     /// # Errors
     /// When git fails.
     pub async fn read(&self, arguments: &[impl AsRef<OsStr>]) -> Result<Vec<u8>, GitError> {
+        let mut call = self.call(arguments);
         // Missing objects must not be fetched, as git would do in a history.
-        let environment = vec![("GIT_NO_LAZY_FETCH".into(), "1".into())];
-        self.run(Call { protocol: "none", environment, ..self.call(arguments) }, |_| ()).await
+        let none = [("GIT_ALLOW_PROTOCOL", "none"), ("GIT_NO_LAZY_FETCH", "1")];
+        call.spec.environment.extend(none.map(|(name, value)| (name.into(), value.into())));
+        self.run(call, |_| ()).await
     }
 
     /// Joins an identical fetch in progress, or starts one. Cancelled when the last waiter drops. `progress` receives
@@ -117,7 +115,10 @@ impl Repository {
                 sender.send_replace(line.trim_start_matches("remote: ").to_owned());
             }
         };
-        self.run(Call { file_size: Some(self.config.project_size << 20), ..self.call(arguments) }, on_line).await?;
+        let mut call = self.call(arguments);
+        // A larger write ends git with SIGXFSZ, which must not leave a core dump.
+        call.limits.extend([(Resource::Core, 0), (Resource::Fsize, self.config.project_size << 20)]);
+        self.run(call, on_line).await?;
         self.collect_garbage(guard);
         Ok(())
     }
@@ -129,7 +130,9 @@ impl Repository {
     pub async fn ask(&self, arguments: &[impl AsRef<OsStr>]) -> Result<String, GitError> {
         // It is never closed.
         let _permit = self.queries.acquire().await.ok();
-        let answer = self.run(Call { memory: LITTLE_MEMORY, ..self.call(arguments) }, |_| ()).await?;
+        let mut call = self.call(arguments);
+        call.limits.push((Resource::Data, LITTLE_MEMORY));
+        let answer = self.run(call, |_| ()).await?;
         Ok(String::from_utf8_lossy(&answer).into_owned())
     }
 
@@ -162,7 +165,7 @@ impl Repository {
         let this = Arc::clone(self);
         tokio::spawn(async move {
             let _guard = guard;
-            let call = Call { time: stall_timeout(&this.config), ..this.call(&["gc", "--auto", "--quiet"]) };
+            let call = Run { time: stall_timeout(&this.config), ..this.call(&["gc", "--auto", "--quiet"]) };
             if let Err(error) = this.run(call, |_| ()).await {
                 log::warn!("{} can't be packed: {error}", this.path.display());
             }

@@ -46,7 +46,7 @@ impl RepositoryCache {
     /// # Errors
     /// When its directory can't be created.
     pub fn open(dir: CacheDir, git: Arc<Git>, config: Arc<SimulationConfig>) -> io::Result<Self> {
-        let folder = dir.path().join("git");
+        let folder = dir.folder.join("git");
         std::fs::create_dir_all(&folder)?;
         Ok(Self { folder, git, config, in_use: Mutex::default(), growth: Arc::default(), _dir: dir })
     }

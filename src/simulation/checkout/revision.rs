@@ -31,20 +31,6 @@ pub enum TrustSource {
 /// Asks the remote for all branches and tags.
 pub const LIST_TIPS: [&str; 6] = ["ls-remote", "--quiet", "--heads", "--tags", "--", REMOTE];
 
-/// Fetches all branches and tags: only their commits where the remote can do that, else everything.
-pub const FETCH_HISTORY: [&str; 10] = [
-    "fetch",
-    "--filter=tree:0",
-    "--prune",
-    "--no-tags",
-    "--no-write-fetch-head",
-    "--progress",
-    "--",
-    REMOTE,
-    "+refs/heads/*:refs/heads/*",
-    "+refs/tags/*:refs/tags/*",
-];
-
 /// The commit that a URL names by its full hash: then nobody need be asked what it is. `allow_any` tells whether any will
 /// do, or only one that is in a branch or tag.
 pub fn commit_of(world: &ProjectUrl, allow_any: bool) -> Option<Revision> {
@@ -58,11 +44,20 @@ fn is_hash(text: &str) -> bool {
     text.len() == 40 && text.bytes().all(|byte| byte.is_ascii_hexdigit())
 }
 
-/// Whether a commit is the newest of a branch or tag in such an answer.
+/// Whether a commit is the newest of a branch or tag in the answer to [`LIST_TIPS`].
 pub fn is_tip(answer: &str, commit: &str) -> bool {
-    let tips = answer.lines().filter_map(|line| line.split_once('\t'));
-    let accepted = |name: &str| name.starts_with("refs/heads/") || name.starts_with("refs/tags/");
-    tips.filter(|(_, name)| accepted(name)).any(|(tip, _)| tip == commit)
+    answer.lines().filter_map(|line| line.split_once('\t')).any(|(tip, _)| tip == commit)
+}
+
+/// Fetches all branches and tags: only their commits where the remote can do that, else everything.
+pub fn fetch_history() -> Vec<String> {
+    fetch(&["--filter=tree:0", "--prune"], &["+refs/heads/*:refs/heads/*", "+refs/tags/*:refs/tags/*"])
+}
+
+/// Fetches these references with these options.
+fn fetch(options: &[&str], references: &[&str]) -> Vec<String> {
+    let common = ["--no-tags", "--no-write-fetch-head", "--progress", "--", REMOTE];
+    [&["fetch"], options, &common, references].concat().into_iter().map(str::to_owned).collect()
 }
 
 /// Asks the remote for all branches and tags that a URL may mean.
@@ -110,9 +105,7 @@ impl Revision {
 
     /// Fetches this commit alone.
     pub fn fetch_arguments(&self) -> Vec<String> {
-        let refspec = format!("+{}:{}", self.commit, self.reference());
-        let options = ["fetch", "--depth=1", "--no-tags", "--no-write-fetch-head", "--progress", "--", REMOTE];
-        options.map(str::to_owned).into_iter().chain([refspec]).collect()
+        fetch(&["--depth=1"], &[&format!("+{}:{}", self.commit, self.reference())])
     }
 
     /// Asks for an entry of the repository, and for all that is directly in the folders above the project's.

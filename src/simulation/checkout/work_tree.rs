@@ -1,46 +1,46 @@
 //! A client's own copy of a project: its checkout by git.
 
-use std::ffi::OsString;
+use std::ffi::{OsStr, OsString};
 use std::io;
 use std::path::Path;
 use std::sync::Arc;
 
+use rustix::process::Resource;
+
 use super::checkout_error::{CheckoutError, git_failed, machine, refused, too_large};
 use super::commit_resolver::ResolvedCommit;
 use super::disk;
-use super::git::{Call, LITTLE_MEMORY};
+use super::git::LITTLE_MEMORY;
 use super::lfs;
 use super::project::Project;
 use super::repository::Repository;
 use super::revision::Revision;
 use super::world_file::WorldFile;
 use crate::shared::domain::ProjectUrl;
-use crate::simulation::process::InstanceDir;
+use crate::simulation::process::{InstanceDir, Run};
 
-/// A git command that writes these paths of a commit, each ended by a zero byte, into a directory. Its scratch files
-/// are in `scratch`.
+/// A git command that writes these paths of a commit, each ended by a zero byte, into a directory, with these settings, each
+/// as `name=value`. Its scratch files are in `scratch`.
 ///
 /// # Errors
 /// When the list of paths can't be written.
-pub fn checkout_command<'call>(
-    repository: &'call Repository,
+pub fn checkout_command(
+    repository: &Repository,
     revision: &Revision,
     paths: &[u8],
     (scratch, into): (&Path, &Path),
-) -> io::Result<Call<'call>> {
-    let list = scratch.join("paths");
+    settings: &[String],
+) -> io::Result<Run> {
+    let (list, reference) = (scratch.join("paths"), OsString::from(revision.reference()));
     std::fs::write(&list, paths)?;
-    let with = |option: &str, path: &Path| {
-        let mut argument = OsString::from(option);
-        argument.push(path);
-        argument
-    };
+    let with = |option: &str, path: &Path| [OsStr::new(option), path.as_os_str()].join(OsStr::new(""));
     let mut arguments = vec![with("--work-tree=", into)];
     arguments.extend(["checkout", "--force", "--progress", "--pathspec-file-nul"].map(OsString::from));
-    arguments.extend([with("--pathspec-from-file=", &list), revision.reference().into()]);
-    let mut call = Call { memory: LITTLE_MEMORY, ..repository.call(&arguments) };
-    call.environment.push(("GIT_INDEX_FILE".into(), scratch.join("index").into()));
-    call.environment.push(("GIT_ATTR_SOURCE".into(), revision.reference().into()));
+    arguments.extend([with("--pathspec-from-file=", &list), reference.clone()]);
+    let mut call = repository.configured(settings, &arguments);
+    call.limits.push((Resource::Data, LITTLE_MEMORY));
+    let index = scratch.join("index").into_os_string();
+    call.spec.environment.extend([("GIT_INDEX_FILE".into(), index), ("GIT_ATTR_SOURCE".into(), reference)]);
     Ok(call)
 }
 
@@ -60,15 +60,15 @@ pub async fn write(
     let folder = if revision.folder.is_empty() { "." } else { &revision.folder };
     let paths = [folder.as_bytes(), b"\0", above].concat();
     let (root, most) = (instance.project(), limit << 20);
-    let call = checkout_command(repository, revision, &paths, (instance.path(), &root));
+    let settings = if has_lfs { lfs::settings(&repository.remote()) } else { Vec::new() };
+    let call = checkout_command(repository, revision, &paths, (instance.path(), &root), &settings);
     let mut call = call.map_err(|error| machine(world, &error))?;
     call.may_block = true;
     // git-lfs stores its downloads here, shared with concurrent checkouts, and copies them into the project.
-    let kept = call.repository.join("lfs");
+    let kept = repository.path.join("lfs");
     let before = if has_lfs { disk::room_of(&kept) } else { 0 };
     let mut growing = vec![(root.clone(), most)];
     if has_lfs {
-        call.settings = lfs::settings(&repository.remote());
         growing.push((kept.clone(), before.saturating_add(most.saturating_mul(2))));
     }
     let written = tokio::select! {
