@@ -48,7 +48,7 @@ fn main() -> ExitCode {
         return ExitCode::SUCCESS;
     }
     if let Some(Part::Guard(arguments)) = &arguments.part {
-        let sweep = |owner: &String| container::sweep_all(&container::ResourceOwner::named(owner));
+        let sweep = |owner: &String| container::sweep_all(&container::ResourceOwner(owner.clone()));
         let remove = || arguments.containers.iter().for_each(sweep);
         return ExitCode::from(guardian::guard(arguments, remove));
     }

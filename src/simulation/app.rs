@@ -21,7 +21,7 @@ use crate::shared::http::{BasicAuth, ConnectionLimiter, LiveUpdates, Metrics, ST
 use crate::shared::run::{
     AppError, Phase, ServerCommand, Signals, limit_clients, permanent, raise_open_files, service_manager, start,
 };
-use crate::simulation::checkout::{CacheDir, CheckoutLimits, CheckoutService};
+use crate::simulation::checkout::{CacheDir, CheckoutService};
 use crate::simulation::client::quota;
 use crate::simulation::container::ContainerService;
 use crate::simulation::isolation::{Launcher, Watcher};
@@ -98,7 +98,7 @@ fn bound_clients(config: &SimulationConfig) -> Result<usize, String> {
 /// When an actor that must live has stopped, or the system refuses what the server needs.
 pub async fn serve(assembly: Application) -> Result<(), AppError> {
     let Application { server, socket, mut signals, phase: phase_sender, mut commands } = assembly;
-    let owner = server.containers.as_ref().map(|containers| containers.run.name());
+    let owner = server.containers.as_ref().map(|containers| containers.run.0.as_str());
     let _guardian = Guardian::start(server.run.path(), owner)?;
     let shared = web::Data::from(Arc::clone(&server));
     let options = HttpServerOptions {
@@ -198,7 +198,8 @@ fn assemble(
         docker: config.docker,
         share_idle_time: config.share_idle_time,
     };
-    let checkouts = open_checkouts(&config, cache_dir, &run, &rules).map_err(cache_fault)?;
+    let checkouts = CheckoutService::open(cache_dir, run.path(), Arc::clone(&config), rules.clone());
+    let checkouts = checkouts.map_err(cache_fault)?;
     let metrics = Metrics::default();
     let logs = config.log_dir.0.join("simulation");
     let ends = Ends::start(logs, launcher.level().to_string(), &metrics);
@@ -260,21 +261,6 @@ fn open_containers(config: &Arc<SimulationConfig>, run: &RunDir) -> Result<Optio
     }
     let unavailable = |why| format!("isolation is \"container\", but {why}");
     Ok(Some(Arc::new(ContainerService::open(Arc::clone(config), run.path()).map_err(unavailable)?)))
-}
-
-/// Opens the cache of repositories with the limits of the configuration.
-fn open_checkouts(
-    config: &SimulationConfig,
-    cache_dir: CacheDir,
-    run: &RunDir,
-    rules: &AdmissionRules,
-) -> std::io::Result<CheckoutService> {
-    let (time, size) = (config.timing.checkout, config.project_size << 20);
-    let limits = CheckoutLimits { time, size, any_commit: config.any_commit };
-    let (budget, mirrors) = (config.cache_size << 20, config.git_mirrors.clone());
-    let git = (mirrors, config.git_config.as_ref().map(|file| file.0.as_path()));
-    let runtime = tokio::runtime::Handle::current();
-    CheckoutService::open(cache_dir, run.path(), budget, git, rules.clone(), limits, runtime)
 }
 
 /// Waits until the server is draining and has no simulation left.

@@ -44,7 +44,7 @@ async fn a_projects_own_dockerfile_is_built_once_for_all_who_want_it_and_what_it
     }
     let images = ask(&["image", "ls", "--format", "{{.Repository}}:{{.Tag}}"]);
     let owner = webots_fleet::simulation::container::ResourceOwner::of(&server.cache());
-    let mine = |name: &&str| name.starts_with(&format!("webots-fleet/{}:", owner.name()));
+    let mine = |name: &&str| name.starts_with(&format!("webots-fleet/{}:", owner.0));
     assert_eq!(images.lines().filter(mine).count(), 1, "{images}");
     for container in of_service(&server, "webots") {
         let built = ask(&["exec", &container, "cat", "/usr/local/webots-project/controllers/c/built"]);
@@ -173,7 +173,7 @@ async fn images_of_ours_that_are_old_are_removed_and_no_others() {
     let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
     std::fs::create_dir(folder.path().join("cache")).unwrap();
     let owner = webots_fleet::simulation::container::ResourceOwner::of(&folder.path().join("cache"));
-    let names = [("old", owner.name()), ("others", "000000000000"), ("running", owner.name())];
+    let names = [("old", owner.0.as_str()), ("others", "000000000000"), ("running", owner.0.as_str())];
     for (tag, owner) in names {
         load(folder.path(), &format!("webots-fleet.test/{tag}:1"), owner, "2020-01-01T00:00:00Z");
     }
@@ -188,7 +188,7 @@ async fn images_of_ours_that_are_old_are_removed_and_no_others() {
     client.leave().await;
     until("the old one is gone", async || !is_there("old")).await;
     assert!(is_there("others") && is_there("running"));
-    assert_eq!(ask(&["image", "ls", "--quiet", &format!("webots-fleet/{}", owner.name())]).lines().count(), 1);
+    assert_eq!(ask(&["image", "ls", "--quiet", &format!("webots-fleet/{}", owner.0)]).lines().count(), 1);
     ask(&["rm", &running]);
 }
 
@@ -198,12 +198,12 @@ async fn a_full_disk_is_freed_of_images_that_no_container_uses() {
     let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
     std::fs::create_dir(folder.path().join("cache")).unwrap();
     let owner = webots_fleet::simulation::container::ResourceOwner::of(&folder.path().join("cache"));
-    let names = [("unused", owner.name()), ("of-others", "000000000000"), ("used", owner.name())];
+    let names = [("unused", owner.0.as_str()), ("of-others", "000000000000"), ("used", owner.0.as_str())];
     let hours = |count: i64| format!("-{count} hours");
     for (tag, owner) in names {
         load(folder.path(), &format!("webots-fleet.test/{tag}:1"), owner, &created(&hours(2)));
     }
-    load(folder.path(), "webots-fleet.test/new:1", owner.name(), &created(&hours(0)));
+    load(folder.path(), "webots-fleet.test/new:1", owner.0.as_str(), &created(&hours(0)));
     let label = "com.docker.compose.project=webots-fleet.test";
     let used = ask(&["create", "--label", label, "--network", "none", "webots-fleet.test/used:1", "true"]);
     let is_there = |tag: &str| !ask(&["image", "ls", "--quiet", &format!("webots-fleet.test/{tag}:1")]).is_empty();

@@ -237,18 +237,21 @@ pub fn check(server: &crate::support::program::Server) -> String {
     format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
 }
 
-/// The containers of a server, those that have ended among them: the names of their projects.
+/// The containers of a server, those that have ended among them.
 pub fn containers(server: &crate::support::program::Server) -> Vec<String> {
-    let format = "{{.Label \"com.docker.compose.project\"}}";
-    let prefix = prefix(server);
-    let all = ask(&["ps", "--all", "--filter", "label=com.docker.compose.project", "--format", format]);
-    all.lines().filter(|name| name.starts_with(&prefix)).map(str::to_owned).collect()
+    containers_of(&prefix(server))
+}
+
+/// The containers whose names or projects begin like this: their names and projects.
+pub fn containers_of(prefix: &str) -> Vec<String> {
+    let all = ask(&["ps", "--all", "--format", "{{.Names}} {{.Label \"com.docker.compose.project\"}}"]);
+    all.lines().filter(|line| line.split(' ').any(|name| name.starts_with(prefix))).map(str::to_owned).collect()
 }
 
 /// How the names of a server's projects begin.
 pub fn prefix(server: &crate::support::program::Server) -> String {
     let owner = webots_fleet::simulation::container::ResourceOwner::of(&server.cache());
-    format!("webots-fleet-{}-", owner.name())
+    format!("webots-fleet-{}-", owner.0)
 }
 
 /// The containers of one service of a server, as soon as there is one. What a container prints may come before Docker counts

@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use nix::sys::signal::Signal;
 
-use super::daemon::{alone, ask, check, containers, docker, prefix, server};
+use super::daemon::{alone, ask, check, containers, containers_of, docker, prefix, server};
 use crate::support::client::Client;
 use crate::support::git::{Forge, arm};
 use crate::support::program::Server;
@@ -12,12 +12,6 @@ use crate::support::{http, until};
 
 /// All of a simulation has to be gone by then.
 const GONE: Duration = Duration::from_secs(10);
-
-fn left(prefix: &str) -> usize {
-    let format = "{{.Label \"com.docker.compose.project\"}}";
-    let all = ask(&["ps", "--all", "--filter", "label=com.docker.compose.project", "--format", format]);
-    all.lines().filter(|name| name.starts_with(prefix)).count()
-}
 
 /// Whether a server says that it can start simulations; its load tells of a busy machine too.
 async fn takes_clients(server: &Server) -> bool {
@@ -37,7 +31,7 @@ async fn everything_is_gone_soon_after_the_server_was_killed() {
     server.signal(Signal::SIGKILL);
     server.ended().await;
     let begin = Instant::now();
-    until("the containers are gone", async || left(&prefix) == 0).await;
+    until("the containers are gone", async || containers_of(&prefix).is_empty()).await;
     assert!(begin.elapsed() < GONE, "{:?}", begin.elapsed());
 }
 
@@ -53,7 +47,7 @@ async fn a_server_that_stops_leaves_nothing() {
     let prefix = prefix(&server);
     server.signal(Signal::SIGTERM);
     assert_eq!(server.ended().await, Some(0));
-    until("the containers are gone", async || left(&prefix) == 0).await;
+    until("the containers are gone", async || containers_of(&prefix).is_empty()).await;
 }
 
 #[actix_rt::test]
@@ -62,21 +56,22 @@ async fn what_an_earlier_run_has_left_is_removed_and_nothing_of_others() {
     let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
     std::fs::create_dir(folder.path().join("cache")).unwrap();
     let owner = webots_fleet::simulation::container::ResourceOwner::of(&folder.path().join("cache"));
-    let make = |project: &str| {
+    let make = |name: &str, project: &str| {
         let label = format!("com.docker.compose.project={project}");
-        ask(&["create", "--label", &label, "--network", "none", super::image::NAME, "sleep", "1000"])
+        ask(&["create", "--name", name, "--label", &label, "--network", "none", super::image::NAME, "sleep", "1000"])
     };
     let (mine, other) = (owner.project(2001), "webots-fleet-000000000000-2001-0".to_owned());
-    let containers = [make(&mine), make(&other)];
     // The label of an image may have any text, and its containers inherit it.
-    let forged = make(&format!("x\n{} {mine}", containers[1]));
+    let containers =
+        [(format!("{mine}-webots"), &mine), (format!("{other}-webots"), &other), ("forged".to_owned(), &mine)]
+            .map(|(name, project)| make(&name, project));
     let _server = server(forge.path(), 1).folder(folder.path()).start().await;
     let is_there = |container: &str| {
         !ask(&["ps", "--all", "--quiet", "--no-trunc", "--filter", &format!("id={container}")]).is_empty()
     };
     until("what it left is gone", async || !is_there(&containers[0])).await;
-    assert!(is_there(&containers[1]));
-    ask(&["rm", &containers[1], &forged]);
+    assert!(is_there(&containers[1]) && is_there(&containers[2]));
+    ask(&["rm", &containers[1], &containers[2]]);
 }
 
 #[actix_rt::test]

@@ -7,7 +7,8 @@ use std::time::{Duration, Instant};
 
 /// The directory `cacheDir`, locked until this is dropped or the process exits.
 pub struct CacheDir {
-    folder: PathBuf,
+    /// The folder itself, without links.
+    pub folder: PathBuf,
     _lock: File,
 }
 
@@ -38,10 +39,5 @@ impl CacheDir {
                 Err(TryLockError::Error(error)) => return Err(error),
             }
         }
-    }
-
-    /// The folder itself, without links.
-    pub fn path(&self) -> &Path {
-        &self.folder
     }
 }

@@ -46,22 +46,17 @@ fn is_beyond(folder: &Path, most: u64) -> bool {
     size.add_folder(folder).is_err() || size.total() > most
 }
 
-/// What everything below a folder takes, each file and folder at least what a name takes of a disk. What nobody can look
-/// into does not count.
+/// What everything below a folder takes, each file and folder at least what a name takes of a disk.
 pub fn room_of(folder: &Path) -> u64 {
     sum(folder, measure)
-}
-
-/// The bytes of all files below a folder.
-pub fn size_of(folder: &Path) -> u64 {
-    sum(folder, disk_usage::length)
 }
 
 fn measure(about: &fs::Metadata) -> u64 {
     disk_usage::length(about).max(disk_usage::room(about))
 }
 
-fn sum(folder: &Path, measure: fn(&fs::Metadata) -> u64) -> u64 {
+/// The sum of everything below a folder. What nobody can look into does not count.
+pub fn sum(folder: &Path, measure: fn(&fs::Metadata) -> u64) -> u64 {
     let mut size = DiskUsage::new(measure, u64::MAX);
     size.add_folder(folder).ok();
     size.total()

@@ -7,36 +7,17 @@ use std::time::Duration;
 use rustix::process::Resource;
 
 use super::git_error::GitError;
-use crate::simulation::process::{ExitReason, Ran, Run, RunError};
+use crate::shared::config::ExpandedPath;
+use crate::simulation::config::SimulationConfig;
+use crate::simulation::process::{ExitReason, Ran, Run};
 
 /// Runs git with this server's settings.
 pub struct Git {
     /// The file with git's settings, and its text.
     settings: (PathBuf, String),
     mark: PathBuf,
-}
-
-/// One git command.
-#[derive(Debug, Clone)]
-pub struct Call<'call> {
-    /// The bare repository.
-    pub repository: &'call Path,
-    /// Settings that it needs, each as `name=value`.
-    pub settings: Vec<String>,
-    /// The command and its arguments.
-    pub arguments: Vec<OsString>,
-    /// The one protocol that it may use.
-    pub protocol: &'static str,
-    /// Memory limit in bytes, without mapped files.
-    pub memory: u64,
-    /// Size limit of a written file, in bytes.
-    pub file_size: Option<u64>,
-    /// Timeout of the command.
-    pub time: Duration,
-    /// Additional environment variables.
-    pub environment: Vec<(OsString, OsString)>,
-    /// Whether its start may block the calling thread.
-    pub may_block: bool,
+    /// Timeout of a command.
+    time: Duration,
 }
 
 /// git reads this instead of the settings of the server's user, because a world's program could have written those. The
@@ -46,10 +27,12 @@ pub struct Call<'call> {
 /// up.
 const SETTINGS: &str = include_str!("gitconfig");
 
-/// Memory limit in bytes for an answer of a remote, which is enough for a million branches, or for a copy.
+/// The last option before the command.
+const GIT_DIR: &str = "--git-dir=";
+/// Memory limit in bytes, without mapped files, for an answer of a remote, which is enough for a million branches, or for a copy.
 pub const LITTLE_MEMORY: u64 = 512 << 20;
 /// Largest memory limit of a git process, in bytes.
-pub const MAX_MEMORY: u64 = 2 << 30;
+const MAX_MEMORY: u64 = 2 << 30;
 /// Commands that may keep all cores busy for long: running simulations have priority.
 const HEAVY: [&str; 2] = ["fetch", "gc"];
 /// The niceness of these commands.
@@ -60,15 +43,17 @@ const MAX_ANSWER: u64 = 64 * 1024 * 1024;
 const MAX_LINE: usize = 500;
 
 impl Git {
-    /// Prepares git for the server whose run has this folder. `config` is the administrator's file of settings; a remote may
-    /// be silent for so long.
-    pub fn new(run: &Path, config: Option<&Path>, silence: Duration) -> Self {
-        let config = config.map(|file| std::path::absolute(file).unwrap_or_else(|_| file.to_owned()));
-        let quoted = |file: PathBuf| file.to_string_lossy().replace('\\', "\\\\").replace('"', "\\\"");
-        let include = config.map(|file| format!("[include]\n\tpath = \"{}\"\n", quoted(file)));
-        let silence = format!("[http]\n\tlowSpeedLimit = 1\n\tlowSpeedTime = {}\n", silence.as_secs().max(1));
+    /// Prepares git for the server whose run has this folder.
+    pub fn new(run: &Path, config: &SimulationConfig) -> Self {
+        let include = config.git_config.as_ref().map(|ExpandedPath(file)| {
+            let file = std::path::absolute(file).unwrap_or_else(|_| file.clone());
+            let quoted = file.to_string_lossy().replace('\\', "\\\\").replace('"', "\\\"");
+            format!("[include]\n\tpath = \"{quoted}\"\n")
+        });
+        let silence = stall_timeout(config).as_secs().max(1);
+        let silence = format!("[http]\n\tlowSpeedLimit = 1\n\tlowSpeedTime = {silence}\n");
         let settings = (run.join("gitconfig"), include.unwrap_or_default() + SETTINGS + &silence);
-        Self { settings, mark: run.to_owned() }
+        Self { settings, mark: run.to_owned(), time: config.timing.checkout }
     }
 
     /// Writes the file of settings, unless it is there.
@@ -84,15 +69,43 @@ impl Git {
         std::fs::rename(&new, file)
     }
 
+    /// A command on a bare repository, with these settings, each as `name=value`. It may use one protocol only.
+    pub fn command(
+        &self,
+        (repository, protocol): (&Path, &str),
+        settings: &[String],
+        arguments: &[impl AsRef<OsStr>],
+    ) -> Run {
+        let folder = [OsStr::new(GIT_DIR), repository.as_os_str()].join(OsStr::new(""));
+        let settings = settings.iter().flat_map(|setting| ["-c".into(), setting.into()]);
+        let words = ["git".into(), "--literal-pathspecs".into()].into_iter().chain(settings).chain([folder]);
+        let mut run = Run::new(words.chain(arguments.iter().map(OsString::from)), &self.mark, self.time);
+        let environment: [(&str, &OsStr); 6] = [
+            ("GIT_CONFIG_GLOBAL", self.settings.0.as_os_str()),
+            ("GIT_ALLOW_PROTOCOL", OsStr::new(protocol)),
+            ("GIT_TERMINAL_PROMPT", OsStr::new("0")),
+            ("GIT_ASKPASS", OsStr::new("/bin/false")),
+            ("GIT_NO_REPLACE_OBJECTS", OsStr::new("1")),
+            ("LC_ALL", OsStr::new("C")),
+        ];
+        run.spec.environment = environment.map(|(name, value)| (name.into(), value.into())).into();
+        (run.answer, run.line) = (MAX_ANSWER, MAX_LINE);
+        run.limits.push((Resource::Data, MAX_MEMORY));
+        run
+    }
+
     /// Runs a command to its end. Returns its answer. `progress` receives each line of standard error.
     ///
     /// Dropping the future ends git and its child processes.
     ///
     /// # Errors
     /// When git can't be started, fails, or takes too long.
-    pub async fn run(&self, call: Call<'_>, mut progress: impl FnMut(&str)) -> Result<Vec<u8>, GitError> {
-        let command = call.arguments.iter().find(|argument| !argument.as_encoded_bytes().starts_with(b"-"));
-        let command = command.map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+    pub async fn run(&self, mut run: Run, mut progress: impl FnMut(&str)) -> Result<Vec<u8>, GitError> {
+        let is = |word: &OsString, start: &str| word.as_encoded_bytes().starts_with(start.as_bytes());
+        let mut words = run.spec.command.iter().skip_while(|word| !is(word, GIT_DIR));
+        let command =
+            words.find(|word| !is(word, "-")).map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+        run.niceness = if HEAVY.contains(&command.as_str()) { NICENESS } else { 0 };
         self.write_settings()?;
         let mut cause = String::new();
         let on_line = |line: String| {
@@ -101,43 +114,18 @@ impl Git {
                 cause = line;
             }
         };
-        let ran = self.prepared(call, &command).run(on_line).await;
-        match ran {
+        match run.run(on_line).await {
             Ok(Ran { ending: ExitReason::Code(0), answer }) => Ok(answer),
-            Ok(Ran { ending: ExitReason::NotStarted, .. }) => Err(GitError::Machine(cause)),
-            Ok(Ran { ending, .. }) => Err(GitError::Failed { command, ending, message: cause }),
-            Err(error @ RunError::NotStarted(_)) => Err(GitError::Machine(format!("git {error}"))),
-            Err(RunError::Slow(limit)) => Err(GitError::Slow(limit)),
-            Err(RunError::TooLong) => Err(GitError::TooLong(command)),
+            Ok(Ran { ending: ExitReason::NotStarted, .. }) => Err(GitError::machine(cause)),
+            Ok(Ran { ending, .. }) => Err(GitError::ended(&command, ending, &cause)),
+            Err(error) => Err(GitError::not_ended(&command, &error)),
         }
     }
+}
 
-    fn prepared(&self, call: Call<'_>, name: &str) -> Run {
-        let mut command: Vec<OsString> = ["git", "--literal-pathspecs", "--git-dir"].map(OsString::from).into();
-        command.push(call.repository.into());
-        command.extend(call.settings.into_iter().flat_map(|setting| ["-c".into(), setting.into()]));
-        command.extend(call.arguments);
-        let fixed: [(&str, &OsStr); 6] = [
-            ("GIT_CONFIG_GLOBAL", self.settings.0.as_os_str()),
-            ("GIT_ALLOW_PROTOCOL", OsStr::new(call.protocol)),
-            ("GIT_TERMINAL_PROMPT", OsStr::new("0")),
-            ("GIT_ASKPASS", OsStr::new("/bin/false")),
-            ("GIT_NO_REPLACE_OBJECTS", OsStr::new("1")),
-            ("LC_ALL", OsStr::new("C")),
-        ];
-        let mut run = Run::new(command, &self.mark, call.time);
-        let fixed = fixed.into_iter().map(|(name, value)| (name.into(), value.into()));
-        run.spec.environment = fixed.chain(call.environment).collect();
-        (run.answer, run.line) = (MAX_ANSWER, MAX_LINE);
-        run.may_block = call.may_block;
-        run.niceness = if HEAVY.contains(&name) { NICENESS } else { 0 };
-        run.limits.push((Resource::Data, call.memory));
-        if let Some(size) = call.file_size {
-            // A larger write ends git with SIGXFSZ, which must not leave a core dump.
-            run.limits.extend([(Resource::Core, 0), (Resource::Fsize, size)]);
-        }
-        run
-    }
+/// How long a remote may be silent, and packing a cached repository hold a fetch up.
+pub fn stall_timeout(config: &SimulationConfig) -> Duration {
+    config.timing.checkout / 4
 }
 
 /// Ranks git's messages: the first fatal line names the cause, else the first error; later lines are consequences.

@@ -3,36 +3,15 @@
 use std::io;
 use std::time::Duration;
 
-use crate::simulation::process::ExitReason;
+use crate::simulation::process::{ExitReason, RunError};
 
 /// A git command that failed.
 #[derive(Debug, Clone, thiserror::Error)]
-pub enum GitError {
-    /// The machine can't run git.
-    #[error("{0}")]
-    Machine(String),
-    /// It exited with another code than 0, or by a signal.
-    #[error("git {command} {ending}: {message}")]
-    Failed {
-        /// The git command, such as `fetch`.
-        command: String,
-        /// Its exit code or signal.
-        ending: ExitReason,
-        /// Its message about the cause.
-        message: String,
-    },
-    /// Its answer exceeds the size limit.
-    #[error("the answer of git {0} is too long")]
-    TooLong(String),
-    /// It exceeded its timeout.
-    #[error("git did not end within {} seconds", .0.as_secs())]
-    Slow(Duration),
-}
-
-impl From<io::Error> for GitError {
-    fn from(error: io::Error) -> Self {
-        Self::Machine(error.to_string())
-    }
+#[error("{message}")]
+pub struct GitError {
+    /// What the failure means.
+    pub cause: Cause,
+    message: String,
 }
 
 /// What a failure means for the caller.
@@ -44,8 +23,10 @@ pub enum Cause {
     NoCommit,
     /// The remote redirects to another URL.
     Moved,
-    /// The fetch exceeds the size limit: the kernel has ended the program that writes its pack.
+    /// The fetch or the answer exceeds its size limit. In a fetch, the kernel has ended the program that writes its pack.
     TooLarge,
+    /// The command exceeded this timeout.
+    Slow(Duration),
     /// The cached repository is corrupt.
     Damaged,
     /// The machine or its network fails.
@@ -80,15 +61,34 @@ const MESSAGES: &[(Cause, &[&str])] = &[
 ];
 
 impl GitError {
-    /// What the failure means.
-    pub fn cause(&self) -> Cause {
-        let message = match self {
-            Self::Failed { ending: ExitReason::Code(_), message, .. } => message,
-            Self::Machine(_) => return Cause::Machine,
-            Self::Failed { .. } | Self::TooLong(_) | Self::Slow(_) => return Cause::Other,
+    /// A command that the machine can't run.
+    pub fn machine(message: String) -> Self {
+        Self { cause: Cause::Machine, message }
+    }
+
+    /// A command that has not ended by itself.
+    pub fn not_ended(command: &str, error: &RunError) -> Self {
+        let cause = match error {
+            RunError::NotStarted(_) => Cause::Machine,
+            RunError::Slow(limit) => Cause::Slow(*limit),
+            RunError::TooLong => Cause::TooLarge,
         };
-        let is_of = |words: &[&str]| words.iter().any(|words| message.contains(words));
-        MESSAGES.iter().find(|(_, words)| is_of(words)).map_or(Cause::Other, |(cause, _)| *cause)
+        Self { cause, message: format!("git {command} {error}") }
+    }
+
+    /// A command that exited with another code than 0, or by a signal; `said` is its message about the cause.
+    pub fn ended(command: &str, ending: ExitReason, said: &str) -> Self {
+        let is_of =
+            |words: &[&str]| matches!(ending, ExitReason::Code(_)) && words.iter().any(|words| said.contains(words));
+        let known = MESSAGES.iter().find(|(_, words)| is_of(words));
+        let cause = known.map_or(Cause::Other, |(cause, _)| *cause);
+        Self { cause, message: format!("git {command} {ending}: {said}") }
+    }
+}
+
+impl From<io::Error> for GitError {
+    fn from(error: io::Error) -> Self {
+        Self::machine(error.to_string())
     }
 }
 
@@ -98,9 +98,7 @@ mod tests {
 
     #[test]
     fn causes_are_told_apart() {
-        let cause = |message: &str, ending| {
-            GitError::Failed { command: "fetch".to_owned(), ending, message: message.to_owned() }.cause()
-        };
+        let cause = |message: &str, ending| GitError::ended("fetch", ending, message).cause;
         for (message, expected) in [
             ("fatal: repository 'https://github.com/lab/none.git/' not found", Cause::NoRepository),
             ("fatal: repository 'https://github.com/lab/certificates.git/' not found", Cause::NoRepository),

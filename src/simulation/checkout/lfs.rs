@@ -2,9 +2,8 @@
 
 use std::path::Path;
 
-use which::which;
-
-use super::mirrors::Remote;
+use super::repository::REMOTE;
+use crate::simulation::config::Remote;
 
 /// The first bytes of a pointer.
 const BEGINNING: &[u8] = b"version https://git-lfs.github.com/spec/";
@@ -29,11 +28,6 @@ pub fn pointers(folder: &Path) -> usize {
     found
 }
 
-/// Whether git finds its part for LFS. Looks on disk: not for a thread that serves others.
-pub fn is_installed() -> bool {
-    which("git-lfs").is_ok()
-}
-
 /// Settings with which a checkout loads large files from where the repository is, whatever the repository says.
 pub fn settings(remote: &Remote) -> Vec<String> {
     let location = &remote.location;
@@ -44,7 +38,7 @@ pub fn settings(remote: &Remote) -> Vec<String> {
     vec![
         format!("lfs.url={url}"),
         // For a local directory, git-lfs reads this.
-        format!("remote.origin.url={url}"),
+        format!("remote.{REMOTE}.url={url}"),
         "filter.lfs.process=git-lfs filter-process".to_owned(),
         "filter.lfs.smudge=git-lfs smudge -- %f".to_owned(),
         "filter.lfs.clean=git-lfs clean -- %f".to_owned(),

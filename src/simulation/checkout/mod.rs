@@ -1,10 +1,9 @@
 //! A client's world, checked out with git: cached, fetched once for all clients of it, cancellable, with progress.
 //!
-//! For the timeout and the size limit of a fetch see [`checkout_limits`]; for git's settings see [`git`].
+//! For git's settings see [`git`].
 
 mod cache_dir;
 mod checkout_error;
-mod checkout_limits;
 mod checkout_service;
 mod commit_resolver;
 mod disk;
@@ -12,7 +11,6 @@ mod file_restore;
 mod git;
 mod git_error;
 mod lfs;
-mod mirrors;
 mod project;
 mod redirect;
 mod repository;
@@ -25,9 +23,7 @@ mod world_file;
 
 pub use cache_dir::CacheDir;
 pub use checkout_error::CheckoutError;
-pub use checkout_limits::CheckoutLimits;
 pub use checkout_service::{CheckoutService, Progress};
 pub use disk::outgrown;
-pub use mirrors::Mirrors;
 pub use project::Project;
 pub use single_flight::{OnProgress, SingleFlight};

@@ -1,6 +1,6 @@
 //! A project that was checked out for one client.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use super::revision::Revision;
@@ -15,23 +15,18 @@ pub struct Project {
     pub world: WorldFile,
     /// What it takes of the disk, in bytes.
     pub size: u64,
-    /// Warnings for the client.
-    pub warnings: Vec<String>,
+    /// A warning for the client.
+    pub warning: Option<String>,
     /// The URL that it was checked out from.
     pub(super) url: ProjectUrl,
     pub(super) revision: Revision,
-    /// The project's directory.
-    pub(super) folder: PathBuf,
+    /// The project's directory, with `worlds` and `controllers` inside.
+    pub folder: PathBuf,
     /// The instance directory; removed with the project.
     pub instance: Arc<InstanceDir>,
 }
 
 impl Project {
-    /// The project's folder, with `worlds` and `controllers` inside.
-    pub fn folder(&self) -> &Path {
-        &self.folder
-    }
-
     /// What tells this project from others: its repository, its commit, and its folder there.
     pub fn identity(&self) -> String {
         format!("{} {} {}", self.url.repository(), self.revision.commit, self.revision.folder)

@@ -6,11 +6,10 @@
 
 use url::Url;
 
-use super::checkout_error::CheckoutError;
-use super::git::Call;
-use super::mirrors::{Mirrors, Remote};
-use super::repository::Repository;
+use super::checkout_error::{CheckoutError, moved};
+use super::repository::{REMOTE, Repository};
 use crate::shared::domain::{AdmissionRules, Load, ProjectUrl};
+use crate::simulation::config::{Mirrors, Remote};
 
 /// Limit of redirects for a world.
 pub const MAX_REDIRECTS: usize = 5;
@@ -31,15 +30,13 @@ pub async fn follow(
         Some(location) => target(mirrors, rules, world, &location),
         None => Err("to where its forge does not say".to_owned()),
     };
-    let (moved, remote) = target.map_err(|why| CheckoutError::Moved(world.repository(), why))?;
-    log::info!("{} is at {}", world.repository(), remote.location);
-    Ok((moved, remote))
+    let target = target.map_err(|why| moved(world, &why))?;
+    log::info!("{} is at {}", world.repository(), target.1.location);
+    Ok(target)
 }
 
 /// The `Location` to which a Git host redirects requests for a repository.
 async fn location(repository: &Repository) -> Option<String> {
-    let trace = [("GIT_TRACE_CURL", "1"), ("GIT_TRACE_CURL_NO_DATA", "1")];
-    let environment = trace.map(|(name, value)| (name.into(), value.into())).to_vec();
     let mut location = None;
     let on_line = |line: &str| {
         let header = line.split_once("Recv header: ").and_then(|(_, header)| header.split_once(": "));
@@ -49,10 +46,11 @@ async fn location(repository: &Repository) -> Option<String> {
             location = Some(value.to_owned());
         }
     };
-    let remote = repository.remote();
-    let call = repository.call(&["ls-remote", "--quiet", "--", &remote.location, "HEAD"]);
+    let mut call = repository.call(&["ls-remote", "--quiet", "--", REMOTE, "HEAD"]);
+    let trace = ["GIT_TRACE_CURL", "GIT_TRACE_CURL_NO_DATA"];
+    call.spec.environment.extend(trace.map(|name| (name.into(), "1".into())));
     // It fails again, since the forge sends it elsewhere.
-    repository.run(Call { environment, ..call }, on_line).await.ok();
+    repository.run(call, on_line).await.ok();
     location
 }
 

@@ -6,74 +6,77 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use parking_lot::Mutex;
+use rustix::process::Resource;
 use tokio::sync::{Notify, OwnedMutexGuard, Semaphore, watch};
 
-use super::checkout_limits::CheckoutLimits;
 use super::disk::{blocking, remove_leftovers};
-use super::git::{Call, Git, LITTLE_MEMORY, MAX_MEMORY};
+use super::git::{Git, LITTLE_MEMORY, stall_timeout};
 use super::git_error::GitError;
-use super::mirrors::Remote;
-use super::revision::FetchRequest;
 use super::single_flight::{OnProgress, SingleFlight};
-use crate::simulation::process::remove_tree;
+use crate::simulation::config::{Remote, SimulationConfig};
+use crate::simulation::process::{Run, remove_tree};
 
 /// A cached repository. It is not evicted from the cache until this is dropped.
 pub struct Repository {
-    path: PathBuf,
+    /// Its folder.
+    pub path: PathBuf,
     /// The remote. Its URL may have several spellings.
-    remote: Mutex<Arc<Remote>>,
+    remote: Mutex<Remote>,
     git: Arc<Git>,
-    /// The limits of a fetch.
-    pub limits: CheckoutLimits,
-    growth: Arc<Notify>,
+    config: Arc<SimulationConfig>,
+    /// Signals that the cache has grown.
+    pub growth: Arc<Notify>,
     /// Held by the task that changes the repository.
     lock: Arc<tokio::sync::Mutex<()>>,
     /// Limits concurrent queries of the remote: a class may want as many worlds of one repository.
     queries: Semaphore,
-    /// The fetches in progress, by the name of the request.
-    fetches: SingleFlight<String, Result<(), GitError>>,
+    /// The fetches in progress, by the arguments of git.
+    fetches: SingleFlight<Vec<String>, Result<(), GitError>>,
 }
 
+/// What arguments of git call the remote. git keeps note of what a partial history lacks only for remotes that have a name.
+pub const REMOTE: &str = "origin";
 /// Number of concurrent queries of a remote for one repository.
 const MAX_QUERIES: usize = 4;
 
 impl Repository {
     /// The repository at `path`, which need not exist yet, for commits of `remote`.
-    pub fn new(path: PathBuf, remote: Remote, git: Arc<Git>, limits: CheckoutLimits, growth: Arc<Notify>) -> Self {
+    pub fn new(
+        path: PathBuf,
+        remote: Remote,
+        git: Arc<Git>,
+        config: Arc<SimulationConfig>,
+        growth: Arc<Notify>,
+    ) -> Self {
         let (lock, fetches, queries) = (Arc::default(), SingleFlight::default(), Semaphore::new(MAX_QUERIES));
-        Self { path, remote: Mutex::new(Arc::new(remote)), git, limits, growth, lock, queries, fetches }
+        Self { path, remote: Mutex::new(remote), git, config, growth, lock, queries, fetches }
     }
 
     /// Where it is fetched from.
-    pub fn remote(&self) -> Arc<Remote> {
-        Arc::clone(&self.remote.lock())
+    pub fn remote(&self) -> Remote {
+        self.remote.lock().clone()
     }
 
     /// Changes the remote to the last requested spelling of its URL.
     pub fn set_remote(&self, remote: &Remote) {
-        *self.remote.lock() = Arc::new(remote.clone());
+        self.remote.lock().clone_from(remote);
     }
 
     /// A git command on this repository.
-    pub fn call(&self, arguments: &[impl AsRef<OsStr>]) -> Call<'_> {
-        Call {
-            repository: &self.path,
-            settings: Vec::new(),
-            arguments: arguments.iter().map(Into::into).collect(),
-            protocol: self.remote().protocol,
-            memory: MAX_MEMORY,
-            file_size: None,
-            time: self.limits.time,
-            environment: Vec::new(),
-            may_block: false,
-        }
+    pub fn call(&self, arguments: &[impl AsRef<OsStr>]) -> Run {
+        self.configured(&[format!("remote.{REMOTE}.url={}", self.remote().location)], arguments)
+    }
+
+    /// A git command on this repository that does not ask the remote, with these settings, each as `name=value`.
+    pub fn configured(&self, settings: &[String], arguments: &[impl AsRef<OsStr>]) -> Run {
+        self.git.command((&self.path, self.remote().protocol), settings, arguments)
     }
 
     /// Runs a command to its end. Returns its answer. `on_line` receives each line of standard error.
     ///
     /// # Errors
     /// When git fails.
-    pub async fn run(&self, call: Call<'_>, on_line: impl FnMut(&str)) -> Result<Vec<u8>, GitError> {
+    pub async fn run(&self, call: Run, on_line: impl FnMut(&str)) -> Result<Vec<u8>, GitError> {
         self.git.run(call, on_line).await
     }
 
@@ -84,9 +87,9 @@ impl Repository {
     pub async fn read(&self, arguments: &[impl AsRef<OsStr>]) -> Result<Vec<u8>, GitError> {
         let mut call = self.call(arguments);
         // Missing objects must not be fetched, as git would do in a history.
-        call.protocol = "none";
-        call.environment.push(("GIT_NO_LAZY_FETCH".into(), "1".into()));
-        self.git.run(call, |_| ()).await
+        let none = [("GIT_ALLOW_PROTOCOL", "none"), ("GIT_NO_LAZY_FETCH", "1")];
+        call.spec.environment.extend(none.map(|(name, value)| (name.into(), value.into())));
+        self.run(call, |_| ()).await
     }
 
     /// Joins an identical fetch in progress, or starts one. Cancelled when the last waiter drops. `progress` receives
@@ -94,15 +97,14 @@ impl Repository {
     ///
     /// # Errors
     /// Why it can't be fetched.
-    pub async fn fetch(self: &Arc<Self>, request: &FetchRequest, progress: OnProgress<'_>) -> Result<(), GitError> {
-        let (this, wanted) = (Arc::clone(self), request.clone());
-        let fetch = |sender| async move { this.fetch_locked(&wanted, &sender).await };
-        self.fetches.join(request.name.clone(), progress, fetch).await
+    pub async fn fetch(self: &Arc<Self>, arguments: Vec<String>, progress: OnProgress<'_>) -> Result<(), GitError> {
+        let (this, key) = (Arc::clone(self), arguments.clone());
+        self.fetches.join(key, progress, |sender| async move { this.fetch_locked(&arguments, &sender).await }).await
     }
 
     async fn fetch_locked(
         self: &Arc<Self>,
-        request: &FetchRequest,
+        arguments: &[String],
         sender: &watch::Sender<String>,
     ) -> Result<(), GitError> {
         let _grown = Grown(&self.growth);
@@ -113,9 +115,10 @@ impl Repository {
                 sender.send_replace(line.trim_start_matches("remote: ").to_owned());
             }
         };
-        let file_size = Some(self.limits.size);
-        let call = Call { settings: request.settings.clone(), file_size, ..self.call(&request.arguments) };
-        self.git.run(call, on_line).await?;
+        let mut call = self.call(arguments);
+        // A larger write ends git with SIGXFSZ, which must not leave a core dump.
+        call.limits.extend([(Resource::Core, 0), (Resource::Fsize, self.config.project_size << 20)]);
+        self.run(call, on_line).await?;
         self.collect_garbage(guard);
         Ok(())
     }
@@ -127,7 +130,9 @@ impl Repository {
     pub async fn ask(&self, arguments: &[impl AsRef<OsStr>]) -> Result<String, GitError> {
         // It is never closed.
         let _permit = self.queries.acquire().await.ok();
-        let answer = self.run(Call { memory: LITTLE_MEMORY, ..self.call(arguments) }, |_| ()).await?;
+        let mut call = self.call(arguments);
+        call.limits.push((Resource::Data, LITTLE_MEMORY));
+        let answer = self.run(call, |_| ()).await?;
         Ok(String::from_utf8_lossy(&answer).into_owned())
     }
 
@@ -143,24 +148,16 @@ impl Repository {
 
     /// Creates the bare repository unless it exists. Else removes what a killed git has left.
     async fn create(&self) -> Result<(), GitError> {
-        // It is renamed to its final path when it is complete.
-        let new = self.path.with_extension("new");
-        let (path, new_path) = (self.path.clone(), new.clone());
+        let path = self.path.clone();
         let is_there = blocking(move || {
-            let is_there = path.join("HEAD").is_file();
-            if is_there {
-                remove_leftovers(&path);
-            } else {
-                remove_tree(&path).and_then(|()| remove_tree(&new_path))?;
-            }
-            Ok(is_there)
+            remove_leftovers(&path);
+            // The last folder that git makes of a new repository.
+            Ok(path.join("objects/pack").is_dir())
         });
-        if is_there.await? {
-            return Ok(());
+        if !is_there.await? {
+            self.run(self.call(&["init", "--quiet", "--bare"]), |_| ()).await?;
         }
-        let call = Call { repository: &new, ..self.call(&["init", "--quiet", "--bare"]) };
-        self.git.run(call, |_| ()).await?;
-        Ok(tokio::fs::rename(&new, &self.path).await?)
+        Ok(())
     }
 
     /// Runs `git gc --auto` in the background, for at most `stall_timeout()`; only the next fetch waits for it.
@@ -168,8 +165,8 @@ impl Repository {
         let this = Arc::clone(self);
         tokio::spawn(async move {
             let _guard = guard;
-            let call = Call { time: this.limits.stall_timeout(), ..this.call(&["gc", "--auto", "--quiet"]) };
-            if let Err(error) = this.git.run(call, |_| ()).await {
+            let call = Run { time: stall_timeout(&this.config), ..this.call(&["gc", "--auto", "--quiet"]) };
+            if let Err(error) = this.run(call, |_| ()).await {
                 log::warn!("{} can't be packed: {error}", this.path.display());
             }
         });

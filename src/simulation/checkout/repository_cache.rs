@@ -13,20 +13,17 @@ use sha2::{Digest, Sha256};
 use tokio::sync::{Mutex, Notify};
 
 use super::cache_dir::CacheDir;
-use super::checkout_limits::CheckoutLimits;
-use super::disk::size_of;
+use super::disk::{blocking, sum};
 use super::git::Git;
-use super::mirrors::Remote;
 use super::repository::Repository;
-use crate::simulation::process::remove_tree;
+use crate::simulation::config::{Remote, SimulationConfig};
+use crate::simulation::process::{disk_usage, remove_tree};
 
 /// The cached repositories of a server.
 pub struct RepositoryCache {
     folder: PathBuf,
-    /// Size limit of all repositories, in bytes.
-    budget: u64,
     git: Arc<Git>,
-    limits: CheckoutLimits,
+    config: Arc<SimulationConfig>,
     /// The repositories in use.
     in_use: Mutex<HashMap<PathBuf, Weak<Repository>>>,
     /// Signals that a repository has grown.
@@ -34,41 +31,32 @@ pub struct RepositoryCache {
     _dir: CacheDir,
 }
 
+/// Contents of a repository: single commits.
+pub const COMMITS: &str = "";
+/// Contents of a repository: the commits of all branches and tags, without files if the remote supports that.
+pub const HISTORY: &str = " history";
 /// The extension of a directory that is being removed. Names of repositories have no dots.
 const REMOVED: &str = "removed";
 /// Interval between two attempts to bring the cache within its budget: repositories in use stay.
 const RETRY_INTERVAL: Duration = Duration::from_secs(2);
 
 impl RepositoryCache {
-    /// Opens the cache in `dir`, with a limit of `budget` bytes.
+    /// Opens the cache in `dir`.
     ///
     /// # Errors
     /// When its directory can't be created.
-    pub fn open(dir: CacheDir, budget: u64, git: Arc<Git>, limits: CheckoutLimits) -> io::Result<Self> {
-        let folder = dir.path().join("git");
+    pub fn open(dir: CacheDir, git: Arc<Git>, config: Arc<SimulationConfig>) -> io::Result<Self> {
+        let folder = dir.folder.join("git");
         std::fs::create_dir_all(&folder)?;
-        Ok(Self { folder, budget, git, limits, in_use: Mutex::default(), growth: Arc::default(), _dir: dir })
+        Ok(Self { folder, git, config, in_use: Mutex::default(), growth: Arc::default(), _dir: dir })
     }
 
-    /// The repository with commits of `remote`. It is in use until the returned value is dropped.
+    /// The repository with this content of `remote`. It is in use until the returned value is dropped.
     ///
     /// # Errors
     /// When the cache's directory can't be created.
-    pub async fn commits(&self, remote: &Remote) -> io::Result<Arc<Repository>> {
-        self.repository(&remote.key(), remote).await
-    }
-
-    /// The repository with the history of `remote`: the commits of all branches and tags, without files if the remote
-    /// supports that.
-    ///
-    /// # Errors
-    /// When the cache's directory can't be created.
-    pub async fn history(&self, remote: &Remote) -> io::Result<Arc<Repository>> {
-        self.repository(&format!("{} history", remote.key()), remote).await
-    }
-
-    async fn repository(&self, key: &str, remote: &Remote) -> io::Result<Arc<Repository>> {
-        let path = self.folder.join(folder_name(key));
+    pub async fn repository(&self, remote: &Remote, content: &str) -> io::Result<Arc<Repository>> {
+        let path = self.folder.join(folder_name(&(remote.key() + content)));
         let repository = {
             let mut in_use = self.in_use.lock().await;
             in_use.retain(|_, repository| repository.strong_count() > 0);
@@ -77,27 +65,21 @@ impl RepositoryCache {
                 repository.set_remote(remote);
             }
             known.unwrap_or_else(|| {
-                let (git, growth) = (Arc::clone(&self.git), Arc::clone(&self.growth));
-                let repository = Arc::new(Repository::new(path.clone(), remote.clone(), git, self.limits, growth));
+                let (git, config, growth) = (Arc::clone(&self.git), Arc::clone(&self.config), Arc::clone(&self.growth));
+                let repository = Arc::new(Repository::new(path.clone(), remote.clone(), git, config, growth));
                 in_use.insert(path.clone(), Arc::downgrade(&repository));
                 repository
             })
         };
         let folder = self.folder.clone();
-        actix_rt::task::spawn_blocking(move || {
+        blocking(move || {
             std::fs::create_dir_all(folder)?;
-            match File::open(&path).and_then(|folder| folder.set_modified(SystemTime::now())) {
-                Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
-                _ => Ok(()),
-            }
+            // It may not be there yet.
+            File::open(&path).and_then(|folder| folder.set_modified(SystemTime::now())).ok();
+            Ok(())
         })
-        .await??;
+        .await?;
         Ok(repository)
-    }
-
-    /// Signals that a repository has grown.
-    pub fn grown(&self) {
-        self.growth.notify_one();
     }
 
     /// Keeps the cache within its budget. Never returns.
@@ -105,7 +87,7 @@ impl RepositoryCache {
         loop {
             let this = Arc::clone(&self);
             let shrunk = actix_rt::task::spawn_blocking(move || this.shrink()).await;
-            match shrunk.inspect_err(|error| log::error!("the cache can't be kept within its budget: {error}")) {
+            match shrunk {
                 Ok(false) => actix_rt::time::sleep(RETRY_INTERVAL).await,
                 _ => self.growth.notified().await,
             }
@@ -120,18 +102,19 @@ impl RepositoryCache {
             if path.extension().is_some_and(|extension| extension == REMOVED) {
                 remove(&path);
             } else if let Ok(used) = entry.metadata().and_then(|about| about.modified()) {
-                all.push((used, size_of(&path), path));
+                all.push((used, sum(&path, disk_usage::length), path));
             }
         }
         all.sort();
         let mut total: u64 = all.iter().map(|(_, size, _)| size).sum();
+        let budget = self.config.cache_size << 20;
         for (_, size, path) in all {
-            if total > self.budget && self.remove_unused(&path) {
+            if total > budget && self.remove_unused(&path) {
                 log::info!("removed {} from the cache", path.display());
                 total -= size;
             }
         }
-        total <= self.budget
+        total <= budget
     }
 
     /// Removes a repository unless it is in use. Blocks.
@@ -140,7 +123,7 @@ impl RepositoryCache {
         {
             // The lock makes new users wait; they then recreate the repository.
             let in_use = self.in_use.blocking_lock();
-            if in_use.get(&path.with_extension("")).is_some_and(|repository| repository.strong_count() > 0)
+            if in_use.get(path).is_some_and(|repository| repository.strong_count() > 0)
                 || std::fs::rename(path, &removed).is_err()
             {
                 return false;

@@ -1,5 +1,6 @@
 //! The commit that a world's URL means, and its contents: arguments for git, and parsers of its answers. Pure.
 
+use super::repository::REMOTE;
 use crate::shared::domain::{ProjectUrl, Reading, RefKind};
 
 /// One commit that a world's URL may mean.
@@ -27,49 +28,42 @@ pub enum TrustSource {
     AnyCommit,
 }
 
-/// A fetch for git.
-#[derive(Debug, Clone)]
-pub struct FetchRequest {
-    /// Unique among different requests; equal requests have equal names.
-    pub name: String,
-    /// Additional settings of git, each as `name=value`.
-    pub settings: Vec<String>,
-    /// What git is to do.
-    pub arguments: Vec<String>,
-}
+/// Asks the remote for all branches and tags.
+pub const LIST_TIPS: [&str; 6] = ["ls-remote", "--quiet", "--heads", "--tags", "--", REMOTE];
 
 /// The commit that a URL names by its full hash: then nobody need be asked what it is. `allow_any` tells whether any will
 /// do, or only one that is in a branch or tag.
 pub fn commit_of(world: &ProjectUrl, allow_any: bool) -> Option<Revision> {
     let Reading { reference, folder } = world.candidates().into_iter().next()?;
-    let is_hash = reference.len() == 40 && reference.bytes().all(|byte| byte.is_ascii_hexdigit());
-    let kind = matches!(world.kind(), RefKind::Any | RefKind::Commit);
-    let commit = reference.to_ascii_lowercase();
+    let is_commit = is_hash(&reference) && matches!(world.kind(), RefKind::Any | RefKind::Commit);
     let trust = if allow_any { TrustSource::AnyCommit } else { TrustSource::Url };
-    (is_hash && kind).then_some(Revision { commit, name: reference, folder, trust })
+    is_commit.then(|| Revision { commit: reference.to_ascii_lowercase(), name: reference, folder, trust })
 }
 
-/// Whether a commit is the newest of a branch or tag in such an answer.
+fn is_hash(text: &str) -> bool {
+    text.len() == 40 && text.bytes().all(|byte| byte.is_ascii_hexdigit())
+}
+
+/// Whether a commit is the newest of a branch or tag in the answer to [`LIST_TIPS`].
 pub fn is_tip(answer: &str, commit: &str) -> bool {
-    let tips = answer.lines().filter_map(|line| line.split_once('\t'));
-    let accepted = |name: &str| name.starts_with("refs/heads/") || name.starts_with("refs/tags/");
-    tips.filter(|(_, name)| accepted(name)).any(|(tip, _)| tip == commit)
+    answer.lines().filter_map(|line| line.split_once('\t')).any(|(tip, _)| tip == commit)
 }
 
-/// Fetches all branches and tags: only their commits where the remote can do that, else everything. git keeps note of
-/// that only for remotes that have a name.
-pub fn history(location: &str) -> FetchRequest {
-    let settings = vec![format!("remote.origin.url={location}")];
-    let options = ["fetch", "--filter=tree:0", "--prune", "--no-tags", "--no-write-fetch-head", "--progress", "--"];
-    let all = ["origin", "+refs/heads/*:refs/heads/*", "+refs/tags/*:refs/tags/*"];
-    let arguments = options.into_iter().chain(all).map(str::to_owned).collect();
-    FetchRequest { name: "history".to_owned(), settings, arguments }
+/// Fetches all branches and tags: only their commits where the remote can do that, else everything.
+pub fn fetch_history() -> Vec<String> {
+    fetch(&["--filter=tree:0", "--prune"], &["+refs/heads/*:refs/heads/*", "+refs/tags/*:refs/tags/*"])
+}
+
+/// Fetches these references with these options.
+fn fetch(options: &[&str], references: &[&str]) -> Vec<String> {
+    let common = ["--no-tags", "--no-write-fetch-head", "--progress", "--", REMOTE];
+    [&["fetch"], options, &common, references].concat().into_iter().map(str::to_owned).collect()
 }
 
 /// Asks the remote for all branches and tags that a URL may mean.
-pub fn search_arguments(world: &ProjectUrl, location: &str) -> Vec<String> {
+pub fn search_arguments(world: &ProjectUrl) -> Vec<String> {
     let names = world.candidates().into_iter().flat_map(|reading| full_names(world, &reading));
-    ["ls-remote", "--quiet", "--", location].map(str::to_owned).into_iter().chain(names).collect()
+    ["ls-remote", "--quiet", "--", REMOTE].map(str::to_owned).into_iter().chain(names).collect()
 }
 
 fn full_names(world: &ProjectUrl, reading: &Reading) -> Vec<String> {
@@ -91,8 +85,7 @@ pub fn found(world: &ProjectUrl, answer: &str) -> Vec<Revision> {
         .flat_map(|reading| full_names(world, &reading).into_iter().map(move |name| (name, reading.clone())))
         .filter_map(|(name, reading)| {
             let (commit, _) = known.iter().find(|(_, known)| *known == name)?;
-            let is_hash = commit.len() == 40 && commit.bytes().all(|byte| byte.is_ascii_hexdigit());
-            is_hash.then(|| Revision {
+            is_hash(commit).then(|| Revision {
                 commit: (*commit).to_owned(),
                 name: reading.reference,
                 folder: reading.folder,
@@ -111,11 +104,8 @@ impl Revision {
     }
 
     /// Fetches this commit alone.
-    pub fn request(&self, location: &str) -> FetchRequest {
-        let refspec = format!("+{}:{}", self.commit, self.reference());
-        let options = ["fetch", "--depth=1", "--no-tags", "--no-write-fetch-head", "--progress", "--"];
-        let arguments = options.into_iter().chain([location, &refspec]).map(str::to_owned).collect();
-        FetchRequest { name: self.reference(), settings: Vec::new(), arguments }
+    pub fn fetch_arguments(&self) -> Vec<String> {
+        fetch(&["--depth=1"], &[&format!("+{}:{}", self.commit, self.reference())])
     }
 
     /// Asks for an entry of the repository, and for all that is directly in the folders above the project's.

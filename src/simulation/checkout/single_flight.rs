@@ -10,7 +10,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use futures_util::FutureExt;
-use futures_util::future::{BoxFuture, Shared, WeakShared};
+use futures_util::future::{BoxFuture, WeakShared};
 use parking_lot::Mutex;
 use tokio::sync::watch;
 
@@ -37,7 +37,19 @@ impl<K: Eq + Hash, T: Clone + Send + Sync + 'static> SingleFlight<K, T> {
     where
         F: Future<Output = T> + Send + 'static,
     {
-        let (mut result, mut steps) = self.join_or_start(key, start);
+        let (mut result, mut steps) = {
+            let mut jobs = self.0.lock();
+            jobs.retain(|_, job| job.result.upgrade().is_some_and(|result| result.peek().is_none()));
+            let known = jobs.get(&key).and_then(|job| Some((job.result.upgrade()?, job.progress.clone())));
+            known.unwrap_or_else(|| {
+                let (sender, progress) = watch::channel(String::new());
+                // Each waiter has a timeout of its own; the job ends with the last of them.
+                let result = start(sender).boxed().shared();
+                let job = result.downgrade().map(|result| Job { progress: progress.clone(), result });
+                jobs.extend(job.map(|job| (key, job)));
+                (result, progress)
+            })
+        };
         let mut sent = Instant::now().checked_sub(STEP_INTERVAL).unwrap_or_else(Instant::now);
         loop {
             let step = async {
@@ -53,30 +65,6 @@ impl<K: Eq + Hash, T: Clone + Send + Sync + 'static> SingleFlight<K, T> {
                 }
             }
         }
-    }
-
-    fn join_or_start<F>(
-        &self,
-        key: K,
-        start: impl FnOnce(watch::Sender<String>) -> F,
-    ) -> (Shared<BoxFuture<'static, T>>, watch::Receiver<String>)
-    where
-        F: Future<Output = T> + Send + 'static,
-    {
-        let mut jobs = self.0.lock();
-        jobs.retain(|_, job| job.result.upgrade().is_some_and(|result| result.peek().is_none()));
-        if let Some(job) = jobs.get(&key)
-            && let Some(result) = job.result.upgrade()
-        {
-            return (result, job.progress.clone());
-        }
-        let (sender, progress) = watch::channel(String::new());
-        // Each waiter has a timeout of its own; the job ends with the last of them.
-        let result = start(sender).boxed().shared();
-        if let Some(weak) = result.downgrade() {
-            jobs.insert(key, Job { progress: progress.clone(), result: weak });
-        }
-        (result, progress)
     }
 }
 

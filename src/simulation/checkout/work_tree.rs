@@ -1,102 +1,97 @@
-//! A client's own copy of a project: its checkout by git, and its contents.
+//! A client's own copy of a project: its checkout by git.
 
-use std::ffi::OsString;
+use std::ffi::{OsStr, OsString};
 use std::io;
 use std::path::Path;
+use std::sync::Arc;
 
-use super::checkout_limits::CheckoutLimits;
+use rustix::process::Resource;
+
+use super::checkout_error::{CheckoutError, git_failed, machine, refused, too_large};
 use super::commit_resolver::ResolvedCommit;
 use super::disk;
-use super::git::{Call, LITTLE_MEMORY};
-use super::git_error::GitError;
+use super::git::LITTLE_MEMORY;
 use super::lfs;
+use super::project::Project;
 use super::repository::Repository;
 use super::revision::Revision;
-use super::world_file::{WorldFile, WorldFileError};
+use super::world_file::WorldFile;
 use crate::shared::domain::ProjectUrl;
-use crate::simulation::process::InstanceDir;
+use crate::simulation::process::{InstanceDir, Run};
 
-/// The contents of a copy.
-pub struct WorkTree {
-    /// Its size in bytes, at least the space of an entry for each file and directory.
-    pub size: u64,
-    /// Number of LFS pointers whose files could not be loaded.
-    pub pointers: usize,
-    /// The world file, or why it can't be opened.
-    pub world: Result<WorldFile, WorldFileError>,
-}
-
-/// A git command that writes these paths of a commit, each ended by a zero byte, into a directory. Its scratch files
-/// are in `scratch`.
+/// A git command that writes these paths of a commit, each ended by a zero byte, into a directory, with these settings, each
+/// as `name=value`. Its scratch files are in `scratch`.
 ///
 /// # Errors
 /// When the list of paths can't be written.
-pub fn checkout_command<'call>(
-    repository: &'call Repository,
+pub fn checkout_command(
+    repository: &Repository,
     revision: &Revision,
     paths: &[u8],
     (scratch, into): (&Path, &Path),
-) -> io::Result<Call<'call>> {
-    let list = scratch.join("paths");
+    settings: &[String],
+) -> io::Result<Run> {
+    let (list, reference) = (scratch.join("paths"), OsString::from(revision.reference()));
     std::fs::write(&list, paths)?;
-    let with = |option: &str, path: &Path| {
-        let mut argument = OsString::from(option);
-        argument.push(path);
-        argument
-    };
+    let with = |option: &str, path: &Path| [OsStr::new(option), path.as_os_str()].join(OsStr::new(""));
     let mut arguments = vec![with("--work-tree=", into)];
     arguments.extend(["checkout", "--force", "--progress", "--pathspec-file-nul"].map(OsString::from));
-    arguments.extend([with("--pathspec-from-file=", &list), revision.reference().into()]);
-    let mut call = Call { memory: LITTLE_MEMORY, ..repository.call(&arguments) };
-    call.environment.push(("GIT_INDEX_FILE".into(), scratch.join("index").into()));
-    call.environment.push(("GIT_ATTR_SOURCE".into(), revision.reference().into()));
+    arguments.extend([with("--pathspec-from-file=", &list), reference.clone()]);
+    let mut call = repository.configured(settings, &arguments);
+    call.limits.push((Resource::Data, LITTLE_MEMORY));
+    let index = scratch.join("index").into_os_string();
+    call.spec.environment.extend([("GIT_INDEX_FILE".into(), index), ("GIT_ATTR_SOURCE".into(), reference)]);
     Ok(call)
 }
 
-/// A written project.
-#[derive(Debug, Clone, Copy)]
-pub struct Written {
-    /// Whether it is within the size limit: git's attributes may make it larger than the commit, and a Git host may send
-    /// more than it should.
-    pub fits: bool,
-    /// Whether the cache has grown by its large files.
-    pub has_grown: bool,
-}
-
-/// Writes a project with git, with its large files; `on_line` receives its progress lines. Blocks its thread.
+/// Writes a project with git, with its large files if git-lfs is there; `on_line` receives git's progress lines. Blocks its
+/// thread.
 ///
 /// # Errors
-/// When git fails.
+/// Why it can't be checked out.
 pub async fn write(
     found: &ResolvedCommit,
-    instance: &InstanceDir,
-    (limits, has_lfs): (&CheckoutLimits, bool),
+    world: &ProjectUrl,
+    instance: &Arc<InstanceDir>,
+    (limit, has_lfs): (u64, bool),
     on_line: impl FnMut(&str),
-) -> Result<Written, GitError> {
-    let folder = if found.revision.folder.is_empty() { "." } else { &found.revision.folder };
-    let paths = [folder.as_bytes(), b"\0", &found.above].concat();
-    let project = instance.project();
-    let mut call = checkout_command(&found.repository, &found.revision, &paths, (instance.path(), &project))?;
+) -> Result<Project, CheckoutError> {
+    let ResolvedCommit { repository, revision, above } = found;
+    let folder = if revision.folder.is_empty() { "." } else { &revision.folder };
+    let paths = [folder.as_bytes(), b"\0", above].concat();
+    let (root, most) = (instance.project(), limit << 20);
+    let settings = if has_lfs { lfs::settings(&repository.remote()) } else { Vec::new() };
+    let call = checkout_command(repository, revision, &paths, (instance.path(), &root), &settings);
+    let mut call = call.map_err(|error| machine(world, &error))?;
     call.may_block = true;
     // git-lfs stores its downloads here, shared with concurrent checkouts, and copies them into the project.
-    let kept = call.repository.join("lfs");
+    let kept = repository.path.join("lfs");
     let before = if has_lfs { disk::room_of(&kept) } else { 0 };
-    let mut growing = vec![(project, limits.size)];
+    let mut growing = vec![(root.clone(), most)];
     if has_lfs {
-        call.settings = lfs::settings(&found.repository.remote());
-        growing.push((kept.clone(), before.saturating_add(limits.size.saturating_mul(2))));
+        growing.push((kept.clone(), before.saturating_add(most.saturating_mul(2))));
     }
-    let fits = tokio::select! {
-        written = found.repository.run(call, on_line) => written.map(|_| true)?,
-        () = disk::outgrown(growing) => false,
+    let written = tokio::select! {
+        written = repository.run(call, on_line) => written.map(|_| true),
+        () = disk::outgrown(growing) => Ok(false),
     };
-    Ok(Written { fits, has_grown: has_lfs && disk::room_of(&kept) > before })
-}
-
-/// Inspects a copy. Blocks.
-pub fn inspect(world: &ProjectUrl, instance: &InstanceDir, revision: &Revision) -> WorkTree {
-    let root = instance.project();
-    let (folder, path) = (root.join(&revision.folder), root.join(revision.world_path(world)));
-    let (size, pointers) = (disk::room_of(&root), lfs::pointers(&folder));
-    WorkTree { size, pointers, world: WorldFile::open(&root, &path) }
+    if has_lfs && disk::room_of(&kept) > before {
+        repository.growth.notify_one();
+    }
+    let size = disk::room_of(&root);
+    // git's attributes may make it larger than the commit, and a Git host may send more than it should.
+    if !written.map_err(|source| git_failed(world, &source))? || size > most {
+        return Err(too_large("The project", limit));
+    }
+    let folder = root.join(&revision.folder);
+    let pointers = lfs::pointers(&folder);
+    Ok(Project {
+        world: WorldFile::open(&root, &root.join(revision.world_path(world))).map_err(refused)?,
+        size,
+        warning: (pointers > 0).then(|| lfs::warning(pointers, has_lfs)),
+        url: world.clone(),
+        revision: revision.clone(),
+        folder,
+        instance: Arc::clone(instance),
+    })
 }

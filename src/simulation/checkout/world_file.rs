@@ -3,25 +3,6 @@
 use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 
-/// Why a file is not a valid world. The messages are for the client.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum WorldFileError {
-    /// There is no such file.
-    #[error("{0} does not exist")]
-    Missing(String),
-    /// It is a symlink to a file outside of the checkout.
-    #[error("{0} leads out of its repository")]
-    Outside(String),
-    /// Its first line is not that of a world.
-    #[error("{name} is no world file: its first line is {found:?}, not like \"#VRML_SIM R2025a utf8\"")]
-    Header {
-        /// The file name.
-        name: String,
-        /// Its first line.
-        found: String,
-    },
-}
-
 /// A valid world.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct WorldFile {
@@ -35,14 +16,14 @@ impl WorldFile {
     /// Inspects a world file below the directory `root`. Blocks.
     ///
     /// # Errors
-    /// When it is not a world inside of that directory.
-    pub fn open(root: &Path, path: &Path) -> Result<Self, WorldFileError> {
-        let name = || path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let missing = |_| WorldFileError::Missing(name());
+    /// When it is not a world inside of that directory, as text for the client.
+    pub fn open(root: &Path, path: &Path) -> Result<Self, String> {
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        let missing = |_| format!("{name} does not exist");
         let root = root.canonicalize().map_err(missing)?;
         let path = path.canonicalize().map_err(missing)?;
         if !path.starts_with(&root) {
-            return Err(WorldFileError::Outside(name()));
+            return Err(format!("{name} leads out of its repository"));
         }
         let file = std::fs::File::open(&path).map_err(missing)?;
         let mut line = Vec::new();
@@ -50,7 +31,9 @@ impl WorldFile {
         let line = String::from_utf8_lossy(&line).trim().to_owned();
         match line.split_whitespace().collect::<Vec<_>>().as_slice() {
             ["#VRML_SIM", version, "utf8", ..] => Ok(Self { version: (*version).to_owned(), path }),
-            _ => Err(WorldFileError::Header { name: name(), found: line }),
+            _ => {
+                Err(format!("{name} is no world file: its first line is {line:?}, not like \"#VRML_SIM R2025a utf8\""))
+            }
         }
     }
 }

@@ -3,6 +3,7 @@
 mod container;
 mod gpus;
 mod isolation;
+mod mirrors;
 mod resources;
 mod simulation_config;
 mod timing;
@@ -11,6 +12,7 @@ mod urls;
 pub use container::{ContainerDisplay, ContainerNetwork, ContainerSettings, EDITOR_PORT};
 pub use gpus::GpuUse;
 pub use isolation::{IsolationSetting, SandboxFolders, SandboxNetwork, VariableName};
+pub use mirrors::{Mirrors, Remote};
 pub use resources::ResourceLimits;
 pub use simulation_config::SimulationConfig;
 pub use timing::Timing;

@@ -9,6 +9,7 @@ use serde::{Deserialize, Serialize};
 use super::container::{ContainerDisplay, ContainerSettings, EDITOR_PORT};
 use super::gpus::GpuUse;
 use super::isolation::{IsolationSetting, SandboxFolders, VariableName};
+use super::mirrors::Mirrors;
 use super::resources::ResourceLimits;
 use super::timing::Timing;
 use super::urls::Streaming;
@@ -19,7 +20,6 @@ use crate::shared::config::{
 };
 use crate::shared::domain::{PublicUrl, UrlPrefix, complete_host};
 use crate::shared::http::{Origin, TrustedProxies, UserHeader};
-use crate::simulation::checkout::Mirrors;
 use crate::simulation::machine::display::{self, DisplayName};
 
 keys! {

@@ -8,10 +8,10 @@ use std::path::{Path, PathBuf};
 use nix::fcntl::OFlag;
 
 use super::dockerfile::Dockerfile;
-use super::project_file::text_of;
 use super::start_error::StartError;
-use super::templates::{CONTROLLER_DOCKERFILE, DOCKERFILE, LAUNCHER, Template, Templates};
-use super::webots_yml::{ProjectKind, WebotsYml};
+use super::templates::{self, CONTROLLER_DOCKERFILE, DOCKERFILE, LAUNCHER, Template};
+use super::webots_yml::{ProjectKind, WebotsYml, text_of};
+use crate::simulation::config::ContainerSettings;
 
 /// The path of a project in its container, as existing Dockerfiles expect.
 pub const PROJECT_PATH: &str = "/usr/local/webots-project";
@@ -30,7 +30,7 @@ pub struct BuildPlan {
 }
 
 /// An image to build.
-#[derive(Debug, Clone)]
+#[derive(Debug)]
 pub struct ImageBuild {
     /// The Dockerfile.
     pub dockerfile: Dockerfile,
@@ -53,19 +53,19 @@ impl BuildPlan {
     ///
     /// # Errors
     /// The problem, in the project or in the administrator's template.
-    pub fn read(project: &Path, templates: &Templates, owner: &str) -> Result<Self, StartError> {
+    pub fn read(project: &Path, settings: &ContainerSettings, owner: &str) -> Result<Self, StartError> {
         let mut yml = WebotsYml::read(project);
         let ignored = IGNORED.iter().filter(|name| project.join(name).symlink_metadata().is_ok());
         yml.warnings.extend(ignored.map(|name| format!("{name} of the project is not used here")));
         let has_makefile = project.join("Makefile").is_file();
         let dockerfile = match text_of(&project.join("Dockerfile"))? {
-            None if has_makefile || templates.has(DOCKERFILE) => Some(templates.text(DOCKERFILE)?.into_owned()),
+            None if has_makefile || templates::own(settings, DOCKERFILE).is_some() => {
+                Some(templates::text(settings, DOCKERFILE)?.into_owned())
+            }
             own => own,
         };
-        let controller = match yml.kind {
-            ProjectKind::Competition => Some(competition(project, templates)?),
-            ProjectKind::Default | ProjectKind::Editor => None,
-        };
+        let is_competition = yml.kind == ProjectKind::Competition;
+        let controller = is_competition.then(|| competition(project, settings)).transpose()?;
         let build = |text: &str, folder, more: &[&str]| {
             let mut arguments =
                 vec![format!("PROJECT_PATH={PROJECT_PATH}"), format!("MAKE={}", u8::from(has_makefile))];
@@ -77,16 +77,16 @@ impl BuildPlan {
             None => build(NO_DOCKERFILE, None, &[])?,
         };
         let controller = controller.map(|text| build(&text, Some("controllers"), &PARTICIPANT)).transpose()?;
-        let template = templates.compose(yml.kind).map_err(StartError::Server)?;
+        let template = templates::compose(settings, yml.kind).map_err(StartError::Server)?;
         Ok(Self { yml, template, image, controller })
     }
 }
 
 /// The Dockerfile of a competition's controllers. Writes the launcher to the paths from which this one and the
 /// project's can copy it.
-fn competition(project: &Path, templates: &Templates) -> Result<String, String> {
+fn competition(project: &Path, settings: &ContainerSettings) -> Result<String, String> {
     let controllers = inside(project, Path::new("controllers"))?;
-    let launcher = templates.text(LAUNCHER)?;
+    let launcher = templates::text(settings, LAUNCHER)?;
     for folder in [project, &controllers] {
         // The project's own file stays.
         match File::create_new(folder.join(LAUNCHER)).and_then(|mut file| file.write_all(launcher.as_bytes())) {
@@ -97,7 +97,7 @@ fn competition(project: &Path, templates: &Templates) -> Result<String, String> 
         }
     }
     let own = text_of(&controllers.join("Dockerfile"))?;
-    own.map_or_else(|| templates.text(CONTROLLER_DOCKERFILE).map(String::from), Ok)
+    own.map_or_else(|| templates::text(settings, CONTROLLER_DOCKERFILE).map(String::from), Ok)
 }
 
 /// A directory of the project, which must not be a symlink to a path outside.
@@ -132,7 +132,6 @@ pub fn open_participant(world: &Path) -> Result<(), StartError> {
 }
 
 /// The image of Webots for a version: up to R2023a on Ubuntu 20.04, later ones on 22.04.
-#[must_use]
 pub fn image_of(pattern: &str, version: &str) -> String {
     let ubuntu = if version < "R2023b" { "20.04" } else { "22.04" };
     pattern.replace("{version}", version).replace("{ubuntu}", ubuntu)
@@ -156,14 +155,14 @@ mod tests {
         assert_eq!(image_of("mine", "R2025a"), "mine");
     }
 
-    fn templates() -> Templates {
-        Templates { folder: None, debug: false }
+    fn read(project: &Path) -> Result<BuildPlan, StartError> {
+        BuildPlan::read(project, &ContainerSettings::default(), "x")
     }
 
     #[test]
     fn an_image_is_built_only_where_there_is_something_to_build() {
         let project = tempfile::tempdir().unwrap();
-        let plan = BuildPlan::read(project.path(), &templates(), "x").unwrap();
+        let plan = read(project.path()).unwrap();
         assert!(
             plan.image.folder.is_none()
                 && plan.image.dockerfile.bases == ["${WEBOTS_DEFAULT_IMAGE}"]
@@ -171,7 +170,7 @@ mod tests {
         );
         std::fs::write(project.path().join("Makefile"), "all:\n").unwrap();
         std::fs::write(project.path().join(".env"), "A=b").unwrap();
-        let plan = BuildPlan::read(project.path(), &templates(), "x").unwrap();
+        let plan = read(project.path()).unwrap();
         assert!(
             plan.image.arguments.contains(&"MAKE=1".to_owned())
                 && plan.image.folder == Some("")
@@ -179,7 +178,7 @@ mod tests {
         );
         assert_eq!(plan.yml.warnings, [".env of the project is not used here"]);
         std::fs::write(project.path().join("Dockerfile"), "FROM mine\n").unwrap();
-        let plan = BuildPlan::read(project.path(), &templates(), "x").unwrap();
+        let plan = read(project.path()).unwrap();
         assert!(plan.image.dockerfile.text.starts_with("FROM mine\nLABEL webots-fleet.owner=x\nRUN "));
     }
 
@@ -188,10 +187,10 @@ mod tests {
         let project = tempfile::tempdir().unwrap();
         let file = project.path().join("Dockerfile");
         std::os::unix::fs::symlink("/etc/passwd", &file).unwrap();
-        assert!(BuildPlan::read(project.path(), &templates(), "x").is_err());
+        assert!(read(project.path()).is_err());
         std::fs::remove_file(&file).unwrap();
         nix::unistd::mkfifo(&file, nix::sys::stat::Mode::S_IRWXU).unwrap();
-        let wrong = BuildPlan::read(project.path(), &templates(), "x").unwrap_err();
+        let wrong = read(project.path()).unwrap_err();
         assert_eq!(wrong.to_string(), "Dockerfile of the project is no plain file of at most 256 KiB");
     }
 

@@ -50,7 +50,6 @@ impl BuiltImage {
     }
 
     /// The entry point of its containers: the first program, which runs that of the image.
-    #[must_use]
     pub fn entrypoint(&self) -> Vec<String> {
         let home = self.env.iter().flatten().find_map(|variable| variable.strip_prefix("HOME="));
         let user = self.user.split(':').next().filter(|user| !user.is_empty()).unwrap_or("root");
@@ -59,7 +58,6 @@ impl BuiltImage {
     }
 
     /// The command of its containers if none is given.
-    #[must_use]
     pub fn command(&self) -> Vec<String> {
         self.cmd.clone().unwrap_or_default()
     }

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use super::docker::{self, Docker};
 use super::packet_filter;
-use super::templates::Templates;
+use super::templates;
 use crate::simulation::config::SimulationConfig;
 
 /// Timeout of a command that starts a container.
@@ -33,7 +33,7 @@ pub fn check(config: &SimulationConfig) -> Result<String, String> {
 /// # Errors
 /// The problems with them, as text for an administrator.
 pub fn check_templates(config: &SimulationConfig) -> Result<String, String> {
-    let faults = Templates::of(&config.container).faults();
+    let faults = templates::faults(&config.container);
     let found = match &config.container.templates {
         Some(folder) => format!("those in {}, else those of this server", folder.0.display()),
         None => "those of this server".to_owned(),
@@ -42,7 +42,6 @@ pub fn check_templates(config: &SimulationConfig) -> Result<String, String> {
 }
 
 /// Why the daemon can't be used now, as text for clients and administrators. Blocks for five seconds at most.
-#[must_use]
 pub fn daemon_fault() -> Option<String> {
     let version = docker::blocking(&["version", "--format", "{{.Server.Version}}"], ANSWER_TIMEOUT);
     version.err().map(|error| error.to_string())
@@ -50,7 +49,6 @@ pub fn daemon_fault() -> Option<String> {
 
 /// The directory in which Docker keeps images and containers; `None` if it does not run on this machine. Cached after
 /// the first answer; blocks for five seconds at most.
-#[must_use]
 pub fn data_folder() -> Option<PathBuf> {
     static FOLDER: OnceLock<PathBuf> = OnceLock::new();
     if std::env::var("DOCKER_HOST").is_ok_and(|host| !host.starts_with("unix:")) {
@@ -70,7 +68,6 @@ pub fn data_folder() -> Option<PathBuf> {
 /// Without one, `xvfb-run` of the images is process 1, to which Xvfb sends no signal, so that it waits forever. `docker
 /// info` does not show it: the version of Debian's docker-init is empty there. So this runs it in a container. Blocks
 /// for a second, for 45 at most.
-#[must_use]
 pub fn init_fault() -> Option<String> {
     let run = || {
         if docker::blocking(&["image", "inspect", EMPTY_IMAGE], START_TIMEOUT).is_err() {

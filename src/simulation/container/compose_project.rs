@@ -1,21 +1,36 @@
 //! The files of a compose project: the template, its variables, and the settings that override the template for each
 //! service.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use serde_json::{Value, json};
+use which::which;
 
-use super::build_plan::{BuildPlan, PROJECT_PATH};
+use super::build_plan::PROJECT_PATH;
 use super::built_image::BuiltImage;
-use super::container_request::ContainerRequest;
-use super::gpu_detection::GpuAccess;
 use super::project_paths::ProjectPaths;
 use super::start_error::StartError;
-use super::templates::{CONTROLLER, WEBOTS};
+use super::templates::{CONTROLLER, Template, WEBOTS};
+use super::webots_yml::WebotsYml;
+use crate::simulation::checkout::Project;
 use crate::simulation::config::{ContainerDisplay, EDITOR_PORT, SimulationConfig};
 use crate::simulation::machine::sensors::Gpu;
+
+/// A simulation that will run in containers.
+#[derive(Debug)]
+pub struct ContainerRequest {
+    /// The project that was checked out.
+    pub project: Arc<Project>,
+    /// The port of Webots.
+    pub port: u16,
+    /// The GPU that it was given; without one, it gets all.
+    pub gpu: Option<Gpu>,
+    /// Webots and its arguments, but for the world, which is the last.
+    pub command: Vec<String>,
+}
 
 /// The compose project of one simulation.
 #[derive(Debug)]
@@ -24,8 +39,10 @@ pub struct ComposeProject {
     pub name: String,
     /// What was requested.
     pub request: ContainerRequest,
-    /// What it consists of.
-    pub plan: BuildPlan,
+    /// What its project's `webots.yml` requests.
+    pub yml: WebotsYml,
+    /// The template for that.
+    pub template: Template,
     /// The image of Webots.
     pub image: BuiltImage,
     /// The image of a competition's controller.
@@ -34,13 +51,31 @@ pub struct ComposeProject {
     pub config: Arc<SimulationConfig>,
 }
 
+/// The access that containers can have to the GPUs of this machine.
+#[derive(Debug)]
+pub struct GpuAccess {
+    /// Whether Docker can give out NVIDIA GPUs.
+    pub nvidia: bool,
+    /// The groups of the devices of other GPUs; `None` if there are no such GPUs.
+    pub groups: Option<BTreeSet<u32>>,
+}
+
 /// Environment variables: names and values.
 pub type Variables = Vec<(&'static str, String)>;
 
 /// Size of shared memory: what a browser's engine inside of Webots needs.
 const SHARED_MEMORY: &str = "256m";
+/// Runs a program on a virtual display; part of the images of Webots.
+const VIRTUAL_DISPLAY: [&str; 2] = ["xvfb-run", "--auto-servernum"];
 /// The directory with the sockets of the machine's displays.
 const DISPLAYS: &str = "/tmp/.X11-unix";
+
+/// The program by which Docker gives out NVIDIA GPUs: part of NVIDIA's container toolkit.
+const NVIDIA_HOOK: &str = "nvidia-container-runtime-hook";
+/// A device of NVIDIA's driver.
+const NVIDIA: &str = "/dev/nvidiactl";
+/// The directory of the devices of other GPUs.
+const DRI: &str = "/dev/dri";
 
 impl ComposeProject {
     /// Writes the files, and returns the options by which compose finds them, and the variables that it has to have: those of
@@ -49,14 +84,19 @@ impl ComposeProject {
     /// # Errors
     /// When a path of the project can't be used, or a file can't be written.
     pub fn write(&self) -> Result<(Vec<String>, Variables), StartError> {
-        let paths = ProjectPaths::of(&self.plan.yml, &self.request.project)?;
+        let paths = ProjectPaths::of(&self.yml, &self.request.project)?;
         let folder = self.request.project.instance.path().join("compose");
         std::fs::create_dir_all(&folder)?;
         std::fs::create_dir_all(self.exchange())?;
         let path = |name: &str| folder.join(name).to_string_lossy().into_owned();
         let (template, overridden) = (path("docker-compose.yml"), path("override.json"));
-        let command = self.request.command(&self.config, &paths.world);
-        std::fs::write(&template, self.plan.template.text.as_bytes())?;
+        let display = match self.config.container.display {
+            ContainerDisplay::Virtual => VIRTUAL_DISPLAY.map(str::to_owned).into(),
+            ContainerDisplay::Machine => Vec::new(),
+        };
+        let world = format!("{PROJECT_PATH}/{}", paths.world);
+        let command = [display, self.request.command.clone(), vec![world]].concat();
+        std::fs::write(&template, self.template.text.as_bytes())?;
         std::fs::write(&overridden, self.overridden(&command).to_string())?;
         let options = ["--file", &template, "--file", &overridden].map(str::to_owned);
         Ok((options.into(), self.variables(&command, &paths)))
@@ -85,7 +125,7 @@ impl ComposeProject {
             ("COMPOSE_PROJECT_NAME", self.name.clone()),
             ("WEBOTS", command),
             ("THEIA_IMAGE", config.container.editor_image.clone()),
-            ("THEIA_VOLUME", self.plan.yml.folder.clone()),
+            ("THEIA_VOLUME", self.yml.folder.clone()),
             ("THEIA_FOLDER", path(&paths.edited)),
             ("THEIA_PORT", (port + EDITOR_PORT).to_string()),
             ("IPC", path(&self.exchange())),
@@ -113,9 +153,19 @@ impl ComposeProject {
             }
             (name.clone(), json!(service))
         };
-        let services: serde_json::Map<String, Value> = self.plan.template.services.iter().map(service).collect();
+        let services: serde_json::Map<String, Value> = self.template.services.iter().map(service).collect();
         let network = json!({ "default": { "external": true, "name": self.config.container.network.name() } });
         json!({ "services": services, "networks": network })
+    }
+}
+
+impl GpuAccess {
+    /// Looks for the GPUs.
+    pub fn find() -> Self {
+        let group = |file: std::fs::DirEntry| Some(file.metadata().ok()?.gid());
+        let groups = std::fs::read_dir(DRI).ok().map(|files| files.flatten().filter_map(group).collect());
+        let nvidia = Path::new(NVIDIA).exists() && which(NVIDIA_HOOK).is_ok();
+        Self { nvidia, groups }
     }
 }
 
@@ -192,7 +242,6 @@ fn memory_folders(size: u64) -> [String; 3] {
 }
 
 /// The name of the container of a service of a compose project.
-#[must_use]
 pub fn container_of(project: &str, service: &str) -> String {
     format!("{project}-{service}")
 }

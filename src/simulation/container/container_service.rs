@@ -9,12 +9,10 @@ use tokio::sync::Semaphore;
 use tokio_util::task::AbortOnDropHandle;
 
 use super::build_plan::{BuildPlan, ImageBuild, PROJECT_PATH};
-use super::compose_project::ComposeProject;
-use super::container_request::ContainerRequest;
-use super::docker::Docker;
+use super::compose_project::{ComposeProject, ContainerRequest};
+use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
 use super::image::Images;
 use super::image_export::export;
-use super::network;
 use super::orphan_cleanup::{ActiveProjects, run_cleanup};
 use super::owned_resources::{ResourceOwner, sweep_all};
 use super::packet_filter;
@@ -22,7 +20,7 @@ use super::project_paths::participant_folder;
 use super::simulation_containers::SimulationContainers;
 use super::start_error::{StartError, blame};
 use super::steps;
-use super::templates::Templates;
+use super::templates;
 use super::webots_yml::ProjectKind;
 use crate::simulation::checkout::OnProgress;
 use crate::simulation::config::SimulationConfig;
@@ -33,7 +31,6 @@ pub struct ContainerService {
     owner: ResourceOwner,
     /// The owner of these containers, for a process that removes them after the server's end.
     pub run: ResourceOwner,
-    templates: Templates,
     images: Arc<Images>,
     active: ActiveProjects,
     /// What containers can do because the packet filter is missing; `None` if it is loaded.
@@ -44,6 +41,8 @@ pub struct ContainerService {
     _keeper: AbortOnDropHandle<()>,
 }
 
+/// The option by which containers in a network can't reach each other.
+const ALONE: &str = "com.docker.network.bridge.enable_icc=false";
 /// Timeout of the creation of a simulation's containers: the disk of Docker may be busy with images of others.
 const CREATE_TIMEOUT: Duration = Duration::from_mins(2);
 
@@ -62,8 +61,7 @@ impl ContainerService {
         if let Some(why) = &shortcoming {
             log::warn!("{why}");
         }
-        let templates = Templates::of(&config.container);
-        templates.faults().iter().for_each(|fault| log::error!("{fault}"));
+        templates::faults(&config.container).iter().for_each(|fault| log::error!("{fault}"));
         let images = Images::new(docker.clone(), owner.clone(), Arc::clone(&config));
         let (images, active) = (Arc::new(images), ActiveProjects::default());
         let keeper = run_cleanup(owner.clone(), active.clone(), Arc::clone(&images), Arc::clone(&config));
@@ -72,7 +70,6 @@ impl ContainerService {
             docker,
             owner,
             run: this_run,
-            templates,
             images,
             active,
             shortcoming,
@@ -94,31 +91,36 @@ impl ContainerService {
         progress: OnProgress<'_>,
     ) -> Result<SimulationContainers, StartError> {
         let (project, docker, size) = (&request.project, &self.docker, self.config.project_size);
-        let (folder, templates, owner) = (project.folder().to_owned(), self.templates.clone(), self.owner.clone());
-        let plan = spawn_blocking(move || BuildPlan::read(&folder, &templates, owner.name())).await??;
+        let (folder, config, owner) = (project.folder.clone(), Arc::clone(&self.config), self.owner.clone());
+        let plan = spawn_blocking(move || BuildPlan::read(&folder, &config.container, &owner.0)).await??;
+        let BuildPlan { yml, template, image, controller } = plan;
         let guard = self.active.insert(self.run.project(request.port));
-        network::join(docker, self.config.container.network.name()).await?;
-        let made = async |build: &ImageBuild, from: &Path, to: &Path| {
+        join_network(docker, self.config.container.network.name()).await?;
+        let is_projects = image.folder.is_some() || controller.is_some();
+        let made = async |build: ImageBuild, from: &Path, to: &Path| {
+            let has_project = build.folder.is_some();
             let image = self.images.build(project, build, progress).await?;
-            if build.folder.is_some() {
+            if has_project {
                 export(docker, &guard.name, (&image.name, from), project, to, size).await?;
             }
             Ok::<_, StartError>(image)
         };
-        let image = made(&plan.image, Path::new(PROJECT_PATH), project.folder()).await?;
-        let mut controller = None;
-        if let Some(build) = &plan.controller {
-            let from = Path::new(PROJECT_PATH).join(plan.yml.folder_in_project());
-            controller = Some(made(build, &from, &participant_folder(project)).await?);
-        }
-        if plan.yml.kind != ProjectKind::Default {
+        let image = made(image, Path::new(PROJECT_PATH), &project.folder).await?;
+        let controller = match controller {
+            Some(build) => {
+                let from = Path::new(PROJECT_PATH).join(yml.folder_in_project());
+                Some(made(build, &from, &participant_folder(project)).await?)
+            }
+            None => None,
+        };
+        let has_editor = yml.kind != ProjectKind::Default;
+        if has_editor {
             self.images.pull(&self.config.container.editor_image, progress).await?;
         }
-        let is_projects = plan.image.folder.is_some() || controller.is_some();
-        let (yml, services) = (plan.yml.clone(), plan.template.services.clone());
         let (name, config) = (guard.name.clone(), Arc::clone(&self.config));
-        let compose = ComposeProject { name, request, plan, image, controller, config };
-        let (options, variables) = spawn_blocking(move || compose.write()).await??;
+        let compose = ComposeProject { name, request, yml, template, image, controller, config };
+        let (written, compose) = spawn_blocking(move || (compose.write(), compose)).await?;
+        let ((options, variables), ComposeProject { yml, template, .. }) = (written?, compose);
         // More concurrent runs would only be slower.
         let turn = self.turns.acquire().await.map_err(|error| StartError::Server(error.to_string()))?;
         progress(steps::CREATING.to_owned());
@@ -128,9 +130,25 @@ impl ContainerService {
         created.map_err(|error| blame(is_projects, error))?;
         drop(turn);
         // An editor has a port of its own, which the relay of streams does not reach.
-        let has_editor = yml.kind != ProjectKind::Default && self.config.ports_are_public();
-        let texts = has_editor.then(|| "ide: enable".to_owned()).into_iter().chain(yml.project_type).collect();
-        let (docker, services, warnings) = (self.docker.clone(), services.into_keys().collect(), yml.warnings);
-        Ok(SimulationContainers { docker, guard, services, is_projects, texts, warnings, restart: None })
+        let ide = (has_editor && self.config.ports_are_public()).then(|| "ide: enable".to_owned());
+        let texts = ide.into_iter().chain(yml.project_type).collect();
+        let (docker, services) = (self.docker.clone(), template.services.into_keys().collect());
+        Ok(SimulationContainers { docker, guard, services, is_projects, texts, warnings: yml.warnings, restart: None })
+    }
+}
+
+/// Creates the network of all containers, unless it exists. Its name is also that of its interface, which the packet filter
+/// matches.
+async fn join_network(docker: &Docker, name: &str) -> Result<(), DockerError> {
+    // One network for all, because Docker's address pools allow only some thirty.
+    let interface = format!("com.docker.network.bridge.name={name}");
+    let create = ["network", "create", "--driver", "bridge", "--opt", &interface, "--opt", ALONE, name];
+    match docker.run(&create, SHORT_TIMEOUT).await {
+        Err(DockerError::Failed { message, .. }) if message.contains("already exists") => Ok(()),
+        // Two that are created at the same time would have the same interface, which Docker refuses.
+        Err(DockerError::Failed { message, .. }) if message.contains("have same bridge name") => {
+            docker.run(&["network", "inspect", name], SHORT_TIMEOUT).await.map(drop)
+        }
+        created => created.map(drop),
     }
 }

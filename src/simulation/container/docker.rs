@@ -111,7 +111,6 @@ impl Docker {
     }
 
     /// The specification of a client program of the daemon. Dropping its process group ends only that program.
-    #[must_use]
     pub fn spec(&self, command: Vec<OsString>, grace: Duration) -> SpawnSpec {
         // The classic builder prints its steps, and can build on the server's own network; BuildKit can't.
         let environment = vec![("DOCKER_BUILDKIT".into(), "0".into()), ("COMPOSE_ANSI".into(), "never".into())];

@@ -13,7 +13,7 @@ use super::compose_project::DEFAULT_MEMORY;
 use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
 use super::dockerfile::LABEL;
 use super::owned_resources::{ResourceOwner, digest};
-use super::start_error::{StartError, blame, is_disk_full};
+use super::start_error::{StartError, is_disk_full};
 use super::steps;
 use crate::simulation::checkout::{OnProgress, Project, SingleFlight};
 use crate::simulation::config::SimulationConfig;
@@ -39,7 +39,6 @@ const REMOVED: &str = "An image that this simulation needs was removed meanwhile
 
 impl Images {
     /// The images of this owner.
-    #[must_use]
     pub fn new(docker: Docker, owner: ResourceOwner, config: Arc<SimulationConfig>) -> Self {
         let builds = Semaphore::new(config.container.builds);
         Self { docker, owner, config, builds, jobs: SingleFlight::default() }
@@ -51,9 +50,6 @@ impl Images {
     /// # Errors
     /// Why it can't be pulled, as text for the client.
     pub async fn pull(self: &Arc<Self>, image: &str, progress: OnProgress<'_>) -> Result<String, StartError> {
-        if let Some(id) = self.inspect(image, ID).await? {
-            return Ok(id);
-        }
         let (this, name) = (Arc::clone(self), image.to_owned());
         let pull = move |sender: watch::Sender<String>| async move {
             let _permit = this.permit(&sender).await?;
@@ -62,8 +58,7 @@ impl Images {
             let pulled = this.docker.follow(command, Vec::new(), this.config.timing.build, on_line).await;
             pulled.map_err(|error| not_pulled(&name, error))
         };
-        self.jobs.join(image.to_owned(), progress, pull).await?;
-        self.inspect(image, ID).await?.ok_or_else(|| StartError::Server(REMOVED.to_owned()))
+        self.made(image, ID, progress, pull).await
     }
 
     /// Builds an image of a project unless it exists.
@@ -73,11 +68,10 @@ impl Images {
     pub async fn build(
         self: &Arc<Self>,
         project: &Arc<Project>,
-        build: &ImageBuild,
+        mut build: ImageBuild,
         progress: OnProgress<'_>,
     ) -> Result<BuiltImage, StartError> {
         let webots = build_plan::image_of(&self.config.container.image, &project.world.version);
-        let mut build = build.clone();
         build.arguments.push(format!("WEBOTS_DEFAULT_IMAGE={webots}"));
         let mut parts = [vec![build.dockerfile.text.clone()], build.arguments.clone()].concat();
         parts.extend(build.folder.into_iter().flat_map(|folder| [project.identity(), folder.to_owned()]));
@@ -91,17 +85,26 @@ impl Images {
                 self.inspect(base, ID).await?
             });
         }
-        let name = format!("webots-fleet/{}:{}", self.owner.name(), digest(parts.join("\0").as_bytes()));
-        if let Some(config) = self.inspect(&name, CONFIG).await? {
-            return Ok(BuiltImage::read(name, &config)?);
-        }
-        let is_projects = build.folder.is_some();
+        let name = format!("webots-fleet/{}:{}", self.owner.0, digest(parts.join("\0").as_bytes()));
         let (this, project, tag) = (Arc::clone(self), Arc::clone(project), name.clone());
         let job = |sender| async move { this.build_now(&tag, &project, build, sender).await };
-        self.jobs.join(name.clone(), progress, job).await?;
-        let inspect = ["image", "inspect", "--format", CONFIG, &name];
-        let config = self.docker.run(&inspect, SHORT_TIMEOUT).await.map_err(|error| blame(is_projects, error))?;
-        Ok(BuiltImage::read(name, config.trim())?)
+        let config = self.made(&name, CONFIG, progress, job).await?;
+        Ok(BuiltImage::read(name, &config)?)
+    }
+
+    /// Makes an image by this job unless it exists. Returns what Docker says of it in this format.
+    async fn made<F: Future<Output = Result<(), StartError>> + Send + 'static>(
+        &self,
+        name: &str,
+        format: &str,
+        progress: OnProgress<'_>,
+        job: impl FnOnce(watch::Sender<String>) -> F,
+    ) -> Result<String, StartError> {
+        if let Some(found) = self.inspect(name, format).await? {
+            return Ok(found);
+        }
+        self.jobs.join(name.to_owned(), progress, job).await?;
+        self.inspect(name, format).await?.ok_or_else(|| StartError::Server(REMOVED.to_owned()))
     }
 
     async fn build_now(
@@ -114,7 +117,7 @@ impl Images {
         // What has no step of a project takes seconds.
         let _permit = if build.folder.is_some() { Some(self.permit(&sender).await?) } else { None };
         let ImageBuild { dockerfile, folder, arguments } = build;
-        let (instance, root) = (project.instance.path().to_owned(), project.folder().to_owned());
+        let (instance, root) = (project.instance.path().to_owned(), project.folder.clone());
         let prepare = move || {
             let file = instance.join(format!("Dockerfile{}", folder.unwrap_or_default()));
             std::fs::write(&file, dockerfile.text)?;
@@ -152,8 +155,8 @@ impl Images {
         sender.send("waiting for images of others to be built".to_owned()).ok();
         let limit = self.config.timing.build;
         let busy = || format!("Images of others were being built for {} seconds (timing.build)", limit.as_secs());
-        let permit = actix_rt::time::timeout(limit, self.builds.acquire()).await;
-        permit.map_err(|_| StartError::Server(busy()))?.map_err(|error| StartError::Server(error.to_string()))
+        let permit = actix_rt::time::timeout(limit, self.builds.acquire()).await.ok().and_then(Result::ok);
+        permit.ok_or_else(|| StartError::Server(busy()))
     }
 
     /// What Docker says of an image in this format; `None` if it does not exist.
@@ -171,7 +174,7 @@ impl Images {
     /// # Errors
     /// When Docker fails.
     pub async fn prune(&self, hours: u64) -> Result<(), DockerError> {
-        let (mine, old) = (format!("label={LABEL}={}", self.owner.name()), format!("until={hours}h"));
+        let (mine, old) = (format!("label={LABEL}={}", self.owner.0), format!("until={hours}h"));
         let prune = ["image", "prune", "--all", "--force", "--filter", &mine, "--filter", &old];
         self.docker.run(&prune, SHORT_TIMEOUT).await.map(drop)
     }

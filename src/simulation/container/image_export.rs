@@ -7,7 +7,7 @@ use std::time::Duration;
 use actix_rt::task::spawn_blocking;
 
 use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
-use super::owned_resources::{self, PROJECT};
+use super::owned_resources;
 use super::start_error::{StartError, blame};
 use crate::simulation::checkout::{Project, outgrown};
 use crate::simulation::process::remove_tree;
@@ -16,7 +16,7 @@ use crate::simulation::process::remove_tree;
 const COPY_TIMEOUT: Duration = Duration::from_mins(2);
 
 /// Copies a directory of an image to `to`, which it creates or replaces, by a temporary directory of the project's
-/// instance. `name` is the compose project; `size` the limit, in MiB.
+/// instance. `name` is the compose project, which its container is named after; `size` the limit, in MiB.
 ///
 /// # Errors
 /// Why not, as text for the client.
@@ -28,11 +28,11 @@ pub async fn export(
     to: &Path,
     size: u64,
 ) -> Result<(), StartError> {
-    let label = format!("{PROJECT}={name}");
-    let create = ["create", "--label", &label, "--network", "none", image, "true"];
-    let container = docker.run(&create, SHORT_TIMEOUT).await.map_err(|error| blame(true, error))?;
-    let (container, through) = (container.trim(), project.instance.path().join("copied"));
-    let source = format!("{container}:{}/.", from.display());
+    let name = format!("{name}-{:08x}", rand::random::<u32>());
+    let create = ["create", "--name", &name, "--network", "none", image, "true"];
+    docker.run(&create, SHORT_TIMEOUT).await.map_err(|error| blame(true, error))?;
+    let through = project.instance.path().join("copied");
+    let source = format!("{name}:{}/.", from.display());
     let words = ["cp", &source, &through.to_string_lossy()].map(str::to_owned);
     tokio::select! {
         copied = docker.run(&words, COPY_TIMEOUT) => drop(copied.map_err(|error| not_copied(error, from))?),
@@ -40,7 +40,7 @@ pub async fn export(
             return Err(format!("The project in its image is larger than {size} MiB (projectSize)").into());
         }
     }
-    owned_resources::remove(docker, &[container.to_owned()]).await?;
+    owned_resources::remove(docker, &[name]).await?;
     let to = to.to_owned();
     Ok(spawn_blocking(move || remove_tree(&to).and_then(|()| std::fs::rename(&through, &to))).await??)
 }

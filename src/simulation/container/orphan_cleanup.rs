@@ -66,12 +66,13 @@ pub async fn run_cleanup(
         // Most is removed by then without a sweep.
         actix_rt::time::sleep(RETRY_INTERVAL).await;
         let (of, used) = (owner.clone(), active.clone());
-        let sweep = move || owned_resources::sweep(&of, |project| used.0.0.lock().contains(project));
+        let is_used = move |name: &str| used.0.0.lock().iter().any(|project| name.starts_with(project));
+        let sweep = move || owned_resources::sweep(&of, is_used);
         pause = match actix_rt::task::spawn_blocking(sweep).await {
             Ok(Ok(left)) if left.is_empty() => SWEEP_INTERVAL,
             // Containers that Docker was removing when it was stopped appear one by one.
             Ok(Ok(left)) => {
-                log::info!("{} was left: removed", left.into_iter().collect::<Vec<_>>().join(", "));
+                log::info!("{} was left: removed", left.join(", "));
                 RETRY_INTERVAL
             }
             // Docker does not answer, or another process removes the same.

@@ -1,9 +1,9 @@
-//! What a server has in Docker: the containers of its simulations, found by the label that compose gives to all that it
-//! makes. There are no networks and no named volumes of theirs: templates that have some are refused.
+//! What a server has in Docker: the containers of its simulations. There are no networks and no named volumes of theirs:
+//! templates that have some are refused.
 //!
-//! The names of its compose projects have a common prefix, so that the resources of a crashed server are found again.
+//! The names of its compose projects, which those of their containers begin with, have a common prefix, so that the resources
+//! of a crashed server are found again.
 
-use std::collections::BTreeSet;
 use std::path::Path;
 use std::time::Duration;
 
@@ -11,24 +11,10 @@ use sha2::{Digest, Sha256};
 
 use super::docker::{self, Docker, DockerError, SHORT_TIMEOUT};
 
-/// The label with which compose marks its projects.
-pub const PROJECT: &str = "com.docker.compose.project";
-
-/// Arguments of docker that list all containers of compose: the id and the project of each. A container inherits labels of
-/// its image, which a project may have made: a quoted beginning of it is one word on one line.
-pub const LIST: [&str; 7] = [
-    "ps",
-    "--all",
-    "--no-trunc",
-    "--filter",
-    "label=com.docker.compose.project",
-    "--format",
-    "{{.ID}} {{printf \"%.100q\" (.Label \"com.docker.compose.project\")}}",
-];
-
-/// The owner of compose projects and images: a server, or one run of it. Their names have a common prefix.
+/// The owner of compose projects and images: a server, or one run of it. Their names have a common prefix: that of the owner
+/// is 12 hexadecimal digits; of a run also `-` and 8 more.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct ResourceOwner(String);
+pub struct ResourceOwner(pub String);
 
 /// How long each command of a sweep may take.
 const SWEEP_TIMEOUT: Duration = Duration::from_secs(20);
@@ -37,7 +23,6 @@ const REMOVE: [&str; 3] = ["rm", "--force", "--volumes"];
 
 impl ResourceOwner {
     /// The server with this cache directory, which only one server uses.
-    #[must_use]
     pub fn of(cache: &Path) -> Self {
         let cache = cache.canonicalize().unwrap_or_else(|_| cache.to_owned());
         let mut name = digest(cache.as_os_str().as_encoded_bytes());
@@ -46,49 +31,26 @@ impl ResourceOwner {
     }
 
     /// One run of this server: resources of the next run have another owner.
-    #[must_use]
     pub fn run(&self) -> Self {
         Self(format!("{}-{:08x}", self.0, rand::random::<u32>()))
     }
 
-    /// The owner with this name, from [`Self::name`].
-    #[must_use]
-    pub fn named(name: &str) -> Self {
-        Self(name.to_owned())
-    }
-
-    /// Its name: 12 hexadecimal digits; for a run also `-` and 8 more.
-    #[must_use]
-    pub fn name(&self) -> &str {
-        &self.0
-    }
-
     /// A new name for the compose project of a simulation on this port.
-    #[must_use]
     pub fn project(&self, port: u16) -> String {
         format!("{}{port}-{:08x}", self.prefix(), rand::random::<u32>())
     }
 
-    /// The port of the simulation with this compose project; `None` if it has another owner.
-    #[must_use]
-    pub fn port_of(&self, project: &str) -> Option<u16> {
-        project.strip_prefix(&self.prefix())?.split('-').next()?.parse().ok()
+    /// The port of the simulation with this container; `None` if it has another owner.
+    pub fn port_of(&self, container: &str) -> Option<u16> {
+        container.strip_prefix(&self.prefix())?.split('-').next()?.parse().ok()
     }
 
     fn prefix(&self) -> String {
         format!("webots-fleet-{}-", self.0)
     }
-
-    /// The containers of this owner in what [`LIST`] prints: the id and the project of each.
-    pub fn containers<'list>(&self, list: &'list str) -> impl Iterator<Item = (&'list str, &'list str)> {
-        let prefix = self.prefix();
-        let lines = list.lines().filter_map(|line| line.strip_suffix('"')?.split_once(" \""));
-        lines.filter(move |(_, project)| project.starts_with(&prefix))
-    }
 }
 
 /// The SHA-256 of a text, in hexadecimal digits.
-#[must_use]
 pub fn digest(text: &[u8]) -> String {
     let digest = Sha256::digest(text);
     digest.iter().fold(String::new(), |text, byte| format!("{text}{byte:02x}"))
@@ -111,19 +73,18 @@ pub async fn remove(docker: &Docker, containers: &[String]) -> Result<(), Docker
     }
 }
 
-/// Removes the containers of an owner, except those of projects in use. Returns the projects of what it has removed.
-/// Blocks.
+/// Removes the containers of an owner, except those in use. Returns the names of those that it has removed. Blocks.
 ///
 /// # Errors
 /// When Docker fails; then some may remain.
-pub fn sweep(owner: &ResourceOwner, is_used: impl Fn(&str) -> bool) -> Result<BTreeSet<String>, DockerError> {
-    let list = docker::blocking(&LIST, SWEEP_TIMEOUT)?;
-    let (ids, projects): (Vec<_>, BTreeSet<_>) =
-        owner.containers(&list).filter(|(_, project)| !is_used(project)).unzip();
-    if !ids.is_empty() {
-        docker::blocking(&[&REMOVE, ids.as_slice()].concat(), SWEEP_TIMEOUT)?;
+pub fn sweep(owner: &ResourceOwner, is_used: impl Fn(&str) -> bool) -> Result<Vec<String>, DockerError> {
+    let list =
+        docker::blocking(&["ps", "--all", "--filter", "name=webots-fleet-", "--format", "{{.Names}}"], SWEEP_TIMEOUT)?;
+    let names: Vec<&str> = list.lines().filter(|name| name.starts_with(&owner.prefix()) && !is_used(name)).collect();
+    if !names.is_empty() {
+        docker::blocking(&[&REMOVE, names.as_slice()].concat(), SWEEP_TIMEOUT)?;
     }
-    Ok(projects.into_iter().map(str::to_owned).collect())
+    Ok(names.into_iter().map(str::to_owned).collect())
 }
 
 /// Removes all containers of an owner: for a process that watches over the server's end. What is left is removed by the next

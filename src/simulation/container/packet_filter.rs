@@ -19,7 +19,6 @@ const TIMEOUT: Duration = Duration::from_secs(5);
 /// list it; for other users systemd reports whether its unit has run.
 ///
 /// Blocks for five seconds at most, because it runs a program.
-#[must_use]
 pub fn missing() -> Option<String> {
     let is_root = nix::unistd::geteuid().is_root();
     let why = if is_root { list(TABLE) } else { succeeds(UNIT) }.err()?;
@@ -32,7 +31,6 @@ pub fn missing() -> Option<String> {
 /// Whether a packet filter keeps others from the ports of Webots; unknown to users other than root.
 ///
 /// Blocks for five seconds at most, because it runs a program.
-#[must_use]
 pub fn closes_streams() -> Option<bool> {
     nix::unistd::geteuid().is_root().then(|| list(STREAMS).is_ok())
 }

@@ -25,7 +25,7 @@ impl ProjectPaths {
     /// # Errors
     /// When one does not exist or can't be mounted, as text for the client.
     pub fn of(yml: &WebotsYml, project: &Project) -> Result<Self, StartError> {
-        let root = project.folder().canonicalize().map_err(|error| error.to_string())?;
+        let root = project.folder.canonicalize().map_err(|error| error.to_string())?;
         let world = world_in(&root, project)?;
         let edited = match yml.kind {
             ProjectKind::Default => root.clone(),
@@ -41,7 +41,6 @@ impl ProjectPaths {
 
 /// The directory of a competition's participant. It is not in the project, where a world's program could replace it by
 /// a symlink before the controller is restarted.
-#[must_use]
 pub fn participant_folder(project: &Project) -> PathBuf {
     project.instance.path().join("edited")
 }

@@ -55,7 +55,6 @@ const RESTART_INTERVAL: Duration = Duration::from_secs(1);
 
 impl Cause {
     /// Whether this server is the cause, so that another one may accept the client.
-    #[must_use]
     pub fn is_own(self) -> bool {
         self != Self::OutOfMemory
     }
@@ -71,7 +70,6 @@ impl SimulationContainers {
     }
 
     /// The process that starts Webots' container, prints its output, and exits with its exit code.
-    #[must_use]
     pub fn spawn_spec(&self, grace: Duration) -> SpawnSpec {
         let webots = self.container(WEBOTS);
         self.docker.spec(["docker", "start", "--attach", &webots].map(Into::into).to_vec(), grace)
@@ -98,7 +96,6 @@ impl SimulationContainers {
     }
 
     /// Restarts the participant's controller on notification, as the original does when Webots was reset.
-    #[must_use]
     pub fn restart(&self) -> Option<Arc<Notify>> {
         self.restart.as_ref().map(|(request, _)| Arc::clone(request))
     }

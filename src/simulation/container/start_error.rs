@@ -15,7 +15,6 @@ pub enum StartError {
 
 /// The cause if Docker fails with the containers of a simulation. `is_projects` tells whether the project has defined
 /// one of their images: then the project is the cause, unless the disk is full.
-#[must_use]
 pub fn blame(is_projects: bool, error: DockerError) -> StartError {
     match &error {
         DockerError::Failed { message, .. } if is_projects && !is_disk_full(message) => {
@@ -26,7 +25,6 @@ pub fn blame(is_projects: bool, error: DockerError) -> StartError {
 }
 
 /// Whether Docker reports a full disk. Only the end of the message counts, because it may contain names of the project.
-#[must_use]
 pub fn is_disk_full(message: &str) -> bool {
     message.ends_with("no space left on device")
 }

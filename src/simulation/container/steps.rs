@@ -10,7 +10,6 @@ const STEPS: u64 = 9;
 pub const CREATING: &str = "Creating network and containers";
 
 /// The step of a pull, with Docker's output line.
-#[must_use]
 pub fn pulling(image: &str, line: &str) -> String {
     format!("Step 1/9 : fetching {image}: {line}")
 }
@@ -26,7 +25,6 @@ const NOISE: [&str; 6] = [
 ];
 
 /// The step of a build, from Docker's output line; `None` if it is not shown. The page supports nine steps.
-#[must_use]
 pub fn building(line: &str) -> Option<String> {
     if NOISE.iter().any(|beginning| line.starts_with(beginning)) {
         return None;

@@ -7,6 +7,7 @@ use std::path::PathBuf;
 use serde_json::Value;
 
 use super::webots_yml::ProjectKind;
+use crate::shared::config::ExpandedPath;
 use crate::simulation::config::ContainerSettings;
 
 /// Embeds a built-in template.
@@ -14,15 +15,6 @@ macro_rules! shipped {
     ($name:literal) => {
         ($name, include_str!(concat!("../../../config/simulation/docker/", $name)))
     };
-}
-
-/// The source of templates.
-#[derive(Debug, Clone)]
-pub struct Templates {
-    /// The administrator's directory.
-    pub folder: Option<PathBuf>,
-    /// Whether the debug variants are used.
-    pub debug: bool,
 }
 
 /// A template for compose.
@@ -45,71 +37,57 @@ pub const CONTROLLER_DOCKERFILE: &str = "Dockerfile.controller";
 /// The launcher of a participant's controller.
 pub const LAUNCHER: &str = "remote_controller_launcher.py";
 
-impl Templates {
-    /// The templates of a configuration.
-    #[must_use]
-    pub fn of(settings: &ContainerSettings) -> Self {
-        Self { folder: settings.templates.as_ref().map(|folder| folder.0.clone()), debug: settings.debug }
+/// The problems of the administrator's files, with the line and what to write there.
+pub fn faults(settings: &ContainerSettings) -> Vec<String> {
+    let Some(ExpandedPath(folder)) = &settings.templates else { return Vec::new() };
+    if let Err(error) = std::fs::read_dir(folder) {
+        return vec![format!("container.templates, {}: {error}", folder.display())];
     }
+    let kinds = [ProjectKind::Default, ProjectKind::Editor, ProjectKind::Competition];
+    let files = [DOCKERFILE, CONTROLLER_DOCKERFILE, LAUNCHER];
+    let faults = kinds.into_iter().filter_map(|kind| compose(settings, kind).err());
+    faults.chain(files.into_iter().filter_map(|name| text(settings, name).err())).collect()
+}
 
-    /// The problems of the administrator's files, with the line and what to write there.
-    #[must_use]
-    pub fn faults(&self) -> Vec<String> {
-        let Some(folder) = &self.folder else { return Vec::new() };
-        if let Err(error) = std::fs::read_dir(folder) {
-            return vec![format!("container.templates, {}: {error}", folder.display())];
-        }
-        let kinds = [ProjectKind::Default, ProjectKind::Editor, ProjectKind::Competition];
-        let files = [DOCKERFILE, CONTROLLER_DOCKERFILE, LAUNCHER];
-        let faults = kinds.into_iter().filter_map(|kind| self.compose(kind).err());
-        faults.chain(files.into_iter().filter_map(|name| self.text(name).err())).collect()
+/// The template for what a project requests.
+///
+/// # Errors
+/// Why it can't be used, as text for the client.
+pub fn compose(settings: &ContainerSettings, kind: ProjectKind) -> Result<Template, String> {
+    let kind = match kind {
+        ProjectKind::Default => "default",
+        ProjectKind::Editor => "theia",
+        ProjectKind::Competition => "competition",
+    };
+    let name = format!("docker-compose-{kind}{}.yml", if settings.debug { "-debug" } else { "" });
+    let broken = |error: String| format!("The template {name} of this simulation server can't be used: {error}");
+    let text = text(settings, &name)?;
+    let document: Value = serde_saphyr::from_str(&text).map_err(|error| broken(error.to_string()))?;
+    let services = document.get("services").and_then(Value::as_object).into_iter().flatten();
+    let has_command = |(name, service): (&String, &Value)| {
+        (name.clone(), service.get("command").is_some_and(|command| !command.is_null()))
+    };
+    let services: BTreeMap<_, _> = services.map(has_command).collect();
+    if !services.contains_key(WEBOTS) {
+        return Err(broken(format!("it has no service {WEBOTS:?}")));
     }
+    unsuitable(&text).map_or(Ok(Template { text, services }), |line| Err(broken(line)))
+}
 
-    /// The template for what a project requests.
-    ///
-    /// # Errors
-    /// Why it can't be used, as text for the client.
-    pub fn compose(&self, kind: ProjectKind) -> Result<Template, String> {
-        let kind = match kind {
-            ProjectKind::Default => "default",
-            ProjectKind::Editor => "theia",
-            ProjectKind::Competition => "competition",
-        };
-        let name = format!("docker-compose-{kind}{}.yml", if self.debug { "-debug" } else { "" });
-        let broken = |error: String| format!("The template {name} of this simulation server can't be used: {error}");
-        let text = self.text(&name)?;
-        let document: Value = serde_saphyr::from_str(&text).map_err(|error| broken(error.to_string()))?;
-        let services = document.get("services").and_then(Value::as_object).into_iter().flatten();
-        let has_command = |(name, service): (&String, &Value)| {
-            (name.clone(), service.get("command").is_some_and(|command| !command.is_null()))
-        };
-        let services: BTreeMap<_, _> = services.map(has_command).collect();
-        if !services.contains_key(WEBOTS) {
-            return Err(broken(format!("it has no service {WEBOTS:?}")));
-        }
-        if let Some(line) = unsuitable(&text) {
-            return Err(broken(line));
-        }
-        Ok(Template { text, services })
-    }
+/// The administrator's file of this name, if there is one.
+pub fn own(settings: &ContainerSettings, name: &str) -> Option<PathBuf> {
+    let file = settings.templates.as_ref()?.0.join(name);
+    file.is_file().then_some(file)
+}
 
-    /// Whether the administrator has a file of this name.
-    #[must_use]
-    pub fn has(&self, name: &str) -> bool {
-        self.folder.as_ref().is_some_and(|folder| folder.join(name).is_file())
-    }
-
-    /// The text of a template.
-    ///
-    /// # Errors
-    /// When the administrator's file can't be read, as text for an administrator.
-    pub fn text(&self, name: &str) -> Result<Cow<'static, str>, String> {
-        match self.folder.as_ref().filter(|_| self.has(name)) {
-            Some(folder) => std::fs::read_to_string(folder.join(name))
-                .map(Cow::Owned)
-                .map_err(|error| format!("{name} of container.templates: {error}")),
-            None => Ok(SHIPPED.iter().find(|(shipped, _)| *shipped == name).map_or("", |(_, text)| text).into()),
-        }
+/// The text of a template.
+///
+/// # Errors
+/// When the administrator's file can't be read, as text for an administrator.
+pub fn text(settings: &ContainerSettings, name: &str) -> Result<Cow<'static, str>, String> {
+    match own(settings, name).map(std::fs::read_to_string) {
+        Some(text) => text.map(Cow::Owned).map_err(|error| format!("{name} of container.templates: {error}")),
+        None => Ok(SHIPPED.iter().find(|(shipped, _)| *shipped == name).map_or("", |(_, text)| text).into()),
     }
 }
 
@@ -153,7 +131,8 @@ mod tests {
     #[test]
     fn what_only_the_original_could_run_is_refused_with_its_line() {
         let folder = tempfile::tempdir().unwrap();
-        let templates = Templates { folder: Some(folder.path().to_owned()), debug: false };
+        let templates = Some(ExpandedPath(folder.path().to_owned()));
+        let settings = ContainerSettings { templates, ..ContainerSettings::default() };
         for (text, words) in [
             ("volumes:\n  data:\nservices:\n  webots: {}\n", "line 1, `volumes:`"),
             ("services:\n  webots:\n    build:\n      context: .\n", "line 3, `build:`"),
@@ -166,13 +145,14 @@ mod tests {
             ("services: {}\n", "no service \"webots\""),
         ] {
             std::fs::write(folder.path().join("docker-compose-default.yml"), text).unwrap();
-            let wrong = templates.compose(ProjectKind::Default).unwrap_err();
+            let wrong = compose(&settings, ProjectKind::Default).unwrap_err();
             assert!(wrong.starts_with("The template docker-compose-default.yml") && wrong.contains(words), "{wrong}");
-            assert_eq!(templates.faults(), [wrong]);
+            assert_eq!(faults(&settings), [wrong]);
         }
         for kind in [ProjectKind::Editor, ProjectKind::Competition] {
             for debug in [false, true] {
-                let template = Templates { folder: None, debug }.compose(kind).unwrap();
+                let settings = ContainerSettings { debug, ..ContainerSettings::default() };
+                let template = compose(&settings, kind).unwrap();
                 assert_eq!(template.text.contains("stdin_open: true"), debug, "{kind:?}");
             }
         }

@@ -4,26 +4,21 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use super::docker::blocking;
-use super::owned_resources::{LIST, ResourceOwner};
+use super::owned_resources::ResourceOwner;
 use crate::simulation::machine::{Usage, Usages};
 
-/// Timeout of each command.
+/// Timeout of the command.
 const TIMEOUT: Duration = Duration::from_secs(20);
 
 /// Measures the simulations of an owner: those on these ports, whose processes are named for each. Blocks for two
 /// seconds, which `docker stats` takes.
-#[must_use]
 pub fn measure(owner: &ResourceOwner, roots: &BTreeMap<u16, i32>) -> Usages {
-    let list = blocking(&LIST, TIMEOUT).unwrap_or_default();
-    let root = |project: &str| roots.get(&owner.port_of(project)?).copied();
-    let containers: BTreeMap<&str, i32> =
-        owner.containers(&list).filter_map(|(id, project)| Some((id, root(project)?))).collect();
-    let format = "{{.ID}}\t{{.CPUPerc}}\t{{.MemUsage}}\t{{.PIDs}}";
+    let format = "{{.Name}}\t{{.CPUPerc}}\t{{.MemUsage}}\t{{.PIDs}}";
     // Of all that run: one that is named and has ended meanwhile would fail all.
-    let printed = blocking(&["stats", "--no-stream", "--no-trunc", "--format", format], TIMEOUT);
+    let printed = blocking(&["stats", "--no-stream", "--format", format], TIMEOUT);
     let mut all = Usages::new();
-    for (id, one) in printed.unwrap_or_default().lines().filter_map(usage_of) {
-        let Some(root) = containers.get(id) else { continue };
+    for (name, one) in printed.unwrap_or_default().lines().filter_map(usage_of) {
+        let Some(root) = owner.port_of(name).and_then(|port| roots.get(&port)) else { continue };
         let sum = all.entry(*root).or_default();
         let cpu = Some(sum.cpu.unwrap_or_default() + one.cpu.unwrap_or_default());
         *sum = Usage { cpu, memory: sum.memory + one.memory, threads: sum.threads + one.threads, ..one };
@@ -34,10 +29,10 @@ pub fn measure(owner: &ResourceOwner, roots: &BTreeMap<u16, i32>) -> Usages {
 /// A line of `docker stats`.
 fn usage_of(line: &str) -> Option<(&str, Usage)> {
     let mut columns = line.split('\t');
-    let id = columns.next()?;
+    let name = columns.next()?;
     let cpu = columns.next()?.trim_end_matches('%').parse().ok();
     let memory = bytes(columns.next()?.split_once(" / ")?.0)?;
-    Some((id, Usage { cpu, memory, threads: columns.next()?.parse().ok()?, time: Duration::ZERO }))
+    Some((name, Usage { cpu, memory, threads: columns.next()?.parse().ok()?, time: Duration::ZERO }))
 }
 
 /// An amount such as `12.3MiB`.

@@ -9,13 +9,15 @@
 //! It is parsed line by line, as in the original: existing files have lines that are not YAML, such as
 //! `dockerCompose:theia:webots-project/controllers/`.
 
+use std::io;
 use std::path::{Path, PathBuf};
 
-use super::project_file::text_of;
 use crate::shared::text::excerpt;
 
 /// The names of the file; the first one that exists counts.
 const NAMES: [&str; 2] = ["webots.yml", "webots.yaml"];
+/// Size limit of a file with which a project configures its containers, in bytes.
+const MAX_SIZE: u64 = 256 * 1024;
 /// Size limit of the line of the type, and of a directory, in bytes.
 const MAX_LENGTH: usize = 200;
 /// Longest excerpt of a value in a warning, in characters.
@@ -53,7 +55,6 @@ pub struct WebotsYml {
 
 impl WebotsYml {
     /// Reads the file of a project; a project without one requests nothing. Blocks.
-    #[must_use]
     pub fn read(project: &Path) -> Self {
         match NAMES.iter().find_map(|name| text_of(&project.join(name)).transpose()) {
             None => Self::default(),
@@ -63,7 +64,6 @@ impl WebotsYml {
     }
 
     /// Parses the text of a file.
-    #[must_use]
     pub fn parse(text: &str) -> Self {
         let text = text.trim_start_matches('\u{feff}');
         let mut found = Self::default();
@@ -81,9 +81,25 @@ impl WebotsYml {
 
     /// The directory below the project's own, such as `controllers/edit`. It is not checked yet: it may be missing, or
     /// be a symlink to any path.
-    #[must_use]
     pub fn folder_in_project(&self) -> PathBuf {
         Path::new(&self.folder).components().skip(1).collect()
+    }
+}
+
+/// The text of a file of a project in which nothing runs yet; `None` if it does not exist. Anything but a regular file is
+/// refused: a symlink could resolve to any path.
+///
+/// # Errors
+/// Why it can't be read, as text for the client.
+pub fn text_of(path: &Path) -> Result<Option<String>, String> {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    match path.symlink_metadata() {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+        Ok(about) if about.is_file() && about.len() <= MAX_SIZE => {
+            let text = std::fs::read_to_string(path);
+            text.map(Some).map_err(|error| format!("{name} of the project can't be read: {error}"))
+        }
+        _ => Err(format!("{name} of the project is no plain file of at most {} KiB", MAX_SIZE / 1024)),
     }
 }
 

@@ -98,7 +98,7 @@ impl LaunchSpec {
             command: webots_command(&self.program, self.mode, self.slot.port, heartbeat, world),
             instance: self.project.instance.path(),
             project: self.project.instance.project(),
-            folder: self.project.folder(),
+            folder: &self.project.folder,
             port: self.slot.port,
             display,
             variables: &self.variables(),

@@ -6,19 +6,12 @@ use std::path::PathBuf;
 use percent_encoding::{AsciiSet, CONTROLS, utf8_percent_encode};
 use serde::{Deserialize, Serialize};
 
-use crate::shared::domain::ProjectUrl;
-use crate::shared::domain::UrlPrefix;
+use crate::shared::domain::{ProjectUrl, UrlPrefix};
 
 /// The key `gitMirrors`: {URL prefix: replacement}. The longest prefix that covers a world's URL wins.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[serde(try_from = "BTreeMap<String, String>", into = "BTreeMap<String, String>")]
-pub struct Mirrors(Vec<Mirror>);
-
-#[derive(Debug, Clone)]
-struct Mirror {
-    prefix: UrlPrefix,
-    replacement: String,
-}
+pub struct Mirrors(Vec<(UrlPrefix, String)>);
 
 /// The remote of a repository.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -48,13 +41,13 @@ const ESCAPED: &AsciiSet =
     &CONTROLS.add(b' ').add(b'"').add(b'#').add(b'%').add(b'<').add(b'>').add(b'?').add(b'`').add(b'{').add(b'}');
 
 impl Mirrors {
-    fn mirror(&self, world: &ProjectUrl) -> Option<&Mirror> {
-        self.0.iter().filter(|mirror| mirror.prefix.covers(world)).max_by_key(|mirror| mirror.prefix.depth())
+    fn mirror(&self, world: &ProjectUrl) -> Option<&(UrlPrefix, String)> {
+        self.0.iter().filter(|(prefix, _)| prefix.covers(world)).max_by_key(|(prefix, _)| prefix.depth())
     }
 
     /// The same world where its repository is cloned from this URL; nothing where none would be, from the same forge.
     pub fn moved(&self, world: &ProjectUrl, location: &str) -> Option<ProjectUrl> {
-        let mirror = self.mirror(world).map(|mirror| (mirror.prefix.as_str(), mirror.replacement.as_str()));
+        let mirror = self.mirror(world).map(|(prefix, replacement)| (prefix.as_str(), replacement.as_str()));
         let (prefix, base) = mirror.unwrap_or((GITHUB, GITHUB));
         let base = url::Url::parse(base).ok()?;
         let rest = location.strip_prefix(base.as_str().trim_end_matches('/'))?.strip_prefix('/')?;
@@ -65,7 +58,7 @@ impl Mirrors {
 
     /// Where the repository of a world is cloned from; nothing for a forge that is neither GitHub nor in a mirror.
     pub fn remote(&self, world: &ProjectUrl) -> Option<Remote> {
-        let Some(Mirror { prefix, replacement }) = self.mirror(world) else {
+        let Some((prefix, replacement)) = self.mirror(world) else {
             let location = format!("{GITHUB}/{}.git", escaped(world.repository_segments()));
             return (world.host() == "github.com").then_some(Remote { location, protocol: "https" });
         };
@@ -98,7 +91,7 @@ impl TryFrom<BTreeMap<String, String>> for Mirrors {
                 let names_something =
                     |begin: &str| replacement.strip_prefix(begin).is_some_and(|rest| !rest.is_empty());
                 if names_something("file:") || names_something("https://") {
-                    Ok(Mirror { prefix, replacement })
+                    Ok((prefix, replacement))
                 } else {
                     Err(format!("{replacement:?} is no replacement; allowed are https://... and file:FOLDER"))
                 }
@@ -110,7 +103,7 @@ impl TryFrom<BTreeMap<String, String>> for Mirrors {
 
 impl From<Mirrors> for BTreeMap<String, String> {
     fn from(mirrors: Mirrors) -> Self {
-        mirrors.0.into_iter().map(|mirror| (mirror.prefix.as_str().to_owned(), mirror.replacement)).collect()
+        mirrors.0.into_iter().map(|(prefix, replacement)| (prefix.into(), replacement)).collect()
     }
 }
 
