@@ -26,7 +26,7 @@ use crate::simulation::client::quota;
 use crate::simulation::container::ContainerService;
 use crate::simulation::isolation::{Launcher, Watcher};
 use crate::simulation::machine::{LoadMonitor, Spread, UsageMonitor};
-use crate::simulation::process::{Guardian, Leftovers, RunDir};
+use crate::simulation::process::{Guardian, RunDir};
 use crate::simulation::relay::{StreamThread, Upstream};
 use crate::simulation::web::configure;
 
@@ -195,12 +195,8 @@ fn assemble(
     let folder = config.cache_dir.0.clone();
     let cache_fault = |source| AppError::Folder { key: "cacheDir", folder: folder.clone(), source };
     let cache_dir = CacheDir::claim(&folder).map_err(cache_fault)?;
-    let (run, leftovers) = RunDir::open(&folder).map_err(cache_fault)?;
-    if leftovers != Leftovers::default() {
-        let Leftovers { runs, processes } = leftovers;
-        log::warn!("removed what {runs} earlier runs had left, {processes} processes among it");
-    }
-    let launcher = Launcher::start(&config).map_err(|error| AppError::Unavailable(error.to_string()))?;
+    let run = RunDir::open(&folder).map_err(cache_fault)?;
+    let launcher = Launcher::start(&config).map_err(AppError::Unavailable)?;
     let containers = open_containers(&config, &run)?;
     let rules = AdmissionRules {
         allowed: config.allowed_repositories.clone(),
@@ -211,7 +207,7 @@ fn assemble(
     let checkouts = open_checkouts(&config, cache_dir, &run, &rules).map_err(cache_fault)?;
     let metrics = Metrics::new();
     let logs = config.log_dir.0.join("simulation");
-    let ends = Ends::start(logs, launcher.level().to_string(), &metrics);
+    let ends = Ends::start(logs, launcher.level.to_string(), &metrics);
     let ends = ends.map_err(|why| AppError::Unavailable(format!("ends of simulations can't be recorded: {why}")))?;
     let (per_address, per_user) = (config.max_places_per_address, config.max_places_per_user);
     let slots =

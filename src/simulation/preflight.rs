@@ -4,9 +4,9 @@ use std::process::Command;
 
 use which::which;
 
-use super::config::{IsolationSetting, SimulationConfig};
+use super::config::{IsolationSetting, SandboxNetwork, SimulationConfig};
 use super::container::{self, packet_filter};
-use crate::simulation::isolation::{IsolationLevel, Launcher, Network};
+use crate::simulation::isolation::Launcher;
 use crate::simulation::machine::display;
 use crate::simulation::machine::sensors::{GpuReading, GpuSensor};
 
@@ -40,13 +40,13 @@ pub fn check(config: &SimulationConfig) -> Vec<String> {
 
 /// The findings on what worlds' programs may do.
 fn isolation(config: &SimulationConfig, launcher: &Launcher) -> Vec<(&'static str, Result<String, String>)> {
-    let mut findings = vec![match launcher.shortcoming() {
+    let mut findings = vec![match &launcher.shortcoming {
         Some(why) => ("isolation", Err(format!("none, worlds' programs may do whatever this user may: {why}"))),
-        None => ("isolation", Ok(launcher.level().to_string())),
+        None => ("isolation", Ok(launcher.level.to_string())),
     }];
-    let words = launcher.network_in_words().filter(|_| launcher.level() == IsolationLevel::Sandbox);
+    let words = launcher.network_in_words().filter(|_| launcher.level == IsolationSetting::Sandbox);
     findings.extend(words.map(|words| ("network", Ok(words))));
-    let is_shared = launcher.network() == Some(Network::Shared);
+    let is_shared = launcher.network() == Some(SandboxNetwork::Shared);
     if is_shared && !config.ports_are_public() {
         findings.push(("streams", streams(config)));
     }

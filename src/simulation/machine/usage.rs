@@ -109,10 +109,20 @@ fn sums_of(trees: &[Tree]) -> Usages {
 
 /// The usage of a cgroup v2 so far; `None` if the kernel does not count all of it there.
 fn cgroup_sum(folder: &Path) -> Option<Usage> {
-    let number = |file: &str| std::fs::read_to_string(folder.join(file)).ok()?.trim().parse().ok();
+    let (memory, threads) = (number_in(&folder.join("memory.current"))?, number_in(&folder.join("pids.current"))?);
+    Some(Usage { cpu: None, memory, threads, time: cgroup_time(folder)? })
+}
+
+/// The CPU time of all that has run in a cgroup v2.
+pub fn cgroup_time(folder: &Path) -> Option<Duration> {
     let times = std::fs::read_to_string(folder.join("cpu.stat")).ok()?;
-    let time = Duration::from_micros(times.lines().find_map(|line| line.strip_prefix("usage_usec "))?.parse().ok()?);
-    Some(Usage { cpu: None, memory: number("memory.current")?, threads: number("pids.current")?, time })
+    let time = times.lines().find_map(|line| line.strip_prefix("usage_usec "))?;
+    time.trim().parse().ok().map(Duration::from_micros)
+}
+
+/// The number in a file of the kernel.
+pub fn number_in(file: &Path) -> Option<u64> {
+    std::fs::read_to_string(file).ok()?.trim().parse().ok()
 }
 
 /// All processes, each below its parent and below the leader of its group.

@@ -12,8 +12,8 @@ use super::launch_target::LaunchTarget;
 use super::output::{self, OutputEvent, Tail};
 use crate::shared::run::RotatedFile;
 use crate::simulation::container::Cause;
-use crate::simulation::ends::Taken;
-use crate::simulation::isolation::{Cgroup, Peak};
+use crate::simulation::ends::{FOLDER_OF_RUNNING, Taken};
+use crate::simulation::isolation::Peak;
 use crate::simulation::process::{ExitReason, ProcessGroup};
 
 /// A Webots that was started.
@@ -55,7 +55,8 @@ pub fn launch(
     target: LaunchTarget,
     events: Recipient<OutputEvent>,
 ) -> std::io::Result<(Launched, impl Future<Output = End> + use<>)> {
-    let log = spec.log_file();
+    let folder = spec.config.log_dir.0.join("simulation").join(FOLDER_OF_RUNNING);
+    let log = folder.join(format!("{}.log", spec.slot.lease.id()));
     let file = RotatedFile::open(&log, OLD_LOGS).inspect_err(|error| {
         let why = format!("what Webots prints is not kept: {} can't be written: {error}", log.display());
         spec.slot.lease.log(log::Level::Warn, &why, why.clone());
@@ -69,22 +70,26 @@ pub fn launch(
         LaunchTarget::Machine(display) => spec.spawn_spec(display)?,
     };
     let (group, ended) = ProcessGroup::start(&process, output.into(), errors.into())?;
-    let folder = cgroup.as_ref().map(|cgroup| cgroup.path().to_owned());
+    let of_cgroup = cgroup.as_ref().map(|cgroup| cgroup.folder.clone());
     let peak = cgroup.is_none().then(|| peak_of(&target));
     let seen = peak.clone();
     let ended = async move {
         let reason = ended.await;
-        let code = if let ExitReason::Code(code) = reason { Some(code.into()) } else { None };
-        let in_container = target.end(code).await;
+        let mut in_container = None;
+        if let LaunchTarget::Containers(containers) = target {
+            in_container = containers.cause(reason).await;
+            containers.remove().await;
+        }
+        // This ends also what has left the process group.
         let (on_machine, taken) = match cgroup {
-            Some(cgroup) => actix_rt::task::spawn_blocking(move || end_all(&cgroup)).await.unwrap_or_default(),
+            Some(cgroup) => actix_rt::task::spawn_blocking(move || cgroup.end()).await.unwrap_or_default(),
             None => (false, seen.map(|peak| peak.taken()).unwrap_or_default()),
         };
         // The last output shows the cause. A process that can't be killed may keep the pipe open.
         actix_rt::time::timeout(LAST_OUTPUT, all_read).await.ok();
         End { reason, cause: in_container.or(on_machine.then_some(Cause::OutOfMemory)), taken }
     };
-    Ok((Launched { group, cgroup: folder, tail, log, peak }, ended))
+    Ok((Launched { group, cgroup: of_cgroup, tail, log, peak }, ended))
 }
 
 /// Hears what a Webots takes that runs on this.
@@ -95,11 +100,4 @@ fn peak_of(target: &LaunchTarget) -> Arc<Peak> {
     // Its start does not wait for that.
     actix_rt::spawn(async move { named.name_containers(ids.await) });
     peak
-}
-
-/// Ends what has left the process group. Returns whether the kernel has ended something because it took too much memory,
-/// and what all has taken.
-fn end_all(cgroup: &Cgroup) -> (bool, Taken) {
-    cgroup.kill();
-    (cgroup.has_run_out_of_memory(), cgroup.taken())
 }
