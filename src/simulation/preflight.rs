@@ -100,18 +100,14 @@ fn gpus(config: &SimulationConfig) -> Result<String, String> {
     let sensor = GpuSensor::open().map_err(|error| unread(&error.to_string()))?;
     let GpuReading { gpus, lost } = sensor.read();
     let (count, displays) = (gpus.len() + lost, config.displays_of_gpus().len());
-    match (count, displays) {
-        (0, _) => return Err(unread("NVIDIA's driver knows none")),
-        (_, 0) => {}
-        _ if displays < count => {
-            return Err(format!(
-                "displays names {displays} of {count} GPUs' X screens: the other GPUs get no simulation"
-            ));
-        }
-        _ if displays > count => {
-            return Err(format!("displays names {displays} X screens, but there are {count} GPUs"));
-        }
-        _ => {}
+    if count == 0 {
+        return Err(unread("NVIDIA's driver knows none"));
+    }
+    if (1..count).contains(&displays) {
+        return Err(format!("displays names {displays} of {count} GPUs' X screens: the other GPUs get no simulation"));
+    }
+    if displays > count {
+        return Err(format!("displays names {displays} X screens, but there are {count} GPUs"));
     }
     if lost > 0 {
         return Err(format!("{lost} of {count} are lost, and get no simulation (see Xid in the kernel's log)"));

@@ -74,7 +74,12 @@ impl Cgroups {
         let made = tempfile::Builder::new().prefix("simulation-").tempdir_in(&self.0);
         let made = made.inspect_err(|error| log::warn!("no control group can be made: {error}"));
         let cgroup = Cgroup { folder: made.ok()?.keep() };
-        for (file, value) in settings(limits, runners) {
+        // A simulation that runs out of memory is killed as a whole.
+        let mut settings =
+            vec![("pids.max", (limits.processes + runners).to_string()), ("memory.oom.group", "1".to_owned())];
+        settings.extend(limits.memory.map(|memory| ("memory.max", (memory << 20).to_string())));
+        settings.extend(limits.cores.map(|cores| ("cpu.max", format!("{} {PERIOD}", cores * PERIOD))));
+        for (file, value) in settings {
             let file = cgroup.folder.join(file);
             // A controller that this server does not have can't limit anything.
             if file.exists()
@@ -152,15 +157,6 @@ fn offered(folder: &Path) -> io::Result<Vec<&'static str>> {
     let offered = std::fs::read_to_string(folder.join("cgroup.controllers"))?;
     let is_offered = |name: &&str| offered.split_whitespace().any(|one| one == *name);
     Ok(CONTROLLERS.into_iter().filter(is_offered).collect())
-}
-
-/// The limits in the kernel's format. A simulation that runs out of memory is killed as a whole.
-fn settings(limits: &ResourceLimits, runners: u64) -> Vec<(&'static str, String)> {
-    let mut settings =
-        vec![("pids.max", (limits.processes + runners).to_string()), ("memory.oom.group", "1".to_owned())];
-    settings.extend(limits.memory.map(|memory| ("memory.max", (memory << 20).to_string())));
-    settings.extend(limits.cores.map(|cores| ("cpu.max", format!("{} {PERIOD}", cores * PERIOD))));
-    settings
 }
 
 /// The directory of this server's control group; `None` if other processes are in it.

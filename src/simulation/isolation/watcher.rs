@@ -109,7 +109,7 @@ impl Table {
                 match if self.all.is_empty() { watches.recv().map_err(Into::into) } else { watches.recv_timeout(left) }
                 {
                     Ok((mut watch, excess)) => {
-                        watch.disk.lost = self.disk.lost();
+                        watch.disk.lost = self.disk.lost;
                         self.all.push(Watched { watch, excess: Some(excess) });
                     }
                     Err(RecvTimeoutError::Timeout) => break,
@@ -117,8 +117,7 @@ impl Table {
                 }
             }
             self.all.retain(|one| one.excess.as_ref().is_some_and(|excess| !excess.is_closed()));
-            self.disk.look();
-            if self.disk.is_short() {
+            if self.disk.look() {
                 self.end_grown_most();
             }
             if Instant::now() >= tick {
@@ -132,10 +131,7 @@ impl Table {
 
     /// Ends the simulation that has grown most; none if none has grown: then another program fills the disk.
     fn end_grown_most(&mut self) {
-        let until = Instant::now() + COUNTS_AT_RESERVE;
-        let lost = self.disk.lost();
-        // Also if none is found, so that the next try waits, too.
-        self.disk.relieve();
+        let (until, lost) = (Instant::now() + COUNTS_AT_RESERVE, self.disk.lost);
         // The one that had grown most is counted first, then those whose count is oldest.
         self.all.sort_by_key(|one| one.watch.disk.counted);
         let most = self.all.iter().enumerate().max_by_key(|(_, one)| one.watch.disk.growth()).map(|(index, _)| index);
@@ -156,7 +152,7 @@ impl Table {
 
     /// Counts what simulations have written, in a tick that began at this processor time.
     fn count_folders(&mut self, begin: Duration) {
-        let (lost, time) = (self.disk.lost(), self.disk.pause().min(COUNT));
+        let (lost, time) = (self.disk.lost, self.disk.pause().min(COUNT));
         let mut due: Vec<&mut Watched> = self.all.iter_mut().filter(|one| one.watch.disk.is_due(lost)).collect();
         due.sort_by_key(|one| one.watch.disk.counted);
         for one in due {

@@ -71,30 +71,24 @@ impl UsageMonitor {
         if roots.is_empty() {
             return Usages::new();
         }
-        let mut readings = self.0.lock();
-        readings.renew(roots, measure);
-        readings.usages.clone()
-    }
-}
-
-impl Readings {
-    fn renew(&mut self, roots: &[i32], measure: impl FnOnce() -> Usages) {
-        let known = roots.iter().all(|root| self.roots.contains(root));
-        if known && self.read.is_some_and(|read| read.elapsed() < AGE) {
-            return;
+        let mut last = self.0.lock();
+        let known = roots.iter().all(|root| last.roots.contains(root));
+        if known && last.read.is_some_and(|read| read.elapsed() < AGE) {
+            return last.usages.clone();
         }
-        self.roots = roots.iter().copied().collect();
+        last.roots = roots.iter().copied().collect();
         let mut usages = measure();
         // If Docker hangs, this may have taken longer than a reading is cached.
-        let passed = self.read.map(|read| read.elapsed().as_secs_f64()).filter(|passed| *passed > 0.0);
-        self.read = Some(Instant::now());
+        let passed = last.read.map(|read| read.elapsed().as_secs_f64()).filter(|passed| *passed > 0.0);
+        last.read = Some(Instant::now());
         for (root, usage) in &mut usages {
-            let before = self.usages.get(root).zip(passed);
+            let before = last.usages.get(root).zip(passed);
             let mean =
                 before.map(|(before, passed)| 100.0 * usage.time.saturating_sub(before.time).as_secs_f64() / passed);
             usage.cpu = usage.cpu.or(mean);
         }
-        self.usages = usages;
+        last.usages.clone_from(&usages);
+        usages
     }
 }
 

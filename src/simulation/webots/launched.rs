@@ -1,4 +1,4 @@
-//! Starts the process of a Webots, and waits until its whole process tree has ended.
+//! Prepares the target on which a Webots runs, starts its process there, and waits until its whole process tree has ended.
 
 use std::future::Future;
 use std::path::PathBuf;
@@ -8,13 +8,20 @@ use std::time::Duration;
 use actix::prelude::*;
 
 use super::launch_spec::LaunchSpec;
-use super::launch_target::LaunchTarget;
 use super::output::{self, OutputEvent, Tail};
 use crate::shared::run::RotatedFile;
-use crate::simulation::container::Cause;
+use crate::simulation::container::{Cause, SimulationContainers, StartError};
 use crate::simulation::ends::{FOLDER_OF_RUNNING, Taken};
-use crate::simulation::isolation::Peak;
+use crate::simulation::isolation::{Display, Peak};
 use crate::simulation::process::{ExitReason, ProcessGroup};
+
+/// The target on which a Webots runs.
+pub enum LaunchTarget {
+    /// The machine, with this display.
+    Machine(Display),
+    /// Containers.
+    Containers(Box<SimulationContainers>),
+}
 
 /// A Webots that was started.
 pub struct Launched {
@@ -45,6 +52,29 @@ pub struct End {
 const OLD_LOGS: usize = 1;
 /// Timeout of reading the rest of an output.
 const LAST_OUTPUT: Duration = Duration::from_secs(1);
+
+impl LaunchTarget {
+    /// Prepares the target of a Webots: containers, a display of its own, or nothing. `progress` receives each step as text.
+    /// Dropping the future discards what was created. Its error says why it failed, and whether the project or this server
+    /// is the cause.
+    pub fn prepare<P: Fn(String) + Send + Sync + 'static>(
+        spec: &LaunchSpec,
+        progress: P,
+    ) -> impl Future<Output = Result<Self, StartError>> + use<P> {
+        let containers = spec.containers.as_ref().map(|containers| (Arc::clone(containers), spec.request()));
+        let (xvfb, display, instance) = (spec.config.xvfb, spec.display(), spec.project.instance.path().to_owned());
+        async move {
+            if let Some((containers, request)) = containers {
+                let mut prepared = containers.prepare(request, &progress).await?;
+                prepared.start_others().await?;
+                return Ok(Self::Containers(Box::new(prepared)));
+            }
+            let display = if xvfb { Display::new_virtual(&instance) } else { Ok(Display::Outside(display)) };
+            let failed = |error| StartError::Server(format!("The virtual display (Xvfb) can't be started: {error}"));
+            display.map(Self::Machine).map_err(failed)
+        }
+    }
+}
 
 /// Starts a Webots on its target. The future resolves when its whole process tree has ended.
 ///

@@ -12,8 +12,7 @@ use tokio::sync::Notify;
 
 use super::event::{WebotsEvent, WebotsExit};
 use super::launch_spec::LaunchSpec;
-use super::launch_target::LaunchTarget;
-use super::launched::{self, End, Launched};
+use super::launched::{self, End, LaunchTarget, Launched};
 use super::output::{OutputEvent, Tail};
 use super::verdict::verdict;
 use crate::shared::run::seconds_since_1970;
