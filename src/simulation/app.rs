@@ -26,7 +26,7 @@ use crate::simulation::client::quota;
 use crate::simulation::container::ContainerService;
 use crate::simulation::isolation::{Launcher, Watcher};
 use crate::simulation::machine::{LoadMonitor, Spread, UsageMonitor};
-use crate::simulation::process::{Guardian, Leftovers, RunDir};
+use crate::simulation::process::{Guardian, RunDir};
 use crate::simulation::relay::{StreamThread, Upstream};
 use crate::simulation::web::configure;
 
@@ -185,11 +185,7 @@ fn assemble(
     let folder = config.cache_dir.0.clone();
     let cache_fault = |error| format!("the folder {} (cacheDir) can't be used: {error}", folder.display());
     let cache_dir = CacheDir::claim(&folder).map_err(cache_fault)?;
-    let (run, leftovers) = RunDir::open(&folder).map_err(cache_fault)?;
-    if leftovers != Leftovers::default() {
-        let Leftovers { runs, processes } = leftovers;
-        log::warn!("removed what {runs} earlier runs had left, {processes} processes among it");
-    }
+    let run = RunDir::open(&folder).map_err(cache_fault)?;
     let launcher = Launcher::start(&config)?;
     let containers = open_containers(&config, &run)?;
     let rules = AdmissionRules {
@@ -202,7 +198,7 @@ fn assemble(
     let checkouts = checkouts.map_err(cache_fault)?;
     let metrics = Metrics::default();
     let logs = config.log_dir.0.join("simulation");
-    let ends = Ends::start(logs, launcher.level().to_string(), &metrics);
+    let ends = Ends::start(logs, launcher.level.to_string(), &metrics);
     let ends = ends.map_err(|why| format!("ends of simulations can't be recorded: {why}"))?;
     let (per_address, per_user) = (config.max_places_per_address, config.max_places_per_user);
     let slots =

@@ -4,9 +4,9 @@ use std::process::Command;
 
 use which::which;
 
-use super::config::{IsolationSetting, SimulationConfig};
+use super::config::{IsolationSetting, SandboxNetwork, SimulationConfig};
 use super::container::{self, packet_filter};
-use crate::simulation::isolation::{IsolationLevel, Launcher, Network};
+use crate::simulation::isolation::Launcher;
 use crate::simulation::machine::display;
 use crate::simulation::machine::sensors::{GpuReading, GpuSensor};
 
@@ -40,13 +40,13 @@ pub fn check(config: &SimulationConfig) -> Vec<String> {
 
 /// The findings on what worlds' programs may do.
 fn isolation(config: &SimulationConfig, launcher: &Launcher) -> Vec<(&'static str, Result<String, String>)> {
-    let mut findings = vec![match launcher.shortcoming() {
+    let mut findings = vec![match &launcher.shortcoming {
         Some(why) => ("isolation", Err(format!("none, worlds' programs may do whatever this user may: {why}"))),
-        None => ("isolation", Ok(launcher.level().to_string())),
+        None => ("isolation", Ok(launcher.level.to_string())),
     }];
-    let words = launcher.network_in_words().filter(|_| launcher.level() == IsolationLevel::Sandbox);
+    let words = launcher.network_in_words().filter(|_| launcher.level == IsolationSetting::Sandbox);
     findings.extend(words.map(|words| ("network", Ok(words))));
-    let is_shared = launcher.network() == Some(Network::Shared);
+    let is_shared = launcher.network() == Some(SandboxNetwork::Shared);
     if is_shared && !config.ports_are_public() {
         findings.push(("streams", streams(config)));
     }
@@ -100,18 +100,14 @@ fn gpus(config: &SimulationConfig) -> Result<String, String> {
     let sensor = GpuSensor::open().map_err(|error| unread(&error.to_string()))?;
     let GpuReading { gpus, lost } = sensor.read();
     let (count, displays) = (gpus.len() + lost, config.displays_of_gpus().len());
-    match (count, displays) {
-        (0, _) => return Err(unread("NVIDIA's driver knows none")),
-        (_, 0) => {}
-        _ if displays < count => {
-            return Err(format!(
-                "displays names {displays} of {count} GPUs' X screens: the other GPUs get no simulation"
-            ));
-        }
-        _ if displays > count => {
-            return Err(format!("displays names {displays} X screens, but there are {count} GPUs"));
-        }
-        _ => {}
+    if count == 0 {
+        return Err(unread("NVIDIA's driver knows none"));
+    }
+    if (1..count).contains(&displays) {
+        return Err(format!("displays names {displays} of {count} GPUs' X screens: the other GPUs get no simulation"));
+    }
+    if displays > count {
+        return Err(format!("displays names {displays} X screens, but there are {count} GPUs"));
     }
     if lost > 0 {
         return Err(format!("{lost} of {count} are lost, and get no simulation (see Xid in the kernel's log)"));

@@ -17,6 +17,7 @@ use super::failed_starts::FailedStarts;
 use crate::simulation::container::{daemon_fault, data_folder, init_fault};
 use crate::simulation::machine::Readings;
 use crate::simulation::machine::display;
+use crate::simulation::machine::sensors::Gpu;
 use crate::simulation::process::DiskRoom;
 
 /// Interval between two checks.
@@ -39,7 +40,7 @@ pub fn watch(
     failed_starts: Arc<FailedStarts>,
 ) -> watch::Receiver<Option<String>> {
     // The first check comes before the first client; GPUs are not read yet.
-    let first = check(&config, &run, &[]).and_then(|()| check_init(&config, false)).err();
+    let first = check(&config, &run, None, false).err();
     let (sender, problem) = watch::channel(None);
     publish(&sender, first, &failed_starts);
     actix_rt::spawn(async move {
@@ -47,13 +48,8 @@ pub fn watch(
         while !sender.is_closed() {
             let pause = if sender.borrow().is_some() { PERIOD_WHILE_NOT_READY } else { PERIOD };
             actix_rt::time::sleep(pause).await;
-            let gpus = check_gpus(&config, &readings.borrow());
-            let indexes: Vec<u32> = readings.borrow().gpus.iter().map(|gpu| gpu.index).collect();
-            let (config, run) = (Arc::clone(&config), run.clone());
-            let all = move || {
-                let found = gpus.and_then(|()| check(&config, &run, &indexes));
-                found.and_then(|()| check_init(&config, has_init)).err()
-            };
+            let (config, run, readings) = (Arc::clone(&config), run.clone(), Arc::clone(&readings.borrow()));
+            let all = move || check(&config, &run, Some(&readings), has_init).err();
             let mut checked = actix_rt::task::spawn_blocking(all);
             let found = if let Ok(found) = actix_rt::time::timeout(HUNG, &mut checked).await {
                 found
@@ -88,10 +84,12 @@ fn publish(sender: &watch::Sender<Option<String>>, found: Option<String>, failed
     });
 }
 
-/// Checks everything that each simulation needs; `gpus` are the numbers of those that answer. Blocks for two seconds for
-/// each display, and for as long as the disk does.
-fn check(config: &SimulationConfig, run: &Path, gpus: &[u32]) -> Result<(), String> {
-    if config.isolation == IsolationSetting::Container {
+/// Checks everything that each simulation needs; whether containers have an init process is known once they had. Blocks for
+/// two seconds for each display, and for as long as the disk does.
+fn check(config: &SimulationConfig, run: &Path, readings: Option<&Readings>, has_init: bool) -> Result<(), String> {
+    let in_container = config.isolation == IsolationSetting::Container;
+    readings.map_or(Ok(()), |readings| check_gpus(config, readings))?;
+    if in_container {
         daemon_fault().map_or(Ok(()), Err)?;
     }
     webots_program(config)?;
@@ -100,24 +98,23 @@ fn check(config: &SimulationConfig, run: &Path, gpus: &[u32]) -> Result<(), Stri
     std::fs::create_dir_all(run).map_err(|error| not_writable(&error))?;
     check_room(run, "disk", config.disk_reserve)?;
     write(run)?;
-    if config.isolation == IsolationSetting::Container
-        && let Some(folder) = data_folder()
-    {
+    if let Some(folder) = in_container.then(data_folder).flatten() {
         check_room(&folder, "disk of Docker", config.disk_reserve)?;
     }
     // Webots itself always needs a display. A replacement (`webots`) may not.
-    if config.webots.is_none() && !config.xvfb && config.isolation != IsolationSetting::Container {
-        for display in displays(config, gpus) {
+    if config.webots.is_none() && !config.xvfb && !in_container {
+        for display in displays(config, readings.map_or(&[], |readings| &readings.gpus)) {
             display::check(&display).map_err(|error| format!("Webots can't open its window: {error}"))?;
         }
     }
-    Ok(())
+    // That starts a container.
+    if in_container && !has_init { init_fault().map_or(Ok(()), Err) } else { Ok(()) }
 }
 
 /// The displays that simulations may be given: those of GPUs that answer, where each has its own.
-fn displays(config: &SimulationConfig, gpus: &[u32]) -> BTreeSet<String> {
-    let with_display = gpus.iter().filter(|index| (**index as usize) < config.displays_of_gpus().len());
-    let displays: BTreeSet<String> = with_display.map(|index| config.display_on(Some(*index))).collect();
+fn displays(config: &SimulationConfig, gpus: &[Gpu]) -> BTreeSet<String> {
+    let with_display = gpus.iter().filter(|gpu| (gpu.index as usize) < config.displays_of_gpus().len());
+    let displays: BTreeSet<String> = with_display.map(|gpu| config.display_on(Some(gpu.index))).collect();
     if displays.is_empty() { [config.display_on(None)].into() } else { displays }
 }
 
@@ -161,15 +158,6 @@ fn write(folder: &Path) -> Result<(), String> {
 
 fn not_writable(error: &std::io::Error) -> String {
     format!("This simulation server can't write in its cache: {error}")
-}
-
-/// Checks that containers can have an init process. It is not checked again after success, because that starts a
-/// container.
-fn check_init(config: &SimulationConfig, has_init: bool) -> Result<(), String> {
-    if has_init || config.isolation != IsolationSetting::Container {
-        return Ok(());
-    }
-    init_fault().map_or(Ok(()), Err)
 }
 
 /// The program that is started for each client; in a container, that of its image.

@@ -1,13 +1,11 @@
 //! A virtual display of a simulation's own.
 
+use std::io::{Read, Write};
 use std::os::unix::fs::PermissionsExt;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 
 use procfs::process::{FDTarget, Process};
-use x11rb::connection::Connection;
-use x11rb::protocol::xproto::{ConnectionExt, CreateGCAux, Rectangle};
-use x11rb::rust_connection::{DefaultStream, RustConnection};
 
 use super::deeds::as_nobody;
 use super::limits::Delegated;
@@ -86,27 +84,37 @@ async fn a_virtual_display_is_inside_of_the_sandbox() {
 }
 
 /// Has the display of a simulation take `MEMORY`, as long as the connection is open.
-fn take_memory(server: &Server, level: &str) -> RustConnection<DefaultStream> {
+fn take_memory(server: &Server, level: &str) -> UnixStream {
     let instance = instance_folders(&server.folder).remove(0);
     let display =
         |(pid, _): (i32, String)| Process::new(pid).ok()?.environ().ok()?.remove(std::ffi::OsStr::new("DISPLAY"));
     let name = instances_below(&server.folder).into_iter().find_map(display).unwrap().into_string().unwrap();
     let root = if level == "sandbox" { instance.as_path() } else { Path::new("/") };
-    let socket = UnixStream::connect(root.join("tmp/.X11-unix").join(name.replace(':', "X"))).unwrap();
+    let mut socket = UnixStream::connect(root.join("tmp/.X11-unix").join(name.replace(':', "X"))).unwrap();
     let authority = std::fs::read(instance.join("Xauthority")).unwrap();
-    let cookie = authority[authority.len() - 16..].to_vec();
-    let (stream, _) = DefaultStream::from_unix_stream(socket).unwrap();
-    let method = b"MIT-MAGIC-COOKIE-1".to_vec();
-    let connection = RustConnection::connect_to_stream_with_auth_info(stream, 0, method, cookie).unwrap();
-    let screen = &connection.setup().roots[0];
-    let [picture, tool] = [connection.generate_id().unwrap(), connection.generate_id().unwrap()];
+    let greeting = b"l\0\x0b\0\0\0\x12\0\x10\0\0\0MIT-MAGIC-COOKIE-1\0\0".as_slice();
+    socket.write_all(&[greeting, &authority[authority.len() - 16..]].concat()).unwrap();
+    let mut head = [0; 8];
+    socket.read_exact(&mut head).unwrap();
+    assert_eq!(head[0], 1, "it takes this client");
+    let mut setup = vec![0; 4 * usize::from(u16::from_le_bytes([head[6], head[7]]))];
+    socket.read_exact(&mut setup).unwrap();
+    let number = |at: usize| u32::from_le_bytes(setup[at..at + 4].try_into().unwrap());
+    let vendor = usize::from(u16::from_le_bytes([setup[16], setup[17]])).next_multiple_of(4);
+    // The first id that this client may give, and the window of the first screen, after the vendor's name and the formats.
+    let (picture, window) = (number(4), number(32 + vendor + 8 * usize::from(setup[21])));
     // Four bytes each.
-    let (width, height) = (8192, u16::try_from(MEMORY / 4 / 8192).unwrap());
-    connection.create_pixmap(screen.root_depth, picture, screen.root, width, height).unwrap();
-    connection.create_gc(tool, picture, &CreateGCAux::new().foreground(screen.white_pixel)).unwrap();
-    connection.poly_fill_rectangle(picture, tool, &[Rectangle { x: 0, y: 0, width, height }]).unwrap();
-    connection.get_input_focus().unwrap().reply().unwrap();
-    connection
+    let size = 8192 | u32::try_from(MEMORY / 4 / 8192).unwrap() << 16;
+    let request = |code: u32, length: u32| code | length << 16;
+    let picture_of_24_bits = [request(53, 4) | 24 << 8, picture, window, size];
+    let tool_with_a_color = [request(55, 5), picture + 1, window, 4, u32::MAX];
+    let rectangle = [request(70, 5), picture, picture + 1, 0, size];
+    let what_is_answered = [request(43, 1)];
+    for word in picture_of_24_bits.iter().chain(&tool_with_a_color).chain(&rectangle).chain(&what_is_answered) {
+        socket.write_all(&word.to_le_bytes()).unwrap();
+    }
+    socket.read_exact(&mut [0; 32]).unwrap();
+    socket
 }
 
 /// In bytes.

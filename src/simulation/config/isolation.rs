@@ -1,5 +1,6 @@
 //! The keys `isolation`, `sandbox` and `environment`: what a world's programs can access.
 
+use std::fmt;
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
@@ -22,6 +23,17 @@ pub enum IsolationSetting {
     Auto,
     /// With Docker.
     Container,
+}
+
+impl fmt::Display for IsolationSetting {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.write_str(match self {
+            Self::None => "none",
+            Self::Sandbox => "sandbox",
+            Self::Auto => "auto",
+            Self::Container => "container",
+        })
+    }
 }
 
 /// The key `sandbox.network`: which network the programs in a sandbox have.

@@ -99,14 +99,14 @@ impl Docker {
         mut on_line: impl FnMut(&str),
     ) -> Result<(), DockerError> {
         let (name, mut reason) = (name_of(&command), String::new());
-        let mut run = Run::new([""], &self.mark, limit);
-        run.spec = self.spec(command, Duration::ZERO);
+        let spec = self.spec(command, Duration::ZERO);
+        let mut run = Run { spec, answer: 0, ..Run::new([""], &self.mark, limit) };
         run.spec.environment.extend(variables.into_iter().map(|(name, value)| (name.into(), value.into())));
         let line = |line: String| {
             on_line(&line);
             note(&mut reason, &line);
         };
-        let ran = run.follow(line).await.map(|ending| Ran { ending, answer: Vec::new() });
+        let ran = run.run(line).await;
         result(name, ran, reason).map(drop)
     }
 

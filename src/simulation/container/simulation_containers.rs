@@ -12,7 +12,7 @@ use super::orphan_cleanup::ProjectGuard;
 use super::owned_resources;
 use super::start_error::{StartError, blame};
 use super::templates::{CONTROLLER, WEBOTS};
-use crate::simulation::process::SpawnSpec;
+use crate::simulation::process::{ExitReason, SpawnSpec};
 
 /// The containers of one simulation.
 #[derive(Debug)]
@@ -46,7 +46,7 @@ pub enum Cause {
 
 /// The exit codes of a program that was ended by SIGTERM or SIGKILL, which Docker sends to all containers when it is
 /// stopped.
-const ENDED_BY_SIGNAL: [i32; 2] = [128 + 15, 128 + 9];
+const ENDED_BY_SIGNAL: [u8; 2] = [128 + 15, 128 + 9];
 /// The range of Docker's events that is queried for the end of a container, before and after now: Docker answers at the
 /// end of the range.
 const EVENTS: (Duration, Duration) = (Duration::from_mins(1), Duration::from_millis(100));
@@ -110,9 +110,10 @@ impl SimulationContainers {
         }
     }
 
-    /// Why Webots' container has ended, given the exit code of the program `docker`; nothing if Docker knows no more.
-    pub async fn cause(&self, code: Option<i32>) -> Option<Cause> {
-        let (webots, code) = (self.container(WEBOTS), code?);
+    /// Why Webots' container has ended, given the end of the program `docker`; nothing if Docker knows no more.
+    pub async fn cause(&self, ended: ExitReason) -> Option<Cause> {
+        let ExitReason::Code(code) = ended else { return None };
+        let webots = self.container(WEBOTS);
         let format = "{{.State.OOMKilled}} {{.State.Status}} {{.State.ExitCode}}";
         let state = match self.docker.run(&["inspect", "--format", format, &webots], SHORT_TIMEOUT).await {
             Ok(state) => state,

@@ -12,16 +12,15 @@ use procfs::process::Process;
 
 use crate::simulation::config::ResourceLimits;
 use crate::simulation::ends::Taken;
+use crate::simulation::machine::{cgroup_time, number_in};
 
 /// The control groups below this server's own.
-pub struct Cgroups {
-    folder: PathBuf,
-    settings: Vec<(&'static str, String)>,
-}
+pub struct Cgroups(PathBuf);
 
 /// The control group of one simulation. Dropping it kills all processes inside, and removes it.
 pub struct Cgroup {
-    folder: PathBuf,
+    /// Its directory.
+    pub folder: PathBuf,
 }
 
 /// The group of the server itself: in a group with subgroups, the kernel's limits do not apply to processes beside
@@ -37,14 +36,14 @@ const VANISH: Duration = Duration::from_secs(2);
 const PAUSE: Duration = Duration::from_millis(5);
 
 impl Cgroups {
-    /// The control groups that are delegated to this server, if they are, as yet without limits. Nothing may have been
-    /// started before: what is just exiting would be taken for another owner of the server's group.
+    /// The control groups that are delegated to this server, if they are. Nothing may have been started before: what is
+    /// just exiting would be taken for another owner of the server's group.
     pub fn delegated() -> Option<Self> {
         let folder = own_folder()?;
         match Self::divide(&folder) {
             Ok(()) => {
                 log::info!("each simulation gets a control group below {}", folder.display());
-                Some(Self { folder, settings: Vec::new() })
+                Some(Self(folder))
             }
             Err(error) => {
                 log::info!("simulations get no control groups: {} can't be divided: {error}", folder.display());
@@ -53,18 +52,10 @@ impl Cgroups {
         }
     }
 
-    /// The same with these limits. `runners` is the number of processes that run each simulation (see
-    /// [`MostProcesses`](super::watcher::MostProcesses)).
-    pub fn with_limits(self, limits: &ResourceLimits, runners: u64) -> Self {
-        Self { settings: settings(limits, runners), ..self }
-    }
-
     /// Moves this server into a subgroup, so that there can be others beside it.
     fn divide(folder: &Path) -> io::Result<()> {
         let own = folder.join(OWN);
-        if !own.is_dir() {
-            std::fs::create_dir(&own)?;
-        }
+        std::fs::create_dir_all(&own)?;
         std::fs::write(own.join("cgroup.procs"), std::process::id().to_string())?;
         for controller in offered(folder)? {
             std::fs::write(folder.join("cgroup.subtree_control"), format!("+{controller}"))?;
@@ -77,22 +68,22 @@ impl Cgroups {
         own_folder().and_then(|folder| offered(&folder).ok()).unwrap_or_default()
     }
 
-    /// Whether the kernel counts the processes of each simulation, and enforces their limit.
-    pub fn limit_processes(&self) -> bool {
-        std::fs::read_to_string(self.folder.join("cgroup.subtree_control"))
-            .is_ok_and(|controllers| controllers.split_whitespace().any(|one| one == "pids"))
-    }
-
-    /// Creates a group for a simulation; `None` if that fails, and it runs without one.
-    pub fn make(&self) -> Option<Cgroup> {
-        let made = tempfile::Builder::new().prefix("simulation-").tempdir_in(&self.folder);
+    /// Creates a group with these limits for a simulation, which so many processes of ours run; `None` if that fails, and it
+    /// runs without one.
+    pub fn make(&self, limits: &ResourceLimits, runners: u64) -> Option<Cgroup> {
+        let made = tempfile::Builder::new().prefix("simulation-").tempdir_in(&self.0);
         let made = made.inspect_err(|error| log::warn!("no control group can be made: {error}"));
         let cgroup = Cgroup { folder: made.ok()?.keep() };
-        for (file, value) in &self.settings {
+        // A simulation that runs out of memory is killed as a whole.
+        let mut settings =
+            vec![("pids.max", (limits.processes + runners).to_string()), ("memory.oom.group", "1".to_owned())];
+        settings.extend(limits.memory.map(|memory| ("memory.max", (memory << 20).to_string())));
+        settings.extend(limits.cores.map(|cores| ("cpu.max", format!("{} {PERIOD}", cores * PERIOD))));
+        for (file, value) in settings {
             let file = cgroup.folder.join(file);
             // A controller that this server does not have can't limit anything.
             if file.exists()
-                && let Err(error) = std::fs::write(&file, value)
+                && let Err(error) = std::fs::write(&file, &value)
             {
                 log::warn!("{} can't be set to {value}: {error}", file.display());
             }
@@ -102,42 +93,39 @@ impl Cgroups {
 }
 
 impl Cgroup {
-    /// The directory of the group.
-    pub fn path(&self) -> &Path {
-        &self.folder
-    }
-
     /// The prefix of a command that runs it in this group.
     pub fn joining(&self) -> Vec<OsString> {
         let words = ["/bin/sh", "-c", "echo 0 >\"$0\" && exec \"$@\""].map(OsString::from);
         words.into_iter().chain(std::iter::once(self.folder.join("cgroup.procs").into())).collect()
     }
 
-    /// Whether the kernel has killed a process inside because of the memory limit.
-    pub fn has_run_out_of_memory(&self) -> bool {
-        let events = std::fs::read_to_string(self.folder.join("memory.events")).unwrap_or_default();
-        events.lines().any(|line| line.strip_prefix("oom_kill ").is_some_and(|count| count.trim() != "0"))
-    }
-
-    /// What has been taken in it.
-    pub fn taken(&self) -> Taken {
-        taken_in(&self.folder)
-    }
-
-    /// Kills all processes inside. Blocks until they have exited, for two seconds at most.
-    pub fn kill(&self) {
+    /// Kills all processes inside, and returns whether the kernel had killed one because of the memory limit, and what has
+    /// been taken. Blocks until they have exited, for two seconds at most.
+    pub fn end(&self) -> (bool, Taken) {
         kill(&self.folder);
+        let events = std::fs::read_to_string(self.folder.join("memory.events")).unwrap_or_default();
+        let kills = events.lines().find_map(|line| line.strip_prefix("oom_kill "));
+        (kills.is_some_and(|count| count.trim() != "0"), taken_in(&self.folder))
     }
 }
 
 /// What has been taken in the control group with this folder, as far as the kernel counts it. It knows the peak of memory
 /// since Linux 5.19.
-pub(super) fn taken_in(folder: &Path) -> Taken {
-    let read = |file| std::fs::read_to_string(folder.join(file)).ok();
-    let time = read("cpu.stat")
-        .and_then(|times| times.lines().find_map(|line| line.strip_prefix("usage_usec ")?.trim().parse().ok()));
-    let memory = read("memory.peak").and_then(|bytes| bytes.trim().parse().ok());
-    Taken { memory, time: time.map(Duration::from_micros) }
+fn taken_in(folder: &Path) -> Taken {
+    Taken { memory: number_in(&folder.join("memory.peak")), time: cgroup_time(folder) }
+}
+
+/// What a container has taken until now, as far as the kernel counts it, in control groups of either version, which Docker
+/// makes with systemd and without. They vanish with the container.
+pub(super) fn taken_by_container(container: &str) -> Taken {
+    let root = Path::new("/sys/fs/cgroup");
+    let names = [format!("system.slice/docker-{container}.scope"), format!("docker/{container}")];
+    let of_version_1 = |name: &String| Taken {
+        memory: number_in(&root.join("memory").join(name).join("memory.max_usage_in_bytes")),
+        time: number_in(&root.join("cpuacct").join(name).join("cpuacct.usage")).map(Duration::from_nanos),
+    };
+    let all = names.iter().flat_map(|name| [taken_in(&root.join(name)), of_version_1(name)]);
+    all.fold(Taken::default(), |all, one| Taken { memory: all.memory.or(one.memory), time: all.time.or(one.time) })
 }
 
 /// Ends all that is in a group. What is forked meanwhile is ended too.
@@ -169,15 +157,6 @@ fn offered(folder: &Path) -> io::Result<Vec<&'static str>> {
     let offered = std::fs::read_to_string(folder.join("cgroup.controllers"))?;
     let is_offered = |name: &&str| offered.split_whitespace().any(|one| one == *name);
     Ok(CONTROLLERS.into_iter().filter(is_offered).collect())
-}
-
-/// The limits in the kernel's format. A simulation that runs out of memory is killed as a whole.
-fn settings(limits: &ResourceLimits, runners: u64) -> Vec<(&'static str, String)> {
-    let mut settings =
-        vec![("pids.max", (limits.processes + runners).to_string()), ("memory.oom.group", "1".to_owned())];
-    settings.extend(limits.memory.map(|memory| ("memory.max", (memory << 20).to_string())));
-    settings.extend(limits.cores.map(|cores| ("cpu.max", format!("{} {PERIOD}", cores * PERIOD))));
-    settings
 }
 
 /// The directory of this server's control group; `None` if other processes are in it.

@@ -12,7 +12,8 @@ pub struct Disk {
     /// `diskReserve`, in MiB.
     reserve: u64,
     room: DiskRoom,
-    lost: u64,
+    /// How much room it has lost since the start, in bytes: what becomes free again is not taken off.
+    pub lost: u64,
     /// The free room when a simulation was last to end for the reserve, or the most since then, in bytes, and when that was.
     relieved: Option<(u64, Instant)>,
 }
@@ -33,47 +34,33 @@ impl Disk {
         Self { folder, reserve, room, lost: 0, relieved: None }
     }
 
-    /// Reads the free room. It stays as it was if the file system does not answer.
-    pub fn look(&mut self) {
-        let Ok(room) = DiskRoom::of(&self.folder) else { return };
-        let bytes = self.room.bytes.saturating_sub(room.bytes);
-        let inodes = self.room.inodes.saturating_sub(room.inodes).saturating_mul(SMALLEST);
-        self.lost = self.lost.saturating_add(bytes.max(inodes));
-        self.room = room;
+    /// Reads the free room; it stays as it was if the file system does not answer. Returns whether a simulation has to end for
+    /// the reserve now, if one has grown.
+    pub fn look(&mut self) -> bool {
+        if let Ok(room) = DiskRoom::of(&self.folder) {
+            let bytes = self.room.bytes.saturating_sub(room.bytes);
+            let inodes = self.room.inodes.saturating_sub(room.inodes).saturating_mul(SMALLEST);
+            self.lost = self.lost.saturating_add(bytes.max(inodes));
+            self.room = room;
+        }
         if self.room.shortage(self.reserve).is_none() {
             self.relieved = None;
+            return false;
         }
-    }
-
-    /// How much room it has lost since the start, in bytes: what becomes free again is not taken off.
-    pub fn lost(&self) -> u64 {
-        self.lost
+        let is_more = self.relieved.is_some_and(|(free, _)| self.room.bytes > free);
+        let has_to_end = self.relieved.is_none_or(|(free, at)| {
+            free.saturating_sub(self.room.bytes) > (self.reserve << 20) / PARTS || at.elapsed() >= EFFECT
+        });
+        // Where there is more, the folder of the ended simulation is being removed.
+        if is_more || has_to_end {
+            self.relieved = Some((self.room.bytes, Instant::now()));
+        }
+        has_to_end && !is_more
     }
 
     /// Time until the next look: the shorter, the closer the free room is to the reserve.
     pub fn pause(&self) -> Duration {
         let above = self.room.bytes.saturating_sub(self.reserve << 20);
         Duration::from_millis(above / FASTEST).clamp(LOOKS.1, LOOKS.0)
-    }
-
-    /// Whether a simulation has to end for the reserve now.
-    pub fn is_short(&mut self) -> bool {
-        if self.room.shortage(self.reserve).is_none() {
-            return false;
-        }
-        match &mut self.relieved {
-            None => true,
-            // The folder of the ended simulation is being removed.
-            Some((free, at)) if self.room.bytes > *free => {
-                (*free, *at) = (self.room.bytes, Instant::now());
-                false
-            }
-            Some((free, at)) => *free - self.room.bytes > (self.reserve << 20) / PARTS || at.elapsed() >= EFFECT,
-        }
-    }
-
-    /// Notes that a simulation ends for the reserve, if one has grown.
-    pub fn relieve(&mut self) {
-        self.relieved = Some((self.room.bytes, Instant::now()));
     }
 }

@@ -4,13 +4,13 @@ use std::os::unix::fs::MetadataExt;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use crate::simulation::process::disk_usage::{DiskUsage, Unknown, room};
+use crate::simulation::process::disk_usage::{DiskUsage, room};
 use crate::simulation::process::process_tree::{nameless_files, tree};
 
 /// What one simulation has taken, as it was last counted.
 pub struct DiskUse {
     /// The process from which all of it descends.
-    root: i32,
+    pub root: i32,
     /// The folder of the instance.
     folder: PathBuf,
     /// How much it may write, in MiB.
@@ -22,8 +22,9 @@ pub struct DiskUse {
     /// Whether its processes hide which files they have open.
     hides: bool,
     /// How much room the disk had lost when it was counted.
-    lost: u64,
-    counted: Instant,
+    pub lost: u64,
+    /// When it was counted last.
+    pub counted: Instant,
 }
 
 /// Time between two counts for `limits.disk`.
@@ -32,14 +33,9 @@ const COUNT_AGAIN: Duration = Duration::from_secs(10);
 const LEAST_GROWTH: u64 = 1 << 20;
 
 impl DiskUse {
-    /// A simulation that has written nothing yet. `lost` is how much room the disk has lost until now.
-    pub fn new(root: i32, folder: PathBuf, (first, limit): (u64, u64), lost: u64) -> Self {
-        Self { root, folder, limit, first, taken: first, hides: false, lost, counted: Instant::now() }
-    }
-
-    /// When it was counted last.
-    pub fn counted(&self) -> Instant {
-        self.counted
+    /// A simulation that has written nothing yet into its folder, which has `first` bytes; it may write `limit` MiB.
+    pub fn new(root: i32, folder: PathBuf, first: u64, limit: u64) -> Self {
+        Self { root, folder, limit, first, taken: first, hides: false, lost: 0, counted: Instant::now() }
     }
 
     /// Whether it may have exceeded its limit since it was counted: the disk has lost as much as it may still write.
@@ -52,10 +48,10 @@ impl DiskUse {
     /// Counts what it takes, within this time. Returns a message for its client if it exceeds its limit.
     pub fn count(&mut self, lost: u64, time: Duration) -> Option<String> {
         let mut size = DiskUsage::new(room, self.allowed()).within(time);
-        let counted = size.add_folder(&self.folder);
+        let is_shown = size.add_folder(&self.folder);
         self.add_nameless(&mut size, time);
         (self.taken, self.lost, self.counted) = (size.total(), lost, Instant::now());
-        if counted == Err(Unknown::Hidden) {
+        if !is_shown {
             return Some("The simulation has folders that nobody can look into, too deep or closed".to_owned());
         }
         let limit = self.limit;

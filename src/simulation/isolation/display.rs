@@ -12,6 +12,8 @@ use std::path::{Path, PathBuf};
 
 use which::which;
 
+use crate::simulation::machine::display::{COOKIE, EVERY_HOST};
+
 /// The display of a simulation.
 pub enum Display {
     /// An existing display, by its name.
@@ -44,10 +46,6 @@ export DISPLAY=":$number"
 shift 2
 exec "$@"
 "#;
-/// In an authority file: the entry counts for every host. `FamilyWild` of X11/Xauth.h.
-const EVERY_HOST: u16 = 0xffff;
-/// The only authorization method that all clients support.
-const COOKIE: &[u8] = b"MIT-MAGIC-COOKIE-1";
 
 impl Display {
     /// A virtual display; its authority file is in the instance's folder.
@@ -60,7 +58,7 @@ impl Display {
         let cookie: [u8; 16] = rand::random();
         let mut entry = EVERY_HOST.to_be_bytes().to_vec();
         // No address and no display number: the entry applies to all.
-        for field in [&[], &[], COOKIE, &cookie] {
+        for field in [&[], &[], COOKIE.as_bytes(), &cookie] {
             entry.extend(u16::try_from(field.len()).unwrap_or_default().to_be_bytes());
             entry.extend(field);
         }

@@ -4,7 +4,6 @@ mod cgroup;
 mod disk;
 mod disk_use;
 mod display;
-mod docker_cgroup;
 mod inherited_environment;
 mod keyrings;
 mod launcher;
@@ -16,8 +15,9 @@ mod sandbox;
 mod watcher;
 
 pub use cgroup::Cgroup;
+pub use disk_use::DiskUse;
 pub use display::Display;
-pub use launcher::{IsolationLevel, Launcher, Network};
+pub use launcher::Launcher;
 pub use peak::Peak;
 pub use program::Program;
 pub use watcher::{Watch, Watcher};

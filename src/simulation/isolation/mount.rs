@@ -12,48 +12,41 @@ use crate::simulation::config::SimulationConfig;
 pub struct Mount {
     /// The absolute path.
     pub at: PathBuf,
-    /// What is mounted there.
-    pub content: MountKind,
-}
-
-/// What a sandbox mounts at a path.
-#[derive(Debug, Clone)]
-pub enum MountKind {
-    /// An empty directory.
-    EmptyFolder,
-    /// An empty file.
-    EmptyFile,
-    /// The same path, read-only.
-    ReadOnly,
-    /// A file at another path, only to be read.
-    ReadableFile(PathBuf),
-    /// What is at another path, to be read and written.
-    ReadWrite(PathBuf),
+    /// bubblewrap's option for it.
+    option: &'static str,
+    /// What is mounted there; `None` if that is an empty directory.
+    pub source: Option<PathBuf>,
 }
 
 /// The administrator's directory, in which a package of this server has its configuration.
 const ETC: &str = "/etc/webots-fleet";
 
 impl Mount {
-    /// Mounts this at a path.
-    pub fn new(at: &str, content: MountKind) -> Self {
-        Self { at: at.into(), content }
+    /// An empty directory.
+    pub fn empty(at: impl Into<PathBuf>) -> Self {
+        Self { at: at.into(), option: "--tmpfs", source: None }
     }
 
-    /// Mounts an empty directory.
-    pub fn empty(at: PathBuf) -> Self {
-        Self { at, content: MountKind::EmptyFolder }
+    /// The same path, read-only, if it is there.
+    pub fn read_only(at: impl Into<PathBuf>) -> Self {
+        let at = at.into();
+        Self { option: "--ro-bind-try", source: Some(at.clone()), at }
+    }
+
+    /// A file at another path, only to be read.
+    pub fn file(at: PathBuf, source: PathBuf) -> Self {
+        Self { at, option: "--ro-bind", source: Some(source) }
+    }
+
+    /// What is at this path, which may be another one, to be read and written.
+    pub fn writable(at: PathBuf, source: &Path) -> Self {
+        Self { at, option: "--bind", source: Some(source.to_owned()) }
     }
 
     /// The arguments of bubblewrap for this mount.
-    pub fn into_arguments(self) -> Vec<OsString> {
-        match self.content {
-            MountKind::EmptyFolder => vec!["--tmpfs".into(), self.at.into()],
-            MountKind::EmptyFile => vec!["--ro-bind".into(), "/dev/null".into(), self.at.into()],
-            MountKind::ReadOnly => vec!["--ro-bind-try".into(), self.at.clone().into(), self.at.into()],
-            MountKind::ReadableFile(content) => vec!["--ro-bind".into(), content.into(), self.at.into()],
-            MountKind::ReadWrite(content) => vec!["--bind".into(), content.into(), self.at.into()],
-        }
+    pub fn into_arguments(self) -> impl Iterator<Item = OsString> {
+        let paths = self.source.into_iter().chain([self.at]);
+        std::iter::once(self.option.into()).chain(paths.map(Into::into))
     }
 }
 
@@ -70,7 +63,7 @@ pub fn hidden(config: &SimulationConfig, homes: &[PathBuf]) -> Vec<Mount> {
         if beside.iter().any(|one| real.parent() == Some(one)) {
             hidden.extend(beside.map(Mount::empty));
         }
-        hidden.push(Mount { at: real, content: MountKind::EmptyFile });
+        hidden.push(Mount::file(real, "/dev/null".into()));
     }
     hidden
 }

@@ -13,9 +13,10 @@ use std::path::{Path, PathBuf};
 
 use which::which;
 
-use super::mount::{Mount, MountKind};
+use super::mount::Mount;
 use super::program::Program;
 use crate::simulation::config::{SandboxNetwork, SimulationConfig};
+use crate::simulation::machine::display;
 
 /// The programs and settings that give each sandbox a network of its own.
 pub struct OwnNetwork {
@@ -23,8 +24,9 @@ pub struct OwnNetwork {
     setpriv: PathBuf,
     unshare: PathBuf,
     /// The program that loads the packet filter; `None` if it is missing or fails.
-    nft: Option<PathBuf>,
-    closed: bool,
+    pub nft: Option<PathBuf>,
+    /// Whether programs reach nothing at all.
+    pub closed: bool,
     loopback: IpAddr,
     /// The address of the machine on which the port of each simulation is forwarded: the one on which the server listens,
     /// or the loopback where only this server is to reach simulations.
@@ -76,16 +78,6 @@ impl OwnNetwork {
         let loopback = loopback();
         let forwarded = if config.ports_are_public() { config.bind } else { loopback };
         Ok(Self { pasta, setpriv, unshare, nft, closed, loopback, forwarded })
-    }
-
-    /// Whether programs reach nothing at all.
-    pub fn is_closed(&self) -> bool {
-        self.closed
-    }
-
-    /// Whether a packet filter keeps programs from private addresses.
-    pub fn is_filtered(&self) -> bool {
-        self.nft.is_some()
     }
 
     /// Drops the packet filter, if the configuration allows that. Returns whether there was one.
@@ -140,7 +132,7 @@ impl OwnNetwork {
     /// The mount by which programs in a sandbox resolve names.
     pub fn mounts(&self, instance: &Path) -> Option<Mount> {
         let at = Path::new(RESOLV_CONF).canonicalize().ok().filter(|_| !self.closed)?;
-        Some(Mount { at, content: MountKind::ReadableFile(resolv_conf(instance)) })
+        Some(Mount::file(at, resolv_conf(instance)))
     }
 }
 
@@ -148,7 +140,7 @@ impl OwnNetwork {
 fn remote_display(config: &SimulationConfig) -> Option<String> {
     let of_gpus = (0..config.displays_of_gpus().len()).map(|index| config.display_on(u32::try_from(index).ok()));
     let mut displays = of_gpus.chain([config.display_on(None)]).filter(|_| !config.xvfb);
-    displays.find(|display| !display.starts_with(':') && !display.starts_with("unix:"))
+    displays.find(|display| display::socket(display).is_none())
 }
 
 fn resolv_conf(instance: &Path) -> PathBuf {

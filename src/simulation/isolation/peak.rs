@@ -4,7 +4,7 @@ use std::sync::OnceLock;
 
 use parking_lot::Mutex;
 
-use super::docker_cgroup::taken_by_container;
+use super::cgroup::taken_by_container;
 use crate::simulation::ends::Taken;
 use crate::simulation::machine::Usage;
 

@@ -21,7 +21,7 @@ pub struct Program<'start> {
     /// Its display.
     pub display: &'start Display,
     /// Variables of its own: the one that names its GPU.
-    pub variables: &'start [(OsString, OsString)],
+    pub variables: Vec<(OsString, OsString)>,
     /// Time between SIGTERM and SIGKILL.
     pub grace: Duration,
 }

@@ -4,7 +4,7 @@
 //! The mounts are one list, outer directories before inner ones. The most specific path wins: a mount covers a
 //! directory and its contents unless a longer path overrides it.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ffi::OsString;
 use std::io;
 use std::net::{Ipv4Addr, TcpListener};
@@ -15,11 +15,12 @@ use which::which;
 
 use super::display::Display;
 use super::keyrings;
-use super::mount::{Mount, MountKind, hidden};
+use super::mount::{Mount, hidden};
 use super::network::{CHECK, OwnNetwork};
 use super::program::Program;
 use crate::shared::text::one_line;
 use crate::simulation::config::{SandboxNetwork, SimulationConfig};
+use crate::simulation::machine::display;
 use crate::simulation::process::{ExitReason, Ran, Run, RunError};
 
 /// The common part of all sandboxes of this server.
@@ -28,10 +29,10 @@ pub struct Sandbox {
     user: u32,
     homes: Vec<PathBuf>,
     mounts: Vec<Mount>,
-    /// Whether programs inside can be kept from creating user namespaces, which bubblewrap supports since 0.8.
-    ends_namespaces: bool,
+    /// Whether programs inside are kept from creating user namespaces, which bubblewrap supports since 0.8.
+    pub ends_namespaces: bool,
     /// Its own network, if it has one.
-    network: Option<OwnNetwork>,
+    pub network: Option<OwnNetwork>,
     /// Size limit of its shared memory, in bytes.
     shared_memory: u64,
 }
@@ -56,28 +57,36 @@ const NETWORK_REMEDY: &str = "ordinary users must be allowed to open /dev/net/tu
                               machine must have a default route, of the version of IP of bind";
 
 impl Sandbox {
-    /// Prepares sandboxes for a server with this configuration.
+    /// Prepares sandboxes for a server with this configuration, and tries whether they work here. Blocks for ten seconds at
+    /// most.
     ///
     /// # Errors
-    /// When bubblewrap is not installed, as text for an administrator.
+    /// Why they don't, and what to do about it, as text for an administrator.
     pub fn new(config: &SimulationConfig) -> Result<Self, String> {
         let bubblewrap = which("bwrap").map_err(|_| {
             "bubblewrap (bwrap) is not there; on Debian, Ubuntu and Fedora the package bubblewrap has it".to_owned()
         })?;
-        let shown = |path: &PathBuf| path.canonicalize().ok();
-        let mut mounts = vec![Mount::new("/run", MountKind::EmptyFolder)];
+        let mut mounts = vec![Mount::empty("/run")];
         let names = NAMES_RUN.into_iter().filter(|_| config.sandbox.network != SandboxNetwork::Closed);
-        mounts.extend(names.chain(SYSTEM_RUN).map(|at| Mount::new(at, MountKind::ReadOnly)));
-        let readable = config.webots_home.iter().chain(&config.sandbox.readable).filter_map(|path| shown(&path.0));
-        mounts.extend(readable.map(|at| Mount { at, content: MountKind::ReadOnly }));
-        let writable = config.sandbox.writable.iter().filter_map(|path| shown(&path.0));
-        mounts.extend(writable.map(|at| Mount { at: at.clone(), content: MountKind::ReadWrite(at) }));
+        mounts.extend(names.chain(SYSTEM_RUN).map(Mount::read_only));
+        let readable = config.webots_home.iter().chain(&config.sandbox.readable);
+        mounts.extend(readable.filter_map(|path| path.0.canonicalize().ok()).map(Mount::read_only));
+        let writable = config.sandbox.writable.iter().filter_map(|path| path.0.canonicalize().ok());
+        mounts.extend(writable.map(|at| Mount::writable(at.clone(), &at)));
         // Last, so that nothing overrides these.
         let homes = homes();
         mounts.extend(hidden(config, &homes));
         mounts.retain(|mount| mount.at.exists());
         let (user, shared_memory) = (nix::unistd::getuid().as_raw(), config.limits.disk << 20);
-        Ok(Self { bubblewrap, user, homes, mounts, ends_namespaces: true, network: None, shared_memory })
+        let mut sandbox = Self { bubblewrap, user, homes, mounts, ends_namespaces: true, network: None, shared_memory };
+        let mut tried = sandbox.trial();
+        // A trial that hangs would also hang without these options.
+        if tried.as_ref().is_err_and(|error| error.kind() != io::ErrorKind::TimedOut) {
+            sandbox.ends_namespaces = false;
+            tried = sandbox.trial();
+        }
+        let told = |error: io::Error| one_line(error.to_string().trim());
+        tried.map(|()| sandbox).map_err(|error| format!("bubblewrap makes no sandbox here ({}): {REMEDY}", told(error)))
     }
 
     /// The prefix of the command that runs a program in a sandbox of its own. Creates the directories that it needs in
@@ -112,24 +121,22 @@ impl Sandbox {
         for device in devices() {
             command.extend(["--dev-bind-try".into(), device.clone().into(), device.into()]);
         }
-        let mut mounts = self.own(program)?;
-        mounts.extend(self.mounts.iter().cloned());
-        // The sort is stable: of two mounts at the same path the last one counts.
-        mounts.sort_by_key(|mount| mount.at.components().count());
+        // Of two mounts at the same path the last one counts.
+        let mounts = self.own(program)?.into_iter().chain(self.mounts.iter().cloned());
+        let mounts: BTreeMap<_, _> =
+            mounts.map(|mount| ((mount.at.components().count(), mount.at.clone()), mount)).collect();
         // Empty directories are memory: they are made read-only, as is the rest of `/dev`.
-        let closed = empty(&mounts);
-        command.extend(mounts.into_iter().flat_map(Mount::into_arguments));
-        command.extend(self.shared_memory());
+        let empty = mounts.values().filter(|mount| mount.source.is_none()).map(|mount| mount.at.clone());
+        let closed: Vec<PathBuf> = empty.chain(["/dev".into()]).collect();
+        command.extend(mounts.into_values().flat_map(Mount::into_arguments));
+        // bubblewrap can set its limit since 0.7.
+        if self.ends_namespaces {
+            command.extend(["--size".into(), self.shared_memory.to_string().into()]);
+        }
+        command.extend(["--tmpfs", "/dev/shm"].map(Into::into));
         command.extend(closed.into_iter().flat_map(|at| ["--remount-ro".into(), at.into()]));
         command.extend(["--chdir".into(), program.folder.into(), "--".into()]);
         Ok(command)
-    }
-
-    /// Shared memory within its limit, which bubblewrap can set since 0.7.
-    fn shared_memory(&self) -> Vec<OsString> {
-        let size = ["--size".to_owned(), self.shared_memory.to_string()];
-        let size = size.into_iter().filter(|_| self.ends_namespaces);
-        size.chain(["--tmpfs", "/dev/shm"].map(str::to_owned)).map(Into::into).collect()
     }
 
     /// What is different from one simulation to another.
@@ -140,15 +147,13 @@ impl Sandbox {
         };
         let (home, run, tmp) = (inside("home")?, inside("run")?, inside("tmp")?);
         program.display.prepare(&tmp)?;
-        let mut own: Vec<Mount> = Vec::new();
-        own.extend(temporary_folders().map(|at| Mount { at, content: MountKind::ReadWrite(tmp.clone()) }));
-        own.push(Mount { at: self.runtime_folder(), content: MountKind::ReadWrite(run) });
-        own.extend(self.homes.iter().map(|at| Mount { at: at.clone(), content: MountKind::ReadWrite(home.clone()) }));
-        own.push(Mount { at: program.project.clone(), content: MountKind::ReadWrite(program.project.clone()) });
+        let mut own: Vec<Mount> = temporary_folders().map(|at| Mount::writable(at, &tmp)).collect();
+        own.push(Mount::writable(self.runtime_folder(), &run));
+        own.extend(self.homes.iter().map(|at| Mount::writable(at.clone(), &home)));
+        own.push(Mount::writable(program.project.clone(), &program.project));
         // The sandbox resolves symlinks inside, where their targets may not exist.
         let files = program.command.first().map(PathBuf::from).into_iter().chain(self.display_files(program));
-        let files = files.filter_map(|file| file.canonicalize().ok());
-        own.extend(files.map(|at| Mount { at, content: MountKind::ReadOnly }));
+        own.extend(files.filter_map(|file| file.canonicalize().ok()).map(Mount::read_only));
         own.extend(self.network.as_ref().and_then(|network| network.mounts(program.instance)));
         own.retain(|mount| mount.at.exists() || mount.at == self.runtime_folder());
         Ok(own)
@@ -162,7 +167,7 @@ impl Sandbox {
         };
         let authority = std::env::var_os("XAUTHORITY").map(PathBuf::from);
         let usual = || self.homes.first().map(|home| home.join(".Xauthority"));
-        socket_of(name).into_iter().chain(authority.or_else(usual)).collect()
+        display::socket(name).into_iter().chain(authority.or_else(usual)).collect()
     }
 
     /// Variables that differ in a sandbox. Shared memory with the display is not available.
@@ -178,21 +183,6 @@ impl Sandbox {
 
     fn runtime_folder(&self) -> PathBuf {
         PathBuf::from(format!("/run/user/{}", self.user))
-    }
-
-    /// Tries whether a sandbox works here. Blocks for ten seconds at most.
-    ///
-    /// # Errors
-    /// Why not, and what to do about it, as text for an administrator.
-    pub fn tried(mut self) -> Result<Self, String> {
-        let mut tried = self.trial();
-        // A trial that hangs would also hang without these options.
-        if tried.as_ref().is_err_and(|error| error.kind() != io::ErrorKind::TimedOut) {
-            self.ends_namespaces = false;
-            tried = self.trial();
-        }
-        let told = |error: io::Error| one_line(error.to_string().trim());
-        tried.map(|()| self).map_err(|error| format!("bubblewrap makes no sandbox here ({}): {REMEDY}", told(error)))
     }
 
     /// Gives each sandbox a network of its own, if that works here. Blocks for ten seconds at most.
@@ -211,16 +201,6 @@ impl Sandbox {
         })
     }
 
-    /// Its own network, if it has one.
-    pub fn network(&self) -> Option<&OwnNetwork> {
-        self.network.as_ref()
-    }
-
-    /// Whether programs inside are kept from creating user namespaces.
-    pub fn ends_namespaces(&self) -> bool {
-        self.ends_namespaces
-    }
-
     /// Runs `true` in a sandbox with all mounts.
     fn trial(&self) -> io::Result<()> {
         let instance = tempfile::tempdir()?;
@@ -233,7 +213,7 @@ impl Sandbox {
             project: project.clone(),
             // One that was free a moment ago.
             port: TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?.local_addr()?.port(),
-            variables: &[],
+            variables: Vec::new(),
             display: &Display::Outside(String::new()),
             grace: TRIAL,
         })?;
@@ -271,24 +251,9 @@ fn temporary_folders() -> impl Iterator<Item = PathBuf> {
     real.filter(|folder| folder.parent().is_some() && !folder.starts_with("/dev")).collect::<BTreeSet<_>>().into_iter()
 }
 
-/// The paths at which a directory stays empty, and `/dev`.
-fn empty(mounts: &[Mount]) -> Vec<PathBuf> {
-    let is_last = |number: usize, mount: &Mount| !mounts.iter().skip(number + 1).any(|other| other.at == mount.at);
-    let empty = mounts.iter().enumerate().filter(|(_, mount)| matches!(mount.content, MountKind::EmptyFolder));
-    let last = empty.filter(|(number, mount)| is_last(*number, mount)).map(|(_, mount)| mount.at.clone());
-    last.chain(["/dev".into()]).collect()
-}
-
 /// The graphics cards of this machine.
 fn devices() -> impl Iterator<Item = PathBuf> {
     let all = std::fs::read_dir("/dev").into_iter().flatten().flatten();
     let nvidia = all.filter(|entry| entry.file_name().as_encoded_bytes().starts_with(b"nvidia"));
     DEVICES.iter().map(PathBuf::from).chain(nvidia.map(|entry| entry.path()))
-}
-
-/// The socket of a display on this machine.
-fn socket_of(display: &str) -> Option<PathBuf> {
-    let (host, number) = display.rsplit_once(':')?;
-    let number = number.split('.').next().filter(|number| number.parse::<u16>().is_ok())?;
-    matches!(host, "" | "unix").then(|| PathBuf::from(format!("/tmp/.X11-unix/X{number}")))
 }

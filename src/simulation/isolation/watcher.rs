@@ -28,35 +28,21 @@ pub struct Watcher(Sender<(Watch, oneshot::Sender<String>)>);
 
 /// What is monitored of one simulation.
 pub struct Watch {
-    /// The root of its process tree.
-    pub root: i32,
-    /// The directory of the instance.
-    pub folder: PathBuf,
-    /// What its project took at first, in bytes.
-    pub first: u64,
-    /// Limit of what it may write into that directory, in MiB.
-    pub disk: u64,
-    /// Limit of its processes and threads; `None` if the kernel enforces it.
-    pub processes: Option<MostProcesses>,
+    /// What it has taken of the disk.
+    pub disk: DiskUse,
+    /// Limit of its own processes and threads; `None` if the kernel enforces it.
+    pub processes: Option<u64>,
+    /// Number of the tree's processes that run the simulation, and do not count.
+    pub runners: u64,
     /// Receives its usage; `None` if its control group counts it.
     pub peak: Option<Arc<Peak>>,
 }
 
-/// A limit of processes that the kernel does not enforce.
-#[derive(Debug, Clone, Copy)]
-pub struct MostProcesses {
-    /// The limit of the simulation's own processes and threads.
-    pub limit: u64,
-    /// Number of the tree's processes that run the simulation, and do not count.
-    pub runners: u64,
-}
-
-/// A monitored simulation, and its state.
+/// A monitored simulation.
 struct Watched {
     watch: Watch,
-    /// Receives the message when it exceeds a limit.
-    excess: oneshot::Sender<String>,
-    disk: DiskUse,
+    /// Receives the message when it exceeds a limit, and is gone then.
+    excess: Option<oneshot::Sender<String>>,
 }
 
 /// The shortest time between two ticks.
@@ -98,6 +84,14 @@ impl Watcher {
     }
 }
 
+impl Watched {
+    /// Sends this message, and ends the monitoring.
+    fn end(&mut self, why: String) {
+        // The receiver may be gone.
+        self.excess.take().map(|excess| excess.send(why));
+    }
+}
+
 /// All monitored simulations.
 struct Table {
     disk: Disk,
@@ -114,105 +108,79 @@ impl Table {
                 let left = next.saturating_duration_since(Instant::now());
                 match if self.all.is_empty() { watches.recv().map_err(Into::into) } else { watches.recv_timeout(left) }
                 {
-                    Ok((watch, excess)) => {
-                        let sizes = (watch.first, watch.disk);
-                        let disk = DiskUse::new(watch.root, watch.folder.clone(), sizes, self.disk.lost());
-                        self.all.push(Watched { watch, excess, disk });
+                    Ok((mut watch, excess)) => {
+                        watch.disk.lost = self.disk.lost;
+                        self.all.push(Watched { watch, excess: Some(excess) });
                     }
                     Err(RecvTimeoutError::Timeout) => break,
                     Err(RecvTimeoutError::Disconnected) => return,
                 }
             }
-            self.all.retain(|one| !one.excess.is_closed());
-            self.disk.look();
-            if self.disk.is_short() {
-                let excess = self.find_grown_most();
-                self.end(excess);
+            self.all.retain(|one| one.excess.as_ref().is_some_and(|excess| !excess.is_closed()));
+            if self.disk.look() {
+                self.end_grown_most();
             }
             if Instant::now() >= tick {
                 let begin = processor_time();
-                self.look(begin);
+                self.count_folders(begin);
+                self.count_processes();
                 tick = Instant::now() + pause_after(processor_time().saturating_sub(begin));
             }
         }
     }
 
-    /// Which simulation has grown most; none if none has grown: then another program fills the disk.
-    fn find_grown_most(&mut self) -> Option<(i32, String)> {
-        let until = Instant::now() + COUNTS_AT_RESERVE;
-        let lost = self.disk.lost();
-        // Also if none is found, so that the next try waits, too.
-        self.disk.relieve();
+    /// Ends the simulation that has grown most; none if none has grown: then another program fills the disk.
+    fn end_grown_most(&mut self) {
+        let (until, lost) = (Instant::now() + COUNTS_AT_RESERVE, self.disk.lost);
         // The one that had grown most is counted first, then those whose count is oldest.
-        self.all.sort_by_key(|one| one.disk.counted());
-        let most = self.all.iter().enumerate().max_by_key(|(_, one)| one.disk.growth()).map(|(mount, _)| mount);
-        most.inspect(|mount| self.all.swap(0, *mount));
+        self.all.sort_by_key(|one| one.watch.disk.counted);
+        let most = self.all.iter().enumerate().max_by_key(|(_, one)| one.watch.disk.growth()).map(|(index, _)| index);
+        most.inspect(|index| self.all.swap(0, *index));
         for one in &mut self.all {
             if Instant::now() >= until {
                 break;
             }
-            if let Some(why) = one.disk.count(lost, COUNT_AT_RESERVE) {
-                return Some((one.watch.root, why));
+            if let Some(why) = one.watch.disk.count(lost, COUNT_AT_RESERVE) {
+                return one.end(why);
             }
         }
-        let grown = self.all.iter().filter_map(|one| Some((one.watch.root, one.disk.growth()?)));
-        let (root, growth) = grown.max_by_key(|(_, growth)| *growth)?;
-        Some((root, words(growth)))
-    }
-
-    /// One tick, which began at this processor time.
-    fn look(&mut self, begin: Duration) {
-        let mut excesses = self.count_folders(begin);
-        excesses.extend(self.count_processes());
-        self.end(excesses);
-    }
-
-    /// Sends these messages, and stops monitoring these simulations.
-    fn end(&mut self, excesses: impl IntoIterator<Item = (i32, String)>) {
-        for (root, why) in excesses {
-            if let Some(mount) = self.all.iter().position(|one| one.watch.root == root) {
-                // The receiver may be gone.
-                self.all.swap_remove(mount).excess.send(why).ok();
-            }
+        let grown = self.all.iter_mut().filter_map(|one| Some((one.watch.disk.growth()?, one)));
+        if let Some((growth, one)) = grown.max_by_key(|(growth, _)| *growth) {
+            one.end(words(growth));
         }
     }
 
-    fn count_folders(&mut self, begin: Duration) -> Vec<(i32, String)> {
-        let (lost, time) = (self.disk.lost(), self.disk.pause().min(COUNT));
-        let mut due: Vec<&mut Watched> = self.all.iter_mut().filter(|one| one.disk.is_due(lost)).collect();
-        due.sort_by_key(|one| one.disk.counted());
-        let mut excesses = Vec::new();
+    /// Counts what simulations have written, in a tick that began at this processor time.
+    fn count_folders(&mut self, begin: Duration) {
+        let (lost, time) = (self.disk.lost, self.disk.pause().min(COUNT));
+        let mut due: Vec<&mut Watched> = self.all.iter_mut().filter(|one| one.watch.disk.is_due(lost)).collect();
+        due.sort_by_key(|one| one.watch.disk.counted);
         for one in due {
             if processor_time().saturating_sub(begin) >= FOLDERS {
                 break;
             }
-            excesses.extend(one.disk.count(lost, time).map(|why| (one.watch.root, why)));
-        }
-        excesses
-    }
-
-    fn count_processes(&self) -> Vec<(i32, String)> {
-        let is_counted =
-            |watch: &Watch| watch.processes.is_some() || watch.peak.as_ref().is_some_and(|peak| peak.is_of_tree());
-        let trees = self.all.iter().filter(|one| is_counted(&one.watch)).map(|one| Tree::of(one.watch.root));
-        let usages = self.usage.read(&trees.collect::<Vec<_>>());
-        for Watch { root, peak, .. } in self.all.iter().map(|one| &one.watch) {
-            if let Some(peak) = peak {
-                peak.look(usages.get(root));
+            if let Some(why) = one.watch.disk.count(lost, time) {
+                one.end(why);
             }
         }
-        let counted = self.all.iter().filter_map(|one| Some((one.watch.root, one.watch.processes?)));
-        let too_many = counted.filter(|(root, most)| {
-            usages.get(root).is_some_and(|usage| usage.threads > most.limit.saturating_add(most.runners))
-        });
-        too_many
-            .map(|(root, MostProcesses { limit, .. })| {
-                let why = format!(
+    }
+
+    fn count_processes(&mut self) {
+        let is_counted =
+            |watch: &Watch| watch.processes.is_some() || watch.peak.as_ref().is_some_and(|peak| peak.is_of_tree());
+        let trees = self.all.iter().map(|one| &one.watch).filter(|watch| is_counted(watch));
+        let usages = self.usage.read(&trees.map(|watch| Tree::of(watch.disk.root)).collect::<Vec<_>>());
+        for one in &mut self.all {
+            let usage = usages.get(&one.watch.disk.root);
+            one.watch.peak.iter().for_each(|peak| peak.look(usage));
+            if let (Some(limit), Some(usage)) = (one.watch.processes, usage)
+                && usage.threads > limit.saturating_add(one.watch.runners)
+            {
+                one.end(format!(
                     "The simulation has more than {limit} processes and threads, the limit of this server (limits.processes)"
-                );
-                (root, why)
-            })
-            .collect()
+                ));
+            }
+        }
     }
 }
 

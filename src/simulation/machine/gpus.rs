@@ -10,9 +10,8 @@ const SILENCE: Duration = Duration::from_secs(10);
 /// What is known of the GPUs.
 #[derive(Debug, Default)]
 pub(super) struct Gpus {
-    reading: GpuReading,
-    /// The time of that reading.
-    read: Option<Instant>,
+    /// The last reading, and its time.
+    reading: Option<(Instant, GpuReading)>,
     /// The largest number that have answered at once, and when that many last did.
     answered: Option<(Instant, usize)>,
     problem: Option<String>,
@@ -21,27 +20,21 @@ pub(super) struct Gpus {
 impl Gpus {
     /// Records a reading.
     pub(super) fn read(&mut self, now: Instant, reading: GpuReading) {
-        if !reading.gpus.is_empty() {
-            if self.answered.is_none() {
-                let names: Vec<&str> = reading.gpus.iter().map(|gpu| gpu.name.as_str()).collect();
-                log::info!("GPUs: {}", names.join(", "));
-            }
-            let most = self.answered.map_or(0, |(_, most)| most);
-            if reading.gpus.len() >= most {
-                self.answered = Some((now, reading.gpus.len()));
-            }
+        if self.answered.is_none() && !reading.gpus.is_empty() {
+            let names: Vec<&str> = reading.gpus.iter().map(|gpu| gpu.name.as_str()).collect();
+            log::info!("GPUs: {}", names.join(", "));
         }
-        self.read = Some(now);
-        self.reading = reading;
+        if reading.gpus.len() >= self.answered.map_or(1, |(_, most)| most) {
+            self.answered = Some((now, reading.gpus.len()));
+        }
+        self.reading = Some((now, reading));
     }
 
     /// Returns the GPUs that answer, and the problem if some have answered before and don't any more. Logs changes.
     pub(super) fn current(&mut self, now: Instant) -> (Vec<Gpu>, Option<String>) {
         let is_recent = |at: Instant| now.saturating_duration_since(at) <= SILENCE;
-        if !self.read.is_some_and(is_recent) {
-            self.reading = GpuReading::default();
-        }
-        let GpuReading { gpus, lost } = self.reading.clone();
+        let reading = self.reading.clone().filter(|(at, _)| is_recent(*at));
+        let GpuReading { gpus, lost } = reading.map(|(_, reading)| reading).unwrap_or_default();
         let problem = match self.answered {
             _ if lost > 0 => Some(format!(
                 "NVIDIA's driver has lost {lost} of {} GPUs (see Xid in the kernel's log)",

@@ -9,4 +9,4 @@ mod usage;
 
 pub use load_monitor::{LoadMonitor, Readings, Sample};
 pub use spread::Spread;
-pub use usage::{Tree, Usage, UsageMonitor, Usages};
+pub use usage::{Tree, Usage, UsageMonitor, Usages, cgroup_time, number_in};

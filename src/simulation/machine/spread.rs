@@ -16,8 +16,8 @@ const EXPECTED: f64 = 10.0;
 /// the last ten seconds counts as 10 % of load; of equal GPUs, the one that was chosen longest ago comes first.
 #[derive(Debug, Default)]
 pub struct Spread {
-    /// Number of GPUs that have a display, the first ones; `None` if no simulation needs one.
-    displays: Option<usize>,
+    /// Number of GPUs that have a display, the first ones; 0 if no simulation needs one.
+    displays: usize,
     /// Times of assignments to each GPU: the last one, and those that readings may not show yet.
     given: Mutex<HashMap<u32, Vec<Instant>>>,
 }
@@ -25,7 +25,7 @@ pub struct Spread {
 impl Spread {
     /// Spreads over the first `displays` GPUs; over all if it is 0.
     pub fn over(displays: usize) -> Self {
-        Self { displays: (displays > 0).then_some(displays), ..Self::default() }
+        Self { displays, ..Self::default() }
     }
 
     /// The GPU that the next simulation would get.
@@ -52,7 +52,7 @@ impl Spread {
         let times = |gpu: &Gpu| given.get(&gpu.index).map(Vec::as_slice).unwrap_or_default();
         let expected = |gpu: &Gpu| times(gpu).iter().filter(|at| is_unseen(**at, now)).map(|_| EXPECTED).sum::<f64>();
         let load = |gpu: &Gpu| gpu.load() + expected(gpu);
-        let has_display = |gpu: &&Gpu| self.displays.is_none_or(|count| (gpu.index as usize) < count);
+        let has_display = |gpu: &&Gpu| self.displays == 0 || (gpu.index as usize) < self.displays;
         let order = |one: &&Gpu, other: &&Gpu| {
             load(one).total_cmp(&load(other)).then_with(|| times(one).last().cmp(&times(other).last()))
         };

@@ -71,30 +71,24 @@ impl UsageMonitor {
         if roots.is_empty() {
             return Usages::new();
         }
-        let mut readings = self.0.lock();
-        readings.renew(roots, measure);
-        readings.usages.clone()
-    }
-}
-
-impl Readings {
-    fn renew(&mut self, roots: &[i32], measure: impl FnOnce() -> Usages) {
-        let known = roots.iter().all(|root| self.roots.contains(root));
-        if known && self.read.is_some_and(|read| read.elapsed() < AGE) {
-            return;
+        let mut last = self.0.lock();
+        let known = roots.iter().all(|root| last.roots.contains(root));
+        if known && last.read.is_some_and(|read| read.elapsed() < AGE) {
+            return last.usages.clone();
         }
-        self.roots = roots.iter().copied().collect();
+        last.roots = roots.iter().copied().collect();
         let mut usages = measure();
         // If Docker hangs, this may have taken longer than a reading is cached.
-        let passed = self.read.map(|read| read.elapsed().as_secs_f64()).filter(|passed| *passed > 0.0);
-        self.read = Some(Instant::now());
+        let passed = last.read.map(|read| read.elapsed().as_secs_f64()).filter(|passed| *passed > 0.0);
+        last.read = Some(Instant::now());
         for (root, usage) in &mut usages {
-            let before = self.usages.get(root).zip(passed);
+            let before = last.usages.get(root).zip(passed);
             let mean =
                 before.map(|(before, passed)| 100.0 * usage.time.saturating_sub(before.time).as_secs_f64() / passed);
             usage.cpu = usage.cpu.or(mean);
         }
-        self.usages = usages;
+        last.usages.clone_from(&usages);
+        usages
     }
 }
 
@@ -109,10 +103,20 @@ fn sums_of(trees: &[Tree]) -> Usages {
 
 /// The usage of a cgroup v2 so far; `None` if the kernel does not count all of it there.
 fn cgroup_sum(folder: &Path) -> Option<Usage> {
-    let number = |file: &str| std::fs::read_to_string(folder.join(file)).ok()?.trim().parse().ok();
+    let (memory, threads) = (number_in(&folder.join("memory.current"))?, number_in(&folder.join("pids.current"))?);
+    Some(Usage { cpu: None, memory, threads, time: cgroup_time(folder)? })
+}
+
+/// The CPU time of all that has run in a cgroup v2.
+pub fn cgroup_time(folder: &Path) -> Option<Duration> {
     let times = std::fs::read_to_string(folder.join("cpu.stat")).ok()?;
-    let time = Duration::from_micros(times.lines().find_map(|line| line.strip_prefix("usage_usec "))?.parse().ok()?);
-    Some(Usage { cpu: None, memory: number("memory.current")?, threads: number("pids.current")?, time })
+    let time = times.lines().find_map(|line| line.strip_prefix("usage_usec "))?;
+    time.trim().parse().ok().map(Duration::from_micros)
+}
+
+/// The number in a file of the kernel.
+pub fn number_in(file: &Path) -> Option<u64> {
+    std::fs::read_to_string(file).ok()?.trim().parse().ok()
 }
 
 /// All processes, each below its parent and below the leader of its group.

@@ -19,15 +19,6 @@ pub struct DiskUsage {
     met: HashSet<(u64, u64)>,
 }
 
-/// Why what is below a folder is not all counted.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Unknown {
-    /// Folders are closed to this server, or nested so deep that nobody would do that but on purpose.
-    Hidden,
-    /// There was no time for more.
-    Late,
-}
-
 /// Least disk usage of a file or directory, in bytes.
 pub const SMALLEST: u64 = 4096;
 /// Files from this size on, in bytes, are tracked by inode.
@@ -64,42 +55,36 @@ impl DiskUsage {
         self.total
     }
 
-    /// Adds everything below a directory. Symlinks are not followed.
-    ///
-    /// # Errors
-    /// When there is more than anybody can tell; the rest is added. When the time is over.
-    pub fn add_folder(&mut self, folder: &Path) -> Result<(), Unknown> {
+    /// Adds everything below a directory that there is time for. Symlinks are not followed. Returns whether no folder there was
+    /// closed to this server, or nested so deep that nobody would do that but on purpose.
+    pub fn add_folder(&mut self, folder: &Path) -> bool {
         let mut open: Vec<(PathBuf, usize)> = vec![(folder.to_owned(), 0)];
-        let mut all = Ok(());
-        while let Some((folder, depth)) = open.pop() {
-            if self.is_late() {
-                return Err(Unknown::Late);
-            }
+        let mut is_shown = true;
+        while let Some((folder, depth)) = open.pop().filter(|_| !self.is_late()) {
             let entries = match std::fs::read_dir(&folder) {
                 Ok(entries) => entries,
-                // It was removed during the walk.
-                Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => continue,
-                Err(_) => {
-                    all = Err(Unknown::Hidden);
+                Err(error) => {
+                    // It may have been removed during the walk.
+                    is_shown &= matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory);
                     continue;
                 }
             };
             for (number, entry) in entries.flatten().enumerate() {
                 if number % BETWEEN_CLOCKS == BETWEEN_CLOCKS - 1 && self.is_late() {
-                    return Err(Unknown::Late);
+                    return is_shown;
                 }
                 let Ok(about) = entry.metadata() else { continue };
                 self.add(&about);
                 if self.total > self.enough {
-                    return Ok(());
+                    return true;
                 }
                 if about.is_dir() {
-                    all = if depth < DEEPEST { all } else { Err(Unknown::Hidden) };
+                    is_shown &= depth < DEEPEST;
                     open.push((entry.path(), depth + 1));
                 }
             }
         }
-        all
+        is_shown
     }
 
     /// Adds a file that has lost its names while a process has it open.
@@ -124,9 +109,10 @@ impl DiskUsage {
 mod tests {
     use super::*;
 
-    fn size(folder: &Path, measure: fn(&Metadata) -> u64) -> Result<u64, Unknown> {
+    fn size(folder: &Path, measure: fn(&Metadata) -> u64) -> u64 {
         let mut size = DiskUsage::new(measure, u64::MAX);
-        size.add_folder(folder).map(|()| size.total())
+        assert!(size.add_folder(folder));
+        size.total()
     }
 
     #[test]
@@ -137,9 +123,9 @@ mod tests {
         std::fs::write(folder.path().join("b/empty"), "").unwrap();
         std::fs::File::create(folder.path().join("hole")).unwrap().set_len(1 << 40).unwrap();
         std::os::unix::fs::symlink("/", folder.path().join("link")).unwrap();
-        let bytes = size(folder.path(), room).unwrap();
+        let bytes = size(folder.path(), room);
         assert!((100_000 + 4 * SMALLEST..200_000).contains(&bytes), "{bytes}");
-        assert_eq!(size(folder.path(), length), Ok(100_000 + (1 << 40) + 1));
+        assert_eq!(size(folder.path(), length), 100_000 + (1 << 40) + 1);
     }
 
     #[test]
@@ -149,7 +135,7 @@ mod tests {
         for name in 1..10 {
             std::fs::hard_link(folder.path().join("0"), folder.path().join(name.to_string())).unwrap();
         }
-        let bytes = size(folder.path(), room).unwrap();
+        let bytes = size(folder.path(), room);
         assert!((1_000_000 + 9 * SMALLEST..1_200_000).contains(&bytes), "{bytes}");
     }
 
@@ -160,7 +146,7 @@ mod tests {
             std::fs::write(folder.path().join(name.to_string()), "").unwrap();
         }
         let mut size = DiskUsage::new(room, 10 * SMALLEST);
-        size.add_folder(folder.path()).unwrap();
+        assert!(size.add_folder(folder.path()));
         assert_eq!(size.total(), 11 * SMALLEST);
     }
 }

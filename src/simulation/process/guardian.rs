@@ -55,7 +55,8 @@ impl Guardian {
 /// code.
 pub fn guard(arguments: &Arguments, remove: impl Fn()) -> u8 {
     // A signal to the server's group, or Ctrl-C in its terminal, must not end the guardian before the server.
-    if let Err(error) = setsid().and_then(|_| block_signals()) {
+    let signals: SigSet = [Signal::SIGINT, Signal::SIGTERM, Signal::SIGHUP].into_iter().collect();
+    if let Err(error) = setsid().and_then(|_| signals.thread_block()) {
         eprintln!("can't get out of the reach of the server's signals: {error}");
         return 1;
     }
@@ -64,9 +65,4 @@ pub fn guard(arguments: &Arguments, remove: impl Fn()) -> u8 {
     remove();
     instance_dir::remove(&arguments.folder);
     0
-}
-
-fn block_signals() -> nix::Result<()> {
-    let blocked: SigSet = [Signal::SIGINT, Signal::SIGTERM, Signal::SIGHUP].into_iter().collect();
-    blocked.thread_block()
 }

@@ -18,15 +18,6 @@ pub struct InstanceDir {
     folder: PathBuf,
 }
 
-/// What earlier runs have left.
-#[derive(Debug, Default, PartialEq, Eq)]
-pub struct Leftovers {
-    /// Number of runs that ended without removing their directory.
-    pub runs: usize,
-    /// Number of their processes that were still alive.
-    pub processes: usize,
-}
-
 /// Attempts to remove a directory before that is left to the next start, and the pause between two attempts.
 const TRIES: u32 = 60;
 const PAUSE: Duration = Duration::from_secs(1);
@@ -37,19 +28,22 @@ impl RunDir {
     ///
     /// # Errors
     /// When the directory can't be created.
-    pub fn open(cache: &Path) -> io::Result<(Self, Leftovers)> {
+    pub fn open(cache: &Path) -> io::Result<Self> {
         let runs = cache.join("runs");
         std::fs::create_dir_all(&runs)?;
         // Marks of processes are compared with this path, so it must be canonical.
         let runs = runs.canonicalize()?;
-        let mut leftovers = Leftovers::default();
-        for dead in std::fs::read_dir(&runs)?.flatten() {
-            leftovers.runs += 1;
-            leftovers.processes += process_tree::kill_marked(&dead.path());
-            remove(&dead.path());
+        let (mut dead, mut processes) = (0, 0);
+        for run in std::fs::read_dir(&runs)?.flatten() {
+            dead += 1;
+            processes += process_tree::kill_marked(&run.path());
+            remove(&run.path());
+        }
+        if dead > 0 {
+            log::warn!("removed what {dead} earlier runs had left, {processes} processes among it");
         }
         let folder = tempfile::Builder::new().prefix("run-").tempdir_in(&runs)?.keep();
-        Ok((Self { folder }, leftovers))
+        Ok(Self { folder })
     }
 
     /// Creates a directory for a simulation, with the directory of its project inside.

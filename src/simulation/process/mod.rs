@@ -15,7 +15,7 @@ mod runner;
 pub use answer::until_answering;
 pub use disk_room::DiskRoom;
 pub use guardian::Guardian;
-pub use instance_dir::{InstanceDir, Leftovers, RunDir};
+pub use instance_dir::{InstanceDir, RunDir};
 pub use lines::Lines;
 pub use own_thread::on_own_thread;
 pub use process_group::{ExitReason, ProcessGroup, SpawnSpec};

@@ -19,7 +19,7 @@ pub struct Run {
     pub spec: SpawnSpec,
     /// Timeout, after which it is killed.
     pub time: Duration,
-    /// Size limit of its answer, in bytes.
+    /// Size limit of its answer, in bytes. Where it is 0, there is none: its standard output is told with its errors.
     pub answer: u64,
     /// Longest line that is kept, in bytes.
     pub line: usize,
@@ -67,24 +67,6 @@ impl Run {
         Self { spec, time, answer: 1 << 20, line: 1000, limits: Vec::new(), niceness: 0, may_block: false }
     }
 
-    /// Runs it. `told` receives each line of its standard error. Dropping the future kills it and its process group.
-    ///
-    /// # Errors
-    /// When it can't be started, or is killed because it exceeds a limit.
-    pub async fn run(self, told: impl FnMut(String)) -> Result<Ran, RunError> {
-        let (output, answer) = io::pipe()?;
-        self.finish(Some(output), answer.into(), told).await
-    }
-
-    /// The same, but `told` receives its standard output as well, and there is no answer.
-    ///
-    /// # Errors
-    /// When it can't be started, or is killed because it exceeds its timeout.
-    pub async fn follow(self, told: impl FnMut(String)) -> Result<ExitReason, RunError> {
-        let ran = self.finish(None, None, told).await;
-        ran.map(|ran| ran.ending)
-    }
-
     /// The same as [`Self::run`], but blocks the calling thread.
     ///
     /// # Errors
@@ -102,15 +84,16 @@ impl Run {
         })
     }
 
-    async fn finish(
-        self,
-        output: Option<io::PipeReader>,
-        answer: Option<io::PipeWriter>,
-        told: impl FnMut(String),
-    ) -> Result<Ran, RunError> {
+    /// Runs it. `told` receives each line of its standard error. Dropping the future kills it and its process group.
+    ///
+    /// # Errors
+    /// When it can't be started, or is killed because it exceeds a limit.
+    pub async fn run(self, told: impl FnMut(String)) -> Result<Ran, RunError> {
         let Self { spec, time, answer: most, line, limits, niceness, may_block } = self;
-        let (said, errors) = io::pipe()?;
-        let answer = answer.map_or_else(|| errors.try_clone(), Ok)?;
+        let ((output, mut answer), (said, errors)) = (io::pipe()?, io::pipe()?);
+        if most == 0 {
+            answer = errors.try_clone()?;
+        }
         let start = move || {
             let (group, ended) = ProcessGroup::start(&spec, answer.into(), errors.into())?;
             bound(group.leader(), &limits, niceness);
@@ -122,9 +105,11 @@ impl Run {
             actix_rt::task::spawn_blocking(start).await.map_err(io::Error::other)??
         };
         let said = Receiver::from_owned_fd(said.into())?;
-        let output = output.map(|output| Receiver::from_owned_fd(output.into())).transpose()?;
-        let all = async { tokio::join!(read(output, most), tell(said, line, told), ended) };
-        let Ok((answer, (), ending)) = actix_rt::time::timeout(time, all).await else {
+        let mut output = Receiver::from_owned_fd(output.into())?.take(most + 1);
+        let mut answer = Vec::new();
+        // A broken pipe ends the answer; the exit code decides whether that is an error.
+        let all = async { tokio::join!(output.read_to_end(&mut answer), tell(said, line, told), ended).2 };
+        let Ok(ending) = actix_rt::time::timeout(time, all).await else {
             return Err(RunError::Slow(time));
         };
         if answer.len() as u64 > most { Err(RunError::TooLong) } else { Ok(Ran { ending, answer }) }
@@ -141,15 +126,6 @@ fn bound(leader: i32, limits: &[(Resource, u64)], niceness: i32) {
     if let Err(error) = nice.and(limits.iter().try_for_each(limit)) {
         log::warn!("process {leader} runs without its limits: {error}");
     }
-}
-
-async fn read(output: Option<Receiver>, most: u64) -> Vec<u8> {
-    let mut answer = Vec::new();
-    if let Some(output) = output {
-        // A broken pipe ends the answer; the exit code decides whether that is an error.
-        output.take(most + 1).read_to_end(&mut answer).await.ok();
-    }
-    answer
 }
 
 /// Passes on each line, made printable; also lines that the program overwrites.
@@ -188,8 +164,8 @@ mod tests {
         assert_eq!((ran.ending, ran.answer.as_slice()), (ExitReason::Code(3), &b"answer\n"[..]));
         assert_eq!(lines, ["one", "two"]);
         lines.clear();
-        assert_eq!(shell(script, LONG).follow(|line| lines.push(line)).await.unwrap(), ExitReason::Code(3));
-        assert_eq!(lines, ["answer", "one", "two"]);
+        let ran = Run { answer: 0, ..shell(script, LONG) }.run(|line| lines.push(line)).await.unwrap();
+        assert_eq!((ran.ending, lines), (ExitReason::Code(3), ["answer", "one", "two"].map(str::to_owned).to_vec()));
         let ran = std::thread::spawn(move || shell(script, LONG).blocking(drop)).join().unwrap();
         assert_eq!(ran.unwrap().answer, b"answer\n");
         assert!(shell(script, LONG).blocking(drop).is_ok(), "also where there is a runtime");

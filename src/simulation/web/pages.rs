@@ -274,7 +274,8 @@ fn duration(seconds: u64) -> String {
 
 /// What worlds' programs can do because isolation is incomplete, and why it is.
 fn shortcoming(server: &AppState) -> Option<(&'static str, &str)> {
-    let of_level = server.launcher.shortcoming().map(|why| ("worlds' programs may do whatever this server may.", why));
+    let of_level =
+        server.launcher.shortcoming.as_deref().map(|why| ("worlds' programs may do whatever this server may.", why));
     let of_containers = server.containers.as_ref().and_then(|containers| containers.shortcoming.as_deref());
     of_level.or_else(|| of_containers.map(|why| ("", why)))
 }

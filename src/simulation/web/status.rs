@@ -4,7 +4,7 @@ use serde::Serialize;
 
 use super::webots_viewer;
 use crate::shared::domain::ServerReport;
-use crate::simulation::isolation::{IsolationLevel, Network};
+use crate::simulation::config::{IsolationSetting, SandboxNetwork};
 use crate::simulation::machine::sensors::{Gpu, Host, Machine};
 use crate::simulation::snapshot::{Simulation, Snapshot};
 use crate::simulation::state::AppState;
@@ -17,10 +17,10 @@ pub struct StatusResponse {
     #[serde(flatten)]
     pub report: ServerReport,
     /// The isolation level of simulations.
-    pub isolation: IsolationLevel,
+    pub isolation: IsolationSetting,
     /// Which network their programs have, where that is not Docker's.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub network: Option<Network>,
+    pub network: Option<SandboxNetwork>,
     /// Time since the start, in seconds.
     pub uptime: u64,
     /// Name, system and hardware of the machine.
@@ -58,7 +58,7 @@ impl StatusResponse {
         };
         Self {
             report,
-            isolation: server.launcher.level(),
+            isolation: server.launcher.level,
             network: server.launcher.network(),
             uptime: server.started.elapsed().as_secs(),
             host: readings.host.clone(),

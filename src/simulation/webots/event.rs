@@ -4,7 +4,6 @@ use std::time::Instant;
 
 use actix::prelude::*;
 
-use crate::simulation::container::Cause;
 use crate::simulation::sessions::Token;
 
 /// An event of a running Webots.
@@ -39,41 +38,4 @@ pub struct WebotsExit {
     pub own: bool,
     /// The reason, as text for the client.
     pub why: String,
-}
-
-/// The cause of a container's end, as text for the client.
-pub fn words(cause: Cause) -> &'static str {
-    match cause {
-        Cause::OutOfMemory => "The simulation has taken more memory than it may (limits.memory)",
-        Cause::NotStarted => "Docker can't start the simulation's container on this simulation server",
-        Cause::Docker => "Docker has stopped on this simulation server, and all simulations in it have ended",
-    }
-}
-
-/// Sends a session the events of its Webots. The exit is always sent, also if the actor panics and is dropped.
-pub struct EventSender {
-    events: Recipient<WebotsEvent>,
-    exit_sent: bool,
-}
-
-impl EventSender {
-    /// Sends to this recipient.
-    pub fn new(events: Recipient<WebotsEvent>) -> Self {
-        Self { events, exit_sent: false }
-    }
-
-    /// Sends an event.
-    pub fn send(&mut self, event: WebotsEvent) {
-        self.exit_sent |= matches!(event, WebotsEvent::Exited(_));
-        self.events.do_send(event);
-    }
-}
-
-impl Drop for EventSender {
-    fn drop(&mut self) {
-        if !self.exit_sent {
-            let why = "The simulation was lost by a fault of this server".to_owned();
-            self.send(WebotsEvent::Exited(WebotsExit { clean: false, own: true, why }));
-        }
-    }
 }

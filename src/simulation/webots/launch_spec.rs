@@ -1,6 +1,5 @@
 //! The launch specification: everything that one Webots is started with.
 
-use std::ffi::OsString;
 use std::io::ErrorKind;
 use std::net::{SocketAddr, TcpStream};
 use std::path::{Path, PathBuf};
@@ -14,14 +13,13 @@ use super::event::WebotsEvent;
 use crate::simulation::checkout::{CheckoutService, Project};
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::container::{ContainerRequest, ContainerService};
-use crate::simulation::ends::FOLDER_OF_RUNNING;
-use crate::simulation::isolation::{Cgroup, Display, Launcher, Peak, Program, Watch, Watcher};
+use crate::simulation::isolation::{Cgroup, DiskUse, Display, Launcher, Peak, Program, Watch, Watcher};
 use crate::simulation::machine::display;
 use crate::simulation::machine::sensors::Gpu;
 use crate::simulation::process::{SpawnSpec, until_answering};
 use crate::simulation::protocol::Mode;
 use crate::simulation::slots::Slot;
-use crate::simulation::streams::{StreamRegistration, Streams, Watched};
+use crate::simulation::streams::{Streams, Watched};
 
 /// A port that does not even refuse a connection for so long has a program that does not take it.
 const SILENCE: Duration = Duration::from_millis(100);
@@ -57,17 +55,6 @@ pub struct LaunchSpec {
 }
 
 impl LaunchSpec {
-    /// The file of its output while it runs.
-    pub fn log_file(&self) -> PathBuf {
-        let folder = self.config.log_dir.0.join("simulation").join(FOLDER_OF_RUNNING);
-        folder.join(format!("{}.log", self.slot.lease.id()))
-    }
-
-    /// Registers its stream.
-    pub fn register(&self) -> StreamRegistration {
-        self.streams.register(self.slot.lease.id(), self.slot.port, self.watched.clone())
-    }
-
     /// The request for its containers.
     pub fn request(&self) -> ContainerRequest {
         let (program, heartbeat) = (Path::new(&self.config.container.program), self.config.timing.heartbeat);
@@ -83,17 +70,13 @@ impl LaunchSpec {
         self.config.display_on(self.gpu.as_ref().map(|gpu| gpu.index))
     }
 
-    /// The environment variable that names its GPU, if it was given one.
-    fn variables(&self) -> Vec<(OsString, OsString)> {
-        self.gpu.iter().map(|gpu| ("CUDA_VISIBLE_DEVICES".into(), gpu.id.clone().into())).collect()
-    }
-
     /// How the process is started and ended, and its control group.
     ///
     /// # Errors
     /// When a folder that it needs can't be made.
     pub fn spawn_spec(&self, display: &Display) -> std::io::Result<(SpawnSpec, Option<Cgroup>)> {
         let (heartbeat, world) = (self.config.timing.heartbeat, &self.project.world.path);
+        let gpu = self.gpu.iter().map(|gpu| ("CUDA_VISIBLE_DEVICES".into(), gpu.id.clone().into()));
         self.launcher.prepare(Program {
             command: webots_command(&self.program, self.mode, self.slot.port, heartbeat, world),
             instance: self.project.instance.path(),
@@ -101,7 +84,7 @@ impl LaunchSpec {
             folder: &self.project.folder,
             port: self.slot.port,
             display,
-            variables: &self.variables(),
+            variables: gpu.collect(),
             grace: self.config.timing.grace,
         })
     }
@@ -109,12 +92,11 @@ impl LaunchSpec {
     /// Waits until the simulation with this root process exceeds a limit, and returns the message for its client.
     /// `peak` records its usage.
     pub fn until_too_much(&self, root: i32, peak: Option<Arc<Peak>>) -> impl Future<Output = String> + use<> {
+        let (folder, limit) = (self.project.instance.path().to_owned(), self.config.limits.disk);
         let watch = Watch {
-            root,
-            folder: self.project.instance.path().to_owned(),
-            first: self.project.size,
-            disk: self.config.limits.disk,
+            disk: DiskUse::new(root, folder, self.project.size, limit),
             processes: self.launcher.most_processes(),
+            runners: self.launcher.runners(),
             peak,
         };
         let watcher = self.watcher.clone();

@@ -1,4 +1,4 @@
-//! Starts the process of a Webots, and waits until its whole process tree has ended.
+//! Prepares the target on which a Webots runs, starts its process there, and waits until its whole process tree has ended.
 
 use std::future::Future;
 use std::path::PathBuf;
@@ -8,13 +8,20 @@ use std::time::Duration;
 use actix::prelude::*;
 
 use super::launch_spec::LaunchSpec;
-use super::launch_target::LaunchTarget;
 use super::output::{self, OutputEvent, Tail};
 use crate::shared::run::RotatedFile;
-use crate::simulation::container::Cause;
-use crate::simulation::ends::Taken;
-use crate::simulation::isolation::{Cgroup, Peak};
+use crate::simulation::container::{Cause, SimulationContainers, StartError};
+use crate::simulation::ends::{FOLDER_OF_RUNNING, Taken};
+use crate::simulation::isolation::{Display, Peak};
 use crate::simulation::process::{ExitReason, ProcessGroup};
+
+/// The target on which a Webots runs.
+pub enum LaunchTarget {
+    /// The machine, with this display.
+    Machine(Display),
+    /// Containers.
+    Containers(Box<SimulationContainers>),
+}
 
 /// A Webots that was started.
 pub struct Launched {
@@ -46,6 +53,29 @@ const OLD_LOGS: usize = 1;
 /// Timeout of reading the rest of an output.
 const LAST_OUTPUT: Duration = Duration::from_secs(1);
 
+impl LaunchTarget {
+    /// Prepares the target of a Webots: containers, a display of its own, or nothing. `progress` receives each step as text.
+    /// Dropping the future discards what was created. Its error says why it failed, and whether the project or this server
+    /// is the cause.
+    pub fn prepare<P: Fn(String) + Send + Sync + 'static>(
+        spec: &LaunchSpec,
+        progress: P,
+    ) -> impl Future<Output = Result<Self, StartError>> + use<P> {
+        let containers = spec.containers.as_ref().map(|containers| (Arc::clone(containers), spec.request()));
+        let (xvfb, display, instance) = (spec.config.xvfb, spec.display(), spec.project.instance.path().to_owned());
+        async move {
+            if let Some((containers, request)) = containers {
+                let mut prepared = containers.prepare(request, &progress).await?;
+                prepared.start_others().await?;
+                return Ok(Self::Containers(Box::new(prepared)));
+            }
+            let display = if xvfb { Display::new_virtual(&instance) } else { Ok(Display::Outside(display)) };
+            let failed = |error| StartError::Server(format!("The virtual display (Xvfb) can't be started: {error}"));
+            display.map(Self::Machine).map_err(failed)
+        }
+    }
+}
+
 /// Starts a Webots on its target. The future resolves when its whole process tree has ended.
 ///
 /// # Errors
@@ -55,7 +85,8 @@ pub fn launch(
     target: LaunchTarget,
     events: Recipient<OutputEvent>,
 ) -> std::io::Result<(Launched, impl Future<Output = End> + use<>)> {
-    let log = spec.log_file();
+    let folder = spec.config.log_dir.0.join("simulation").join(FOLDER_OF_RUNNING);
+    let log = folder.join(format!("{}.log", spec.slot.lease.id()));
     let file = RotatedFile::open(&log, OLD_LOGS).inspect_err(|error| {
         let why = format!("what Webots prints is not kept: {} can't be written: {error}", log.display());
         spec.slot.lease.log(log::Level::Warn, &why, why.clone());
@@ -69,22 +100,26 @@ pub fn launch(
         LaunchTarget::Machine(display) => spec.spawn_spec(display)?,
     };
     let (group, ended) = ProcessGroup::start(&process, output.into(), errors.into())?;
-    let folder = cgroup.as_ref().map(|cgroup| cgroup.path().to_owned());
+    let of_cgroup = cgroup.as_ref().map(|cgroup| cgroup.folder.clone());
     let peak = cgroup.is_none().then(|| peak_of(&target));
     let seen = peak.clone();
     let ended = async move {
         let reason = ended.await;
-        let code = if let ExitReason::Code(code) = reason { Some(code.into()) } else { None };
-        let in_container = target.end(code).await;
+        let mut in_container = None;
+        if let LaunchTarget::Containers(containers) = target {
+            in_container = containers.cause(reason).await;
+            containers.remove().await;
+        }
+        // This ends also what has left the process group.
         let (on_machine, taken) = match cgroup {
-            Some(cgroup) => actix_rt::task::spawn_blocking(move || end_all(&cgroup)).await.unwrap_or_default(),
+            Some(cgroup) => actix_rt::task::spawn_blocking(move || cgroup.end()).await.unwrap_or_default(),
             None => (false, seen.map(|peak| peak.taken()).unwrap_or_default()),
         };
         // The last output shows the cause. A process that can't be killed may keep the pipe open.
         actix_rt::time::timeout(LAST_OUTPUT, all_read).await.ok();
         End { reason, cause: in_container.or(on_machine.then_some(Cause::OutOfMemory)), taken }
     };
-    Ok((Launched { group, cgroup: folder, tail, log, peak }, ended))
+    Ok((Launched { group, cgroup: of_cgroup, tail, log, peak }, ended))
 }
 
 /// Hears what a Webots takes that runs on this.
@@ -95,11 +130,4 @@ fn peak_of(target: &LaunchTarget) -> Arc<Peak> {
     // Its start does not wait for that.
     actix_rt::spawn(async move { named.name_containers(ids.await) });
     peak
-}
-
-/// Ends what has left the process group. Returns whether the kernel has ended something because it took too much memory,
-/// and what all has taken.
-fn end_all(cgroup: &Cgroup) -> (bool, Taken) {
-    cgroup.kill();
-    (cgroup.has_run_out_of_memory(), cgroup.taken())
 }

@@ -4,7 +4,6 @@ mod command;
 mod event;
 mod idleness;
 mod launch_spec;
-mod launch_target;
 mod launched;
 mod output;
 mod verdict;

@@ -1,7 +1,7 @@
 //! The verdict on how a simulation has ended, from what is known of its Webots. Pure.
 
-use super::event;
 use super::launched::End;
+use crate::simulation::container::Cause;
 use crate::simulation::ends::EndReason;
 use crate::simulation::process::ExitReason;
 
@@ -19,17 +19,25 @@ pub fn verdict(stopped: Option<(EndReason, String)>, end: &End, was_ready: bool)
         (None, _) => EndReason::NoWebots,
     };
     let why = match end.cause {
-        Some(cause) => event::words(cause).to_owned(),
+        Some(cause) => words(cause).to_owned(),
         None if kind == EndReason::Finished => "Webots has ended".to_owned(),
         None => format!("Webots {}", end.reason),
     };
     (kind, why)
 }
 
+/// The cause of a container's end, as text for the client.
+fn words(cause: Cause) -> &'static str {
+    match cause {
+        Cause::OutOfMemory => "The simulation has taken more memory than it may (limits.memory)",
+        Cause::NotStarted => "Docker can't start the simulation's container on this simulation server",
+        Cause::Docker => "Docker has stopped on this simulation server, and all simulations in it have ended",
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::simulation::container::Cause;
     use crate::simulation::ends::Taken;
 
     #[test]
@@ -41,8 +49,8 @@ mod tests {
             (end(killed, None), true, EndReason::Crashed, "Webots was ended by the signal SIGKILL"),
             (end(ExitReason::Code(3), None), false, EndReason::NoWebots, "Webots ended with exit code 3"),
             (end(ExitReason::NotStarted, None), false, EndReason::NoWebots, "Webots could not be started"),
-            (end(killed, Some(Cause::OutOfMemory)), true, EndReason::Limit, event::words(Cause::OutOfMemory)),
-            (end(ok, Some(Cause::Docker)), true, EndReason::Fault, event::words(Cause::Docker)),
+            (end(killed, Some(Cause::OutOfMemory)), true, EndReason::Limit, super::words(Cause::OutOfMemory)),
+            (end(ok, Some(Cause::Docker)), true, EndReason::Fault, super::words(Cause::Docker)),
         ] {
             assert_eq!(verdict(None, &end, was_ready), (kind, words.to_owned()), "{end:?}");
             let stopped = (EndReason::Hung, "It was silent".to_owned());

@@ -10,10 +10,9 @@ use actix::prelude::*;
 use log::Level;
 use tokio::sync::Notify;
 
-use super::event::{EventSender, WebotsEvent, WebotsExit};
+use super::event::{WebotsEvent, WebotsExit};
 use super::launch_spec::LaunchSpec;
-use super::launch_target::LaunchTarget;
-use super::launched::{self, End, Launched};
+use super::launched::{self, End, LaunchTarget, Launched};
 use super::output::{OutputEvent, Tail};
 use super::verdict::verdict;
 use crate::shared::run::seconds_since_1970;
@@ -39,7 +38,8 @@ pub struct Webots {
     /// Its stream, which is not found any more before another simulation may have its port.
     stream: Option<StreamRegistration>,
     pub(super) spec: LaunchSpec,
-    events: EventSender,
+    /// Its session, until it hears of the end.
+    hears_end: Option<Recipient<WebotsEvent>>,
     /// The preparation of its target, while it runs.
     preparing: Option<SpawnHandle>,
     group: Option<ProcessGroup>,
@@ -74,7 +74,7 @@ impl Webots {
     pub fn new(spec: LaunchSpec) -> Self {
         Self {
             stream: None,
-            events: EventSender::new(spec.events.clone()),
+            hears_end: Some(spec.events.clone()),
             spec,
             preparing: None,
             group: None,
@@ -105,8 +105,11 @@ impl Webots {
 
     fn launch(&mut self, target: LaunchTarget, ctx: &mut Context<Self>) {
         self.preparing = None;
-        self.restart = target.restart();
-        target.events().into_iter().for_each(|event| self.send(event));
+        if let LaunchTarget::Containers(containers) = &target {
+            self.restart = containers.restart();
+            containers.warnings.iter().cloned().for_each(|warning| self.send(WebotsEvent::Progress(warning)));
+            containers.texts.iter().cloned().for_each(|text| self.send(WebotsEvent::Text(text)));
+        }
         if let Err(error) = self.spawn(target, ctx) {
             return self.not_started(EndReason::Fault, &format!("Webots can't be started: {error}"), ctx);
         }
@@ -166,7 +169,8 @@ impl Webots {
         self.listening = true;
         self.last_heartbeat = Instant::now();
         self.show_pace();
-        let stream = self.stream.insert(self.spec.register()).token();
+        let (slot, watched) = (&self.spec.slot, self.spec.watched.clone());
+        let stream = self.stream.insert(self.spec.streams.register(slot.lease.id(), slot.port, watched)).token();
         self.send(WebotsEvent::Listening(self.spec.slot.port, stream));
         self.used(ctx);
     }
@@ -238,8 +242,14 @@ impl Webots {
     }
 
     fn exited(&mut self, exit: WebotsExit, ctx: &mut Context<Self>) {
-        self.send(WebotsEvent::Exited(exit));
+        self.tell_end(exit);
         ctx.stop();
+    }
+
+    fn tell_end(&mut self, exit: WebotsExit) {
+        if let Some(session) = self.hears_end.take() {
+            session.do_send(WebotsEvent::Exited(exit));
+        }
     }
 
     /// An abnormal exit. In containers it is the project's own, because the project determines what they run.
@@ -248,8 +258,8 @@ impl Webots {
         WebotsExit { clean: false, own: !self.listening && self.spec.containers.is_none(), why }
     }
 
-    pub(super) fn send(&mut self, event: WebotsEvent) {
-        self.events.send(event);
+    pub(super) fn send(&self, event: WebotsEvent) {
+        self.spec.events.do_send(event);
     }
 
     /// Logs an event with its port. Without a password everybody reads `/output`, and a relayed stream is reached by its
@@ -260,6 +270,14 @@ impl Webots {
         let line = format!("port {port}: {event}");
         let shown = if is_shown { line.clone() } else { event.to_owned() };
         self.spec.slot.lease.log(level, &line, shown);
+    }
+}
+
+impl Drop for Webots {
+    /// Its session always hears of its end, also if it panics and is dropped.
+    fn drop(&mut self) {
+        let why = "The simulation was lost by a fault of this server".to_owned();
+        self.tell_end(WebotsExit { clean: false, own: true, why });
     }
 }
 
