@@ -10,16 +10,10 @@
 use std::os::unix::fs::{PermissionsExt, symlink};
 use std::path::Path;
 use std::process::{Command, Stdio};
-use std::time::Duration;
 
-use super::daemon::{ask, build_from, docker, host, of_service, open_socket, server};
+use super::daemon::{ask, build_from, docker, host, of_service, open_socket, running, server_with};
 use super::image::NAME;
-use crate::support::client::Client;
-use crate::support::git::{Forge, arm};
 use crate::support::page;
-
-/// How long a build may take on a busy machine.
-const BUILT: Duration = Duration::from_secs(90);
 
 /// The blocks of the page in this language.
 fn blocks(language: &str) -> Vec<String> {
@@ -87,13 +81,9 @@ async fn the_dockerfile_of_the_page_on_containers_is_built_and_runs() {
     // Packages can't be had here.
     let image = "webots-fleet.test/packages";
     build_from(&format!("FROM {NAME}\nRUN ln -s /bin/true /usr/local/bin/apt-get\n"), image);
-    let forge = Forge::with_arm();
-    let makefile = "all:\n\ttouch made\n";
-    let files = [("Dockerfile", blocks("dockerfile").concat()), ("controllers/mine/Makefile", makefile.to_owned())];
-    forge.commit("lab/arm", "main", &files.each_ref().map(|(path, text)| (*path, text.as_str())));
-    let server = server(forge.path(), 1).set("container", serde_json::json!({ "image": image })).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.patiently("webots:", BUILT).await;
+    let makefile = ("controllers/mine/Makefile", "all:\n\ttouch made\n");
+    let server = server_with(&[("Dockerfile", &blocks("dockerfile").concat()), makefile]);
+    let (server, _client) = running(server.set("container", serde_json::json!({ "image": image }))).await;
     let made = "/usr/local/webots-project/controllers/mine/made";
     ask(&["exec", &of_service(&server, "webots")[0], "ls", made]);
 }

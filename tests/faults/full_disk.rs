@@ -6,12 +6,8 @@ use std::path::Path;
 use serde_json::Value;
 
 use crate::fleet::try_start;
-use crate::support::client::Client;
 use crate::support::disk::{self, Full};
-use crate::support::git::Forge;
-use crate::support::program::{Builder, Server, session_server, simulation_server};
-use crate::support::webots::Webots;
-use crate::support::{http, skip, until};
+use crate::support::{Builder, Client, Forge, Server, Webots, http, session_server, simulation_server, skip, until};
 
 /// How many come.
 const CLASS: u16 = 16;

@@ -4,11 +4,8 @@ use std::time::{Duration, Instant};
 
 use futures_util::StreamExt;
 
-use crate::support::client::Client;
-use crate::support::git::Forge;
 use crate::support::ports::dead_port;
-use crate::support::program::{session_server, simulation_server};
-use crate::support::webots::Webots;
+use crate::support::{Client, Forge, Webots, session_server, simulation_server};
 
 /// How many clients there are.
 const CLIENTS: usize = 5_000;

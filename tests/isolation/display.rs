@@ -11,12 +11,8 @@ use x11rb::rust_connection::{DefaultStream, RustConnection};
 
 use super::deeds::as_nobody;
 use super::limits::Delegated;
-use crate::simulation::scene::{DEMO, instance_folders, nothing_left};
-use crate::support::client::Client;
-use crate::support::git::Forge;
-use crate::support::program::{Server, simulation_server};
-use crate::support::webots::{Webots, instances_below};
-use crate::support::{display, needs, until};
+use crate::simulation::scene::{instance_folders, nothing_left};
+use crate::support::{Client, DEMO, Forge, Server, Webots, display, instances_below, needs, simulation_server, until};
 
 /// The inodes of the sockets that a process has open.
 fn sockets(pid: i32) -> Vec<u64> {

@@ -7,10 +7,8 @@ use futures_util::future::join_all;
 use super::git_wrapper::GitWrapper;
 use super::opened::{cached, outcome, reader, world_text};
 use super::scene::stages;
-use crate::support::client::Client;
-use crate::support::git::{Forge, git, world};
-use crate::support::program::simulation_server;
-use crate::support::until;
+use crate::support::git::git;
+use crate::support::{Client, Forge, simulation_server, until, world};
 
 /// A forge with `lab/arm`: each of these branches has two worlds that name it.
 fn forge(branches: &[&str]) -> Forge {

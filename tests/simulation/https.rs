@@ -7,10 +7,9 @@ use std::process::{Command, Stdio};
 
 use super::opened::{cached, outcome, reader, world_text};
 use crate::support::authority::Authority;
-use crate::support::git::{Forge, git, world};
+use crate::support::git::git;
 use crate::support::listener::{Request, serve};
-use crate::support::program::{Builder, simulation_server};
-use crate::support::webots::Webots;
+use crate::support::{Builder, Forge, Webots, simulation_server, world};
 
 /// A forge that is reached by HTTPS alone.
 struct Https {

@@ -4,12 +4,8 @@ use std::path::Path;
 
 use super::git_wrapper::GitWrapper;
 use super::opened::{outcome, reader};
-use super::scene::arm;
-use crate::support::client::Client;
-use crate::support::git::{Forge, git};
-use crate::support::program::simulation_server;
-use crate::support::webots::Webots;
-use crate::support::{needs, programs};
+use crate::support::git::git;
+use crate::support::{Client, Forge, Webots, arm, needs, programs, simulation_server};
 
 const POINTER: &str = "version https://git-lfs.github.com/spec/v1\noid sha256:0000000000000000000000000000000000000000000000000000000000000000\nsize 12345\n";
 

@@ -2,9 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::support::client::Client;
-use crate::support::program::Server;
-use crate::support::webots::Webots;
+use crate::support::{Client, Server, Webots};
 
 /// A Webots that tells which world it was given, and ends: its client hears the world's second line.
 pub fn reader() -> Webots {
@@ -32,13 +30,6 @@ pub fn size_of(folder: &Path) -> u64 {
             if entry.path().is_dir() { size_of(&entry.path()) } else { entry.metadata().map_or(0, |about| about.len()) }
         })
         .sum()
-}
-
-/// Bytes that can't be packed.
-pub fn noise(bytes: usize) -> Vec<u8> {
-    let mut noise = vec![0; bytes];
-    rand::fill(&mut noise[..]);
-    noise
 }
 
 pub fn cached(server: &Server) -> Vec<PathBuf> {

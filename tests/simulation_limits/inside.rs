@@ -16,13 +16,9 @@ use webots_fleet::simulation::slots::GetSnapshot;
 use webots_fleet::simulation::snapshot::Stage;
 use webots_fleet::simulation::state::AppState;
 
-use crate::support::client::Client;
-use crate::support::git::Forge;
-pub use crate::support::git::arm;
-use crate::support::webots::{Webots, instances_below};
-use crate::support::{ports, until};
+use crate::support::{Client, Forge, Webots, arm, instances_below, ports, until};
 
-/// A server with one place, and what it stands on. Its Webots is one of these scripts.
+/// A server with one place, and what it stands on.
 pub struct Inside {
     pub server: Arc<AppState>,
     pub port: u16,
@@ -31,25 +27,11 @@ pub struct Inside {
     _parts: (Forge, Webots, Option<TcpListener>),
 }
 
-const DEMO: &str =
-    concat!("export DEMO_SIMULATOR_BIND=127.0.0.1; '", env!("CARGO_BIN_EXE_demo-simulator"), "' \"$@\" &\n");
-
-/// The text of a Webots whose simulation comes to a certain state, and stays there. One that is to be stopping ignores
-/// SIGTERM and has a child that hides.
-pub fn webots_that_is(stage: Stage) -> String {
-    match stage {
-        Stage::Launching => "sleep 1000 & sleep 1000".to_owned(),
-        Stage::Running => format!("{DEMO} echo real-time; wait"),
-        Stage::Stopping => format!("trap '' TERM\n(setsid sleep 1000) &\n{DEMO} while true; do wait; sleep 0.1; done"),
-        _ => format!("{DEMO} wait"),
-    }
-}
-
 impl Inside {
     /// Starts a server. Where checkouts are to hang, its forge never answers.
     pub async fn new(stage: Stage, change: impl FnOnce(&mut SimulationConfig)) -> Self {
         // Before the server: it takes for its own what is started later.
-        let (forge, webots) = (Forge::with_arm(), Webots::script(&webots_that_is(stage)));
+        let (forge, webots) = (Forge::with_arm(), Webots::that_is(&format!("{stage:?}").to_lowercase()));
         let (folder, port) = (tempfile::tempdir().unwrap(), ports::block(12));
         let hanging = (stage == Stage::CheckingOut).then(|| TcpListener::bind("127.0.0.1:0").unwrap());
         let mirror = match &hanging {

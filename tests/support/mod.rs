@@ -2,7 +2,7 @@
 //!
 //! Everything that a test starts ends with it, and a test that fails prints the logs of what it had started.
 
-#![allow(dead_code, reason = "each test crate uses its own part of this")]
+#![allow(dead_code, unused_imports, reason = "each test crate uses its own part of this")]
 
 pub mod authority;
 pub mod client;
@@ -21,6 +21,11 @@ pub mod smtp;
 pub mod stand_in;
 pub mod stopwatch;
 pub mod webots;
+
+pub use client::Client;
+pub use git::{Forge, WORLD, arm, world};
+pub use program::{Builder, Server, demo_server, server_of, session_server, simulation_server};
+pub use webots::{DEMO, Webots, instance_folders_in, instances_below};
 
 use std::io::Write;
 use std::os::unix::fs::PermissionsExt;

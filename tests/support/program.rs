@@ -90,6 +90,11 @@ impl Builder {
         }
     }
 
+    /// The forge that a server of [`server_of`] has to itself.
+    pub fn forge(&self) -> &Forge {
+        &self.parts.as_ref().unwrap().0
+    }
+
     /// Sets a key of the configuration; `a.b` is a key of a part.
     pub fn set(mut self, key: &str, value: impl Into<Value>) -> Self {
         let pointer = key.split('.').fold(&mut self.config, |place, part| &mut place[part]);
@@ -196,6 +201,11 @@ impl Builder {
 }
 
 impl Server {
+    /// The forge that a server of [`server_of`] has to itself.
+    pub fn forge(&self) -> &Forge {
+        &self._parts.as_ref().unwrap().0
+    }
+
     /// The folder of its cache.
     pub fn cache(&self) -> PathBuf {
         self.folder.join("cache")
@@ -224,6 +234,18 @@ impl Server {
     /// The process id.
     pub fn pid(&self) -> i32 {
         i32::try_from(self.child.id()).unwrap()
+    }
+
+    /// The processes that it has started, and that are not lost to others.
+    pub fn children(&self) -> Vec<i32> {
+        let all = procfs::process::all_processes().unwrap().flatten();
+        all.filter(|one| one.stat().is_ok_and(|stat| stat.ppid == self.pid())).map(|one| one.pid()).collect()
+    }
+
+    /// The child that ends the simulations when the server is gone.
+    pub fn guardian(&self) -> i32 {
+        let words = |pid: &i32| procfs::process::Process::new(*pid).and_then(|one| one.cmdline()).unwrap_or_default();
+        self.children().into_iter().find(|pid| words(pid).get(1).is_some_and(|word| word == "guard")).unwrap()
     }
 
     /// Sends a signal to the server itself.
