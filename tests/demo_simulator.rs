@@ -177,7 +177,7 @@ async fn real_time_and_fast_run_until_paused_and_later_viewers_hear_which() {
             player.send("w3d").await;
             viewer.until("pause: ").await;
         } else {
-            late.send("pause").await;
+            viewer.send("pause").await;
             viewer.until("paused by client").await;
         }
     }

@@ -120,23 +120,23 @@ async fn the_acceptance_run_finds_the_demo_as_expected() {
 }
 
 #[actix_rt::test]
-async fn a_fleet_that_is_not_there_and_one_elsewhere_are_refused_in_one_line() {
-    let (_taken, port) = ports::dead_port();
-    let Said { code, err, .. } = rehearse(&format!("http://127.0.0.1:{port}"), &["--clients", "1"]).await;
-    assert!(code == Some(1) && err.starts_with("error: ") && err.lines().count() == 1, "{err}");
-    // Nobody is there to agree. Nothing is sent: the address is one for documentation.
-    let Said { code, err, .. } = rehearse("http://192.0.2.1:1999", &["--clients", "1"]).await;
-    let words = "error: nobody agreed to load http://192.0.2.1:1999/; --yes agrees\n";
-    assert_eq!((code, err.as_str()), (Some(2), words));
-}
-
-#[actix_rt::test]
-async fn who_names_a_simulation_server_in_place_of_a_session_server_is_told_so() {
-    let fleet = Fleet::with_places(1).await;
-    for arguments in [&ONE[..], &["--explain"]] {
-        let Said { code, err, .. } = rehearse(&fleet.simulation.url(""), arguments).await;
-        assert!(code == Some(1) && err.starts_with("error: ws://") && err.lines().count() == 1, "{err}");
-        assert!(err.ends_with(": no session server, maybe a simulation server\n"), "{err}");
+async fn a_fleet_that_is_not_there_or_elsewhere_or_only_a_part_is_refused_in_one_line() {
+    let ((_taken, port), fleet) = (ports::dead_port(), Fleet::with_places(1).await);
+    let no_session_server = (1, "error: ws://", ": no session server, maybe a simulation server\n");
+    for (url, arguments, (code, begin, end)) in [
+        (format!("http://127.0.0.1:{port}"), &ONE[..], (1, "error: ", "\n")),
+        // Nobody is there to agree. Nothing is sent: the address is one for documentation.
+        (
+            "http://192.0.2.1:1999".to_owned(),
+            &ONE[..],
+            (2, "error: nobody agreed to load http://192.0.2.1:1999/; --yes agrees\n", ""),
+        ),
+        (fleet.simulation.url(""), &ONE[..], no_session_server),
+        (fleet.simulation.url(""), &["--explain"], no_session_server),
+    ] {
+        let said = rehearse(&url, arguments).await;
+        assert!(said.code == Some(code) && said.err.lines().count() == 1, "{said:?}");
+        assert!(said.err.starts_with(begin) && said.err.ends_with(end), "{said:?}");
     }
 }
 

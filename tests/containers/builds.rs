@@ -2,11 +2,9 @@
 
 use webots_fleet::simulation::container::ResourceOwner;
 
-use super::daemon::{
-    ask, containers, docker, dockerfile, of_service, refused, running, server, server_built, server_with,
-};
+use super::daemon::{ask, containers, docker, dockerfile, of_service, running, server, server_built, server_with};
 use super::image::NAME;
-use crate::support::{Client, WORLD, arm, until};
+use crate::support::{Client, WORLD, arm, is_told, until};
 
 #[actix_rt::test]
 async fn a_projects_own_dockerfile_is_built_once_for_all_who_want_it_and_what_it_makes_is_there() {
@@ -97,8 +95,7 @@ async fn what_can_not_be_built_is_told_in_words_and_leaves_nothing() {
     let server = server(1).start().await;
     for (dockerfile, words) in table {
         server.forge().commit("lab/arm", "main", &[("Dockerfile", &dockerfile)]);
-        let (told, _) = refused(&server, &arm()).await;
-        assert!(told.contains(words), "{told:?} does not have {words:?}");
+        is_told(&server, &arm(), words).await;
         until("nothing is left", async || containers(&server).is_empty()).await;
     }
 }
@@ -109,8 +106,7 @@ async fn a_version_without_an_image_is_told_in_words() {
     // A registry that says at once that it is not there.
     let image = serde_json::json!({"image": "127.0.0.1:1/webots:{version}"});
     let server = server_with(&[("worlds/a.wbt", &WORLD.replace("R2025a", "R2022b"))]).set("container", image);
-    let (told, _) = refused(&server.start().await, &arm()).await;
-    assert!(told.contains("127.0.0.1:1/webots:R2022b"), "{told}");
+    is_told(&server.start().await, &arm(), "127.0.0.1:1/webots:R2022b").await;
 }
 
 #[actix_rt::test]
@@ -132,8 +128,7 @@ async fn a_client_that_leaves_in_the_middle_of_a_build_ends_it() {
 #[actix_rt::test]
 async fn a_build_that_takes_too_long_is_ended_and_told() {
     let Some(_docker) = docker().await else { return };
-    let (told, _) = refused(&server_built("RUN sleep 1000").set("timing.build", 3).start().await, &arm()).await;
-    assert!(told.contains("timing.build"), "{told}");
+    is_told(&server_built("RUN sleep 1000").set("timing.build", 3).start().await, &arm(), "timing.build").await;
 }
 
 #[actix_rt::test]

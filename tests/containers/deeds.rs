@@ -2,9 +2,9 @@
 
 use std::time::{Duration, Instant};
 
-use super::daemon::{ask, containers, docker, of_service, refused, running, server_running};
+use super::daemon::{ask, containers, docker, of_service, running, server_running};
 use super::image::NAME;
-use crate::support::{Builder, arm, until};
+use crate::support::{Builder, arm, is_told, until};
 
 /// A server whose Webots does this and then heartbeats.
 fn doing(script: &str) -> Builder {
@@ -43,8 +43,7 @@ async fn memory_without_end_is_told_and_ended() {
     let Some(_docker) = docker().await else { return };
     let server = doing("sleep 1; perl -e 'my @a; push @a, \"x\" x 1000000 while 1' & wait $!; exit 137");
     let server = server.set("limits.memory", 64).start().await;
-    let (told, _) = refused(&server, &arm()).await;
-    assert!(told.contains("limits.memory"), "{told}");
+    is_told(&server, &arm(), "limits.memory").await;
     until("it is gone", async || containers(&server).is_empty()).await;
 }
 
@@ -66,8 +65,7 @@ async fn what_fills_the_project_is_told_and_ended() {
     let Some(_docker) = docker().await else { return };
     let server = doing("(sleep 1; dd if=/dev/zero of=/usr/local/webots-project/big bs=1M count=50 2>/dev/null) &");
     let server = server.set("limits.disk", 20).start().await;
-    let (told, _) = refused(&server, &arm()).await;
-    assert!(told.contains("limits.disk"), "{told}");
+    is_told(&server, &arm(), "limits.disk").await;
 }
 
 #[actix_rt::test]

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::Signal;
 
 use super::daemon::{self, alone, ask, check, containers, docker, refused, running, server, server_running};
-use crate::support::{Client, Server, arm, until};
+use crate::support::{Client, Server, arm, is_told, until};
 
 /// All of a simulation has to be gone by then.
 const GONE: Duration = Duration::from_secs(10);
@@ -95,8 +95,7 @@ async fn a_docker_that_is_stopped_or_has_no_init_process_is_told_and_all_goes_on
     daemon::start_again(&["--init-path", "/nowhere/docker-init"]);
     let second = daemon::server(1).start().await;
     until("it takes no client", async || !takes_clients(&second).await).await;
-    let (told, _) = refused(&second, &arm()).await;
-    assert!(told.contains("docker-init: on Debian and Ubuntu the packages docker.io and tini"), "{told}");
+    is_told(&second, &arm(), "docker-init: on Debian and Ubuntu the packages docker.io and tini").await;
     let checked = check(&second);
     assert!(checked.contains("can't give containers an init process"), "{checked}");
     daemon::kill();

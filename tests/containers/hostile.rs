@@ -2,7 +2,7 @@
 
 use super::daemon::{as_ordinary, ask, docker, dockerfile, of_service, refused, running, server, server_built};
 use super::image::NAME;
-use crate::support::{arm, world};
+use crate::support::{arm, arm_at, is_told};
 
 #[actix_rt::test]
 async fn a_link_in_an_image_leads_no_build_to_files_of_the_machine() {
@@ -17,8 +17,7 @@ async fn a_link_in_an_image_leads_no_build_to_files_of_the_machine() {
     let yml = "dockerCompose: \"competition:webots-project/controllers/c\"\n";
     let server = server_built(&link);
     server.forge().commit("lab/arm", "main", &[("webots.yml", yml), ("controllers/Dockerfile", &controller)]);
-    let (told, _) = refused(&server.start().await, &arm()).await;
-    assert!(told.contains("The project has no folder controllers"), "{told}");
+    is_told(&server.start().await, &arm(), "The project has no folder controllers").await;
 }
 
 #[actix_rt::test]
@@ -43,7 +42,7 @@ async fn what_an_image_does_to_folders_and_devices_is_its_projects_fault() {
     }
     let server = as_ordinary(server, folder.path()).start().await;
     for (branch, (line, words)) in ["a", "b", "c", "d"].into_iter().zip(all) {
-        let (told, code) = refused(&server, &world("lab/arm", branch, "worlds/a.wbt")).await;
+        let (told, code) = refused(&server, &arm_at(branch)).await;
         assert_eq!(code, Some(1000), "{line}: {told}");
         assert_eq!(server.status().await["failedStarts"], 0, "{line}: {told}");
         assert!(told.contains(words) && !told.contains(server.folder().to_str().unwrap()), "{line}: {told}");

@@ -5,11 +5,10 @@ use std::time::{Duration, Instant};
 use serde_json::json;
 
 use super::daemon::{
-    ORDINARY, as_ordinary, ask, check, containers, docker, of_service, refused, running, server, server_running,
-    server_with,
+    ORDINARY, as_ordinary, ask, check, containers, docker, of_service, running, server, server_running, server_with,
 };
 use super::image::NAME;
-use crate::support::{Client, WORLD, arm, until};
+use crate::support::{Client, WORLD, arm, is_told, until};
 
 #[actix_rt::test]
 async fn a_project_has_an_editor_on_the_port_of_webots_plus_500() {
@@ -43,8 +42,7 @@ async fn a_folder_that_leads_out_of_the_project_or_has_an_odd_name_is_not_shown_
         std::os::unix::fs::symlink(target, work.join("controllers/edit")).unwrap();
         std::fs::write(work.join("webots.yml"), "dockerCompose: \"theia:webots-project/controllers/edit\"\n").unwrap();
         server.forge().commit_work_tree("lab/arm", "main");
-        let (told, _) = refused(&server, &arm()).await;
-        assert!(told.contains(words), "{told}");
+        is_told(&server, &arm(), words).await;
     }
 }
 

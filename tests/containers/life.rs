@@ -4,8 +4,8 @@ use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
 
-use super::daemon::{self, ask, containers, docker, of_service, refused, running, server};
-use crate::support::{Client, WORLD, arm, instance_folders_in, until, world};
+use super::daemon::{self, ask, containers, docker, of_service, running, server};
+use crate::support::{Client, WORLD, arm, instance_folders_in, is_told, until, world};
 
 /// All of a simulation has to be gone by then.
 const GONE: Duration = Duration::from_secs(10);
@@ -117,8 +117,7 @@ async fn an_existing_configuration_with_docker_true_runs_every_world_in_a_contai
         until("it is gone", async || containers(&server).is_empty()).await;
     }
     let server = daemon::server(2).set("shareIdleTime", 0).start().await;
-    let (told, _) = refused(&server, &world("other/world", "main", "worlds/a.wbt")).await;
-    assert!(told.contains("not configured to share idle time"), "{told}");
+    is_told(&server, &world("other/world", "main", "worlds/a.wbt"), "not configured to share idle time").await;
 }
 
 #[actix_rt::test]

@@ -15,7 +15,7 @@ use super::deeds::{Stage, as_nobody};
 use crate::simulation::scene::{gone_within, nothing_left};
 use crate::support::client::Heard;
 use crate::support::{
-    Builder, Client, DEMO, Server, Webots, arm, display, http, instances_below, needs, programs, skip, until,
+    Builder, Client, DEMO, Server, Webots, arm, display, http, instances_below, is_told, needs, programs, skip, until,
 };
 
 /// What runs a server as an ordinary user who can have networks; nothing, and a word, where there is none.
@@ -244,8 +244,7 @@ async fn how_a_program_has_ended_is_told_from_its_own_network() {
     ] {
         let webots = Webots::script(script);
         let server = server(&stage, &webots, user, "own").start().await;
-        let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
-        assert!(told.contains(words), "{told}");
+        is_told(&server, &arm(), words).await;
     }
 }
 

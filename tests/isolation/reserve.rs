@@ -10,7 +10,7 @@ use nix::sys::statvfs::statvfs;
 use super::deeds::{as_nobody, open};
 use crate::simulation::scene::{instance_folders, nothing_left};
 use crate::support::disk::{self, Full};
-use crate::support::{Builder, Client, DEMO, Forge, SOON, Server, Webots, open_folder, simulation_server, skip, until};
+use crate::support::{Builder, Client, DEMO, SOON, Server, Webots, open_folder, server_of, skip, until};
 
 /// The size of the disk, in MiB; `diskReserve` is as it is by itself.
 const SIZE: u32 = 1024;
@@ -65,9 +65,9 @@ impl Least {
 }
 
 /// A server on a disk of its own, whose simulations do what `go` in their project says.
-async fn server(forge: &Forge, webots: &Webots, folder: &Path, change: impl FnOnce(Builder) -> Builder) -> Server {
+async fn server(webots: Webots, folder: &Path, change: impl FnOnce(Builder) -> Builder) -> Server {
     open(folder);
-    let builder = simulation_server(&webots.path(), forge.path(), 2).folder(folder).set("timing.heartbeat", 0.5);
+    let builder = server_of(webots, 2).folder(folder).set("timing.heartbeat", 0.5);
     change(builder.set("isolation", "sandbox").set("limits.disk", 1_000_000)).start().await
 }
 
@@ -100,13 +100,12 @@ async fn simulations_never_use_up_the_reserve_of_the_disk() {
     if !disk::small_disk(&small, SIZE) {
         return skip("simulations_never_use_up_the_reserve_of_the_disk", "only root may mount a small disk");
     }
-    let (forge, webots) = (Forge::with_arm(), webots());
     let mut users = vec![("root", "true")];
     users.extend(as_nobody().map(|nobody| ("nobody", nobody)));
     for (user, before) in users {
         let own = small.join(user);
         std::fs::create_dir(&own).unwrap();
-        let server = server(&forge, &webots, &own, |builder| builder.before(before)).await;
+        let server = server(webots(), &own, |builder| builder.before(before)).await;
         let (mut innocent, folder) = doing(&server, "").await;
         go(&folder, "true");
         // Root sees what hides, too.
@@ -139,8 +138,7 @@ async fn no_simulation_ends_where_another_program_fills_the_disk() {
     if !disk::small_disk(folder.path(), 64) {
         return skip("no_simulation_ends_where_another_program_fills_the_disk", "only root may mount a small disk");
     }
-    let (forge, webots) = (Forge::with_arm(), Webots::script(&format!("{DEMO} \"$@\" & wait")));
-    let server = server(&forge, &webots, folder.path(), |builder| builder.set("diskReserve", 8)).await;
+    let server = server(Webots::launcher(), folder.path(), |builder| builder.set("diskReserve", 8)).await;
     let mut client = Client::ready(&server).await;
     let _filler = Full::at(folder.path());
     until("it is full", async || server.health().await.0 == 503).await;

@@ -1,6 +1,6 @@
 //! Whose worlds run here.
 
-use crate::support::{Client, Forge, Webots, simulation_server};
+use crate::support::{Forge, Webots, is_told, simulation_server};
 
 #[actix_rt::test]
 async fn a_world_runs_only_where_its_repository_is_allowed() {
@@ -26,7 +26,6 @@ async fn a_world_runs_only_where_its_repository_is_allowed() {
         (format!("https://github.com/lab/%2e%2e/lab-evil/arm/{end}"), "Wrong Webots simulation URL"),
     ];
     for (url, words) in table {
-        let told = Client::start(&server, &url).await.until("loading: Error:").await;
-        assert!(told.contains(words), "{url}: {told}");
+        is_told(&server, &url, words).await;
     }
 }

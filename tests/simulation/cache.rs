@@ -6,9 +6,11 @@ use std::time::Duration;
 use nix::sys::signal::Signal;
 
 use super::git_wrapper::GitWrapper;
-use super::opened::{cached, outcome, reader, size_of, world_text};
+use super::opened::{cached, reader, size_of, world_text};
 use super::scene::instance_folders;
-use crate::support::{Client, Forge, Server, arm, demo_server, server_of, simulation_server, until, world};
+use crate::support::{
+    Client, Forge, Server, arm, arm_at, demo_server, is_told, outcome, server_of, simulation_server, until, world,
+};
 
 #[actix_rt::test]
 async fn the_cache_keeps_to_its_budget() {
@@ -133,7 +135,7 @@ async fn a_repository_that_is_being_used_stays_and_goes_with_its_last_user_where
     let mut user = Client::start(&server, &arm()).await;
     user.until("loading: Step 8/9 : checking main out").await;
     // Others come and go.
-    assert!(outcome(&server, &world("lab/leg", "main", "worlds/a.wbt")).await.contains("opened [leg]"));
+    is_told(&server, &world("lab/leg", "main", "worlds/a.wbt"), "opened [leg]").await;
     until("the other has gone", async || !has(&server, "lab-leg")).await;
     assert!(has(&server, "lab-arm"), "it is in use");
     std::fs::write(marks.path().join("go"), "").unwrap();
@@ -141,7 +143,7 @@ async fn a_repository_that_is_being_used_stays_and_goes_with_its_last_user_where
     until("it is gone with its user", async || cached(&server).is_empty()).await;
     drop(server);
     let server = start(100).await;
-    assert!(outcome(&server, &arm()).await.contains("opened"));
+    is_told(&server, &arm(), "opened").await;
     assert_eq!(cached(&server).len(), 1);
     drop(server);
     let server = start(1).await;
@@ -158,7 +160,7 @@ async fn packing_that_takes_long_holds_nobody_up_for_long() {
     let builder = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path());
     let server = builder.set("timing.checkout", 12).start().await;
     let ask = async |branch: &str| {
-        let mut client = Client::start(&server, &world("lab/arm", branch, "worlds/a.wbt")).await;
+        let mut client = Client::start(&server, &arm_at(branch)).await;
         let told = client.until("loading: Error:").await;
         assert!(told.contains(&format!("opened [{branch}]")), "{told}");
         client.closed().await;
@@ -180,19 +182,18 @@ async fn a_remote_that_fails_costs_nothing_of_the_cache() {
     let server = server_of(reader(), 1).env("PATH", &wrapper.path()).start().await;
     let forge = server.forge();
     forge.commit_noise("lab/arm", 1 << 20);
-    assert!(outcome(&server, &arm()).await.contains("opened"));
+    is_told(&server, &arm(), "opened").await;
     let before = size_of(&cached(&server)[0]);
     std::fs::write(fails.path().join("now"), "").unwrap();
     let commit = forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("next"))]);
     let fetches = || wrapper.calls().iter().filter(|call| call.contains(&format!("+{commit}"))).count();
     for number in 1..=2 {
-        let told = outcome(&server, &arm()).await;
-        assert!(told.contains("git fetch ended with exit code 128: fatal: early EOF"), "{told}");
+        is_told(&server, &arm(), "git fetch ended with exit code 128: fatal: early EOF").await;
         assert_eq!(fetches(), number, "it is not tried again by itself");
         assert_eq!(size_of(&cached(&server)[0]), before);
     }
     std::fs::remove_file(fails.path().join("now")).unwrap();
-    assert!(outcome(&server, &arm()).await.contains("opened [next]"));
+    is_told(&server, &arm(), "opened [next]").await;
 }
 
 #[actix_rt::test]
@@ -203,7 +204,7 @@ async fn a_cache_belongs_to_one_server() {
     let said = builder().refused(1).await;
     let words = "(cacheDir) can't be used: another simulation server uses it, and each needs one of its own";
     assert!(said.contains(words), "{said}");
-    assert!(outcome(&one, &arm()).await.contains("opened"), "the first is not disturbed");
+    is_told(&one, &arm(), "opened").await;
     one.signal(Signal::SIGKILL);
     one.ended().await;
     assert!(outcome(&builder().start().await, &arm()).await.contains("opened"), "its lock ends with it");

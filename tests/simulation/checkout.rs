@@ -7,10 +7,12 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
 use super::git_wrapper::GitWrapper;
-use super::opened::{cached, outcome, reader, size_of, world_text};
+use super::opened::{cached, reader, size_of, world_text};
 use super::scene::{instance_folders, nothing_left};
 use crate::support::git::git;
-use crate::support::{Client, Forge, Webots, arm, instances_below, server_of, simulation_server, until, world};
+use crate::support::{
+    Client, Forge, Webots, arm, arm_at, instances_below, is_told, outcome, server_of, simulation_server, until, world,
+};
 
 #[actix_rt::test]
 async fn every_kind_of_url_opens_its_world() {
@@ -56,8 +58,7 @@ async fn every_kind_of_url_opens_its_world() {
         (format!("https://gitea.lab:3000/lab/arm/src/commit/{first}/worlds/a.wbt"), "root of main"),
     ];
     for (url, mark) in table {
-        let told = outcome(&server, &url).await;
-        assert!(told.contains(&format!("opened [{mark}]")), "{url}: {told}");
+        is_told(&server, &url, &format!("opened [{mark}]")).await;
     }
     assert!(!server.folder.join("pwned").exists() && !Path::new("pwned").exists(), "a name was run");
     assert!(server.log().contains("is for Webots R2025a"));
@@ -88,11 +89,8 @@ async fn what_is_not_there_or_no_world_is_told_in_words() {
     let none = "0123456789012345678901234567890123456789";
     let table = [
         (world("lab/none", "main", "worlds/a.wbt"), "https://github.com/lab/none does not exist or is not public"),
-        (
-            world("lab/arm", "none", "worlds/a.wbt"),
-            "https://github.com/lab/arm has no branch, tag or commit called \"none\"",
-        ),
-        (world("lab/arm", none, "worlds/a.wbt"), "is in no branch or tag of https://github.com/lab/arm"),
+        (arm_at("none"), "https://github.com/lab/arm has no branch, tag or commit called \"none\""),
+        (arm_at(none), "is in no branch or tag of https://github.com/lab/arm"),
         (world("lab/arm", "main", "worlds/none.wbt"), "worlds/none.wbt in main does not exist"),
         (world("lab/arm", "main", "p/worlds/a.wbt"), "p/worlds/a.wbt in main does not exist"),
         (world("lab/arm", "main", "worlds/passwd.wbt"), "passwd.wbt leads out of its repository"),
@@ -104,7 +102,7 @@ async fn what_is_not_there_or_no_world_is_told_in_words() {
         (world("lab/arm", "main", "project/worlds/b.wbt"), "project/worlds/b.wbt in main does not exist"),
         (world("lab/arm", "main", "etc/worlds/b.wbt"), "etc/worlds/b.wbt in main does not exist"),
         (world("lab/arm", "main", "far/worlds/b.wbt"), "b.wbt does not exist"),
-        (world("lab/arm", &tip[..9], "worlds/a.wbt"), "has no branch, tag or commit called"),
+        (arm_at(&tip[..9]), "has no branch, tag or commit called"),
     ];
     for (url, words) in table {
         let told = outcome(&server, &url).await;
@@ -146,8 +144,7 @@ async fn a_repository_can_run_nothing() {
     .unwrap();
     let builder = simulation_server(&webots.path(), forge.path(), 2).env("HOME", home.to_str().unwrap());
     let server = builder.env("XDG_CONFIG_HOME", home.join(".config").to_str().unwrap()).start().await;
-    let told = outcome(&server, &arm()).await;
-    assert!(told.contains("opened [WorldInfo { title \"Test\" basicTimeStep 32 }]"), "{told}");
+    is_told(&server, &arm(), "opened [WorldInfo { title \"Test\" basicTimeStep 32 }]").await;
     let left: Vec<_> = std::fs::read_dir(trap.path()).unwrap().flatten().map(|entry| entry.file_name()).collect();
     assert_eq!(left, ["home"]);
 }
@@ -168,7 +165,7 @@ async fn equal_checkouts_are_done_once_and_a_cached_start_fetches_nothing() {
     outcome(&server, &arm()).await;
     let before = size_of(&server.folder.join("cache/git"));
     forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("changed"))]);
-    assert!(outcome(&server, &arm()).await.contains("opened [changed]"));
+    is_told(&server, &arm(), "opened [changed]").await;
     let grown = size_of(&server.folder.join("cache/git")) - before;
     assert!(before > 1 << 20 && grown < 20_000, "{grown} bytes were fetched");
     // A client that waits alone ends git when it leaves.
@@ -228,7 +225,7 @@ async fn a_kill_in_the_middle_of_a_fetch_harms_no_later_start() {
         server.ended().await;
         until("git has ended", async || instances_below(folder.path()).is_empty()).await;
         let server = start().start().await;
-        assert!(outcome(&server, &arm()).await.contains("opened [WorldInfo"));
+        is_told(&server, &arm(), "opened [WorldInfo").await;
         let is_whole = async || !cached(&server).iter().any(|path| has_half_a_pack(path));
         until("the half of a pack is gone", is_whole).await;
         std::fs::remove_dir_all(folder.path().join("cache/git")).unwrap();

@@ -6,7 +6,9 @@ use serde_json::Value;
 
 use super::scene::nothing_left;
 use crate::support::http::{PASSWORD, get_as_administrator};
-use crate::support::{Client, DEMO, Forge, Server, Webots, arm, http, server_of, simulation_server, until, world};
+use crate::support::{
+    Client, DEMO, Forge, Server, Webots, arm, http, is_told, server_of, simulation_server, until, world,
+};
 
 /// A simulator that ends with an exit code, once that is in a file.
 fn ending(file: &Path) -> Webots {
@@ -156,8 +158,7 @@ async fn an_output_that_can_not_be_kept_fails_no_start() {
     std::fs::create_dir_all(&logs).unwrap();
     // Not even root can make a folder in a file.
     std::fs::write(logs.join("instances"), "").unwrap();
-    let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
-    assert!(told.contains("Webots ended with exit code 3. Its last output: last words"), "{told}");
+    is_told(&server, &arm(), "Webots ended with exit code 3. Its last output: last words").await;
     assert_eq!(server.log().matches("what Webots prints is not kept").count(), 1);
     nothing_left(&server, 1).await;
 }

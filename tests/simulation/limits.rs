@@ -1,10 +1,10 @@
 //! What is too large, or takes too much.
 
 use super::git_wrapper::GitWrapper;
-use super::opened::{outcome, reader, size_of, world_text};
+use super::opened::{reader, size_of, world_text};
 use super::scene::nothing_left;
 use crate::support::git::git;
-use crate::support::{Forge, WORLD, arm, simulation_server, until, world};
+use crate::support::{Forge, WORLD, arm, arm_at, is_told, outcome, simulation_server, until, world};
 
 #[actix_rt::test]
 async fn sizes_are_limited() {
@@ -17,7 +17,7 @@ async fn sizes_are_limited() {
     let server = builder.set("cacheSize", 1).start().await;
     let told = outcome(&server, &arm()).await;
     assert!(told.ends_with("is larger than 1 MiB"), "{told}");
-    let told = outcome(&server, &world("lab/arm", old.trim(), "worlds/a.wbt")).await;
+    let told = outcome(&server, &arm_at(old.trim())).await;
     assert_eq!(told, "loading: Error: The history of https://github.com/lab/arm is larger than 1 MiB");
     // What was broken off leaves nothing.
     let cache = server.folder.join("cache/git");
@@ -46,8 +46,7 @@ async fn sizes_are_limited() {
         let root = make_tree(format!("040000 tree {tree}\tbomb\n040000 tree {}\tworlds\n", worlds.trim()));
         let commit = git(&work, &["commit-tree", "-m", "bomb", &root]);
         git(&work, &["push", "--quiet", "--force", "origin", &format!("{}:refs/heads/main", commit.trim())]);
-        let told = outcome(&server, &world("lab/bomb", "main", "worlds/a.wbt")).await;
-        assert!(told.contains(words), "{told}");
+        is_told(&server, &world("lab/bomb", "main", "worlds/a.wbt"), words).await;
     }
     nothing_left(&server, 2).await;
 }
@@ -70,6 +69,5 @@ async fn git_is_bounded_in_memory_and_in_what_it_writes() {
     // The server sets it once git has been started.
     let wrapper = GitWrapper::new("until [ \"$(ulimit -d)\" -le 2097152 ] 2>/dev/null; do sleep 0.01; done");
     let server = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path()).start().await;
-    let told = outcome(&server, &arm()).await;
-    assert!(told.contains("opened"), "{told}");
+    is_told(&server, &arm(), "opened").await;
 }

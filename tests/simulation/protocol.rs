@@ -1,7 +1,7 @@
 //! What clients and pages may ask, and what they are told.
 
 use super::scene::{nothing_left, stages};
-use crate::support::{Client, Server, arm, demo_server, http, instances_below, until, world};
+use crate::support::{Client, Server, arm, arm_at, demo_server, http, instances_below, until, world};
 
 #[actix_rt::test]
 async fn a_message_that_is_none_is_answered_in_words() {
@@ -32,7 +32,7 @@ async fn a_message_that_is_none_is_answered_in_words() {
     let image = "%3Cimg%20src=x%20onerror=alert(1)%3E";
     for url in [
         world("lab/arm", "main", &format!("worlds/{image}.wbt")),
-        world("lab/arm", image, "worlds/a.wbt"),
+        arm_at(image),
         world(&format!("lab/{image}"), "main", "worlds/a.wbt"),
         world("lab/arm", "main", &format!("worlds/{image}.txt")),
     ] {

@@ -2,7 +2,9 @@
 
 use serde_json::Value;
 
-use crate::support::{Client, Forge, Server, Webots, arm, demo_server, http, session_server, simulation_server, until};
+use crate::support::{
+    Client, Forge, Server, Webots, arm, demo_server, http, is_told, session_server, simulation_server, until,
+};
 
 /// Whether the session server counts its only simulation server as one that works; a busy machine may make it full.
 async fn works(session: &Server) -> bool {
@@ -39,8 +41,7 @@ async fn a_display_that_is_missing_is_a_problem_for_webots_itself() {
     let server = itself().set("display", ":59").start().await;
     until("it is told", async || server.health().await.0 == 503).await;
     assert!(server.health().await.1.contains("no display answers at :59"));
-    let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
-    assert!(told.contains("no display answers at :59"), "{told}");
+    is_told(&server, &arm(), "no display answers at :59").await;
     // That of each GPU which answers is needed.
     let library = super::readings::gpu_driver();
     let mark = library.path().join("mark");

@@ -8,12 +8,12 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
 use super::ends::line;
-use super::opened::{outcome, world_text};
+use super::opened::world_text;
 use super::scene::{nothing_left, stages};
 use crate::support::stopwatch::Stopwatch;
 use crate::support::{
-    Client, DEMO, Forge, Server, Webots, arm, demo_server, display, instance_folders_in, instances_below, programs,
-    server_of, simulation_server, until, world,
+    Client, DEMO, Forge, Server, Webots, arm, demo_server, display, instance_folders_in, instances_below, is_told,
+    outcome, programs, server_of, simulation_server, until, world,
 };
 
 #[actix_rt::test]
@@ -103,8 +103,7 @@ async fn webots_gets_the_configured_display_else_the_servers_own_else_the_first(
     ] {
         let builder = simulation_server(&webots.path(), forge.path(), 1).before(environment);
         let builder = if let Some(name) = configured { builder.set("display", name) } else { builder };
-        let told = outcome(&builder.start().await, &arm()).await;
-        assert!(told.contains(&format!("display [{display}]")), "{configured:?}, {environment}: {told}");
+        is_told(&builder.start().await, &arm(), &format!("display [{display}]")).await;
     }
 }
 
@@ -141,8 +140,7 @@ async fn a_missing_webots_or_xvfb_is_told_with_what_to_do() {
     assert!(told.contains("has no Webots that it can run at \"webots\"") && told.contains("webotsHome"), "{told}");
     let git = programs(&["git", "bash", "env", "sh", "rm"]);
     let server = demo_server(1).set("xvfb", true).env("PATH", git.path().to_str().unwrap()).start().await;
-    let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
-    assert!(told.contains("(xvfb), but has no Xvfb"), "{told}");
+    is_told(&server, &arm(), "(xvfb), but has no Xvfb").await;
     nothing_left(&server, 1).await;
 }
 
@@ -196,8 +194,7 @@ async fn a_virtual_display_that_does_not_start_is_told() {
     for level in ["none", "sandbox"] {
         let builder = simulation_server(&webots.path(), forge.path(), 1).set("xvfb", true).set("isolation", level);
         let server = builder.env("PATH", &path).start().await;
-        let told = outcome(&server, &arm()).await;
-        assert!(told.contains("The virtual display (Xvfb) can't be started: no screens found"), "{level}: {told}");
+        is_told(&server, &arm(), "The virtual display (Xvfb) can't be started: no screens found").await;
         nothing_left(&server, 1).await;
     }
 }

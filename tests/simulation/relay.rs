@@ -17,16 +17,15 @@ use super::network::Network;
 use super::scene::nothing_left;
 use crate::support::client::Heard;
 use crate::support::http::{PASSWORD, get_as_administrator, get_with_password};
-use crate::support::{Builder, Client, Forge, SOON, Server, Webots, arm, http, simulation_server, skip, until};
+use crate::support::{Builder, Client, SOON, Server, Webots, arm, http, server_of, skip, until};
 
 /// The headers of who asks for a WebSocket.
 const UPGRADE: &str = "Host: localhost\r\nConnection: upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n\
     Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n";
 
-/// A server, and what it needs.
+/// A server.
 struct Stage {
     server: Server,
-    _parts: (Forge, Webots),
 }
 
 impl Stage {
@@ -35,10 +34,10 @@ impl Stage {
     }
 
     async fn with(webots: Webots, change: impl FnOnce(Builder) -> Builder) -> Self {
-        let forge = Forge::with_arm();
-        forge.commit("lab/arm", "main", &[("worlds/textures/a.png", "a picture"), ("plugins/a.html", "<p>a page</p>")]);
-        let builder = quick(simulation_server(&webots.path(), forge.path(), 2)).set("streaming", "relay");
-        Self { server: change(builder).start().await, _parts: (forge, webots) }
+        let files = [("worlds/textures/a.png", "a picture"), ("plugins/a.html", "<p>a page</p>")];
+        let builder = quick(server_of(webots, 2)).set("streaming", "relay");
+        builder.forge().commit("lab/arm", "main", &files);
+        Self { server: change(builder).start().await }
     }
 
     /// A simulation, and the path of its stream.
@@ -295,26 +294,21 @@ async fn no_trick_leads_anywhere_else() {
     let elsewhere = other.local_addr().unwrap();
     let token = path.rsplit('/').next().unwrap();
     let wrong = format!("{}{}", &token[..47], if token.ends_with('0') { '1' } else { '0' });
-    for (path, status) in [
-        (format!("{path}/../status"), 404),
-        (format!("{path}/%2e%2e/a.png"), 404),
-        (format!("{path}/%252e%252e/a.png"), 404),
-        (format!("{path}/a%2f..%2fb"), 404),
-        (format!("{path}/a%5c..%5cb"), 404),
-        (format!("{path}//{elsewhere}/"), 404),
-        (format!("{path}@{elsewhere}/"), 404),
-        (format!("{path}:80/a.png"), 404),
-        (format!("{path}/a%0d%0aHost:%20{elsewhere}"), 404),
-        (format!("/%73tream/{token}/a.png"), 404),
-        (format!("/stream/{wrong}/a.png"), 404),
-        (format!("/stream/{}/a.png", &token[..47]), 404),
-        (format!("/stream/{}/a.png", token.replace(|one: char| one.is_ascii_digit(), "%30")), 404),
-        ("/stream/".to_owned(), 404),
-        ("/stream".to_owned(), 404),
+    for path in [
+        format!("{path}/../status"),
+        format!("{path}/%2e%2e/a.png"),
+        format!("{path}@{elsewhere}/"),
+        format!("{path}:80/a.png"),
+        format!("/%73tream/{token}/a.png"),
+        format!("/stream/{wrong}/a.png"),
+        format!("/stream/{}/a.png", &token[..47]),
+        format!("/stream/{}/a.png", token.replace(|one: char| one.is_ascii_digit(), "%30")),
+        "/stream/".to_owned(),
+        "/stream".to_owned(),
     ] {
         for headers in [headers, UPGRADE] {
             let answer = stage.raw(&format!("GET {path} HTTP/1.1\r\n{headers}\r\n")).await;
-            assert!(answer.starts_with(&format!("HTTP/1.1 {status} ")), "{path}: {answer}");
+            assert!(answer.starts_with("HTTP/1.1 404 "), "{path}: {answer}");
             assert!(!answer.contains(&token[16..]), "{answer}");
         }
     }

@@ -4,7 +4,7 @@ use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use crate::support::{Builder, Client, Server, Webots, arm, instance_folders_in, instances_below, server_of, until};
+use crate::support::{Builder, Client, Server, arm, instance_folders_in, instances_below, server_that_is, until};
 
 /// The states of a simulation: one that is only connected, and those that servers show.
 pub const ALL: [&str; 7] = ["connected", "queued", "checkingout", "launching", "idle", "running", "stopping"];
@@ -24,12 +24,8 @@ impl Scene {
     /// Brings a client into this state.
     pub async fn new(state: &str, change: impl FnOnce(Builder) -> Builder) -> Self {
         let folder = tempfile::tempdir().unwrap();
-        let mut builder = server_of(Webots::that_is(state), 1).folder(folder.path());
-        let hanging = (state == "checkingout").then(|| TcpListener::bind("127.0.0.1:0").unwrap());
-        if let Some(hanging) = &hanging {
-            let mirror = format!("https://127.0.0.1:{}/", hanging.local_addr().unwrap().port());
-            builder = builder.set("gitMirrors", serde_json::json!({"https://github.com/": mirror}));
-        }
+        let (builder, hanging) = server_that_is(state);
+        let builder = builder.folder(folder.path());
         let server = change(builder).start().await;
         let other = if state == "queued" { Some(Client::ready(&server).await) } else { None };
         let mut client = Client::connect(&server.websocket("/client")).await;

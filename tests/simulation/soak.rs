@@ -6,7 +6,7 @@ use std::time::Duration;
 use procfs::net::TcpState;
 use procfs::process::Process;
 
-use crate::support::{Client, Forge, Server, Webots, holds_soon, instances_below, simulation_server, until, world};
+use crate::support::{Client, Forge, Server, Webots, arm, holds_soon, instances_below, simulation_server, until};
 
 /// What a server holds at one moment.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -96,7 +96,7 @@ pub async fn soak(starts: usize, rounds: usize) -> (Holdings, Holdings) {
 
 /// So many visits, some of which end before Webots is ready, or at any moment; waits until all are gone.
 async fn visit(server: &Server, visits: usize) {
-    let url = world("lab/arm", "main", "worlds/a.wbt");
+    let url = arm();
     let next = std::cell::Cell::new(0);
     let visitor = async || {
         while next.get() < visits {

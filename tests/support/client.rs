@@ -278,3 +278,19 @@ impl Client {
         self.socket.close(None).await.ok();
     }
 }
+
+/// What a client that asks for a world is told in the end.
+pub async fn outcome(server: &super::program::Server, world: &str) -> String {
+    let mut client = Client::start(server, world).await;
+    let told = client.patiently("loading: Error:").await;
+    // The words and the code agree in whether another server may take the client.
+    let code = if told.contains(". Connect again: the session server") { 1013 } else { 1000 };
+    assert_eq!(client.closed().await, Some(code), "{told}");
+    told
+}
+
+/// Has a client ask for a world, who is told these words in the end.
+pub async fn is_told(server: &super::program::Server, world: &str, words: &str) {
+    let told = outcome(server, world).await;
+    assert!(told.contains(words), "{world}: {words:?} is not in {told}");
+}

@@ -117,7 +117,12 @@ pub fn world(repository: &str, reference: &str, path: &str) -> String {
 
 /// The URL of the world of [`Forge::with_arm`].
 pub fn arm() -> String {
-    world("lab/arm", "main", "worlds/a.wbt")
+    arm_at("main")
+}
+
+/// The URL of that world in a branch, tag or commit.
+pub fn arm_at(reference: &str) -> String {
+    world("lab/arm", reference, "worlds/a.wbt")
 }
 
 /// Runs git in a folder; gives back what it prints.

@@ -22,9 +22,9 @@ pub mod stand_in;
 pub mod stopwatch;
 pub mod webots;
 
-pub use client::Client;
-pub use git::{Forge, WORLD, arm, world};
-pub use program::{Builder, Server, demo_server, server_of, session_server, simulation_server};
+pub use client::{Client, is_told, outcome};
+pub use git::{Forge, WORLD, arm, arm_at, world};
+pub use program::{Builder, Server, demo_server, server_of, server_that_is, session_server, simulation_server};
 pub use webots::{DEMO, Webots, instance_folders_in, instances_below};
 
 use std::io::Write;
@@ -48,6 +48,12 @@ pub fn open_folder() -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     std::fs::set_permissions(folder.path(), PermissionsExt::from_mode(0o755)).unwrap();
     folder
+}
+
+/// Makes a program of a script for bash.
+pub fn make_program(path: &std::path::Path, script: &str) {
+    std::fs::write(path, format!("#!/usr/bin/env bash\n{script}\n")).unwrap();
+    std::fs::set_permissions(path, PermissionsExt::from_mode(0o755)).unwrap();
 }
 
 /// A folder with links to these programs alone, for PATH.

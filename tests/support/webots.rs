@@ -1,6 +1,5 @@
 //! Stand-ins for Webots: the demo simulator behind a launcher, as the real one is, and scripts that misbehave.
 
-use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
 /// The shell's word for the demo simulator.
@@ -15,9 +14,7 @@ impl Webots {
     /// A script with this text below `#!/usr/bin/env bash`.
     pub fn script(text: &str) -> Self {
         let folder = super::open_folder();
-        let path = folder.path().join("webots");
-        std::fs::write(&path, format!("#!/usr/bin/env bash\n{text}\n")).unwrap();
-        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o755)).unwrap();
+        super::make_program(&folder.path().join("webots"), text);
         Self { folder }
     }
 
