@@ -233,7 +233,7 @@ pub fn dockerfile(lines: &str) -> String {
 /// What `--check` prints for a server's configuration.
 pub fn check(server: &Server) -> String {
     let mut command = Command::new(env!("CARGO_BIN_EXE_simulation-server"));
-    command.arg("--check").arg(server.folder().join("config.json")).env("DOCKER_HOST", host());
+    command.arg("--check").arg(server.folder.join("config.json")).env("DOCKER_HOST", host());
     let output = command.output().unwrap();
     format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
 }

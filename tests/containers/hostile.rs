@@ -45,7 +45,7 @@ async fn what_an_image_does_to_folders_and_devices_is_its_projects_fault() {
         let (told, code) = refused(&server, &arm_at(branch)).await;
         assert_eq!(code, Some(1000), "{line}: {told}");
         assert_eq!(server.status().await["failedStarts"], 0, "{line}: {told}");
-        assert!(told.contains(words) && !told.contains(server.folder().to_str().unwrap()), "{line}: {told}");
+        assert!(told.contains(words) && !told.contains(server.folder.to_str().unwrap()), "{line}: {told}");
     }
 }
 

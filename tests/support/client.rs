@@ -132,7 +132,7 @@ impl Client {
     /// The next simulated time that a viewer is told, in milliseconds.
     pub async fn time(&mut self) -> f64 {
         let update = self.until("application/json:").await;
-        let update: serde_json::Value = serde_json::from_str(&update["application/json:".len()..]).unwrap();
+        let update: serde_json::Value = serde_json::from_str(update.trim_start_matches("application/json:")).unwrap();
         update["time"].as_f64().unwrap()
     }
 

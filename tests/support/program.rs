@@ -44,7 +44,7 @@ pub fn session_server(simulation_servers: &[String]) -> Builder {
         "server": "localhost", "ssl": false, "portRewrite": false, "bind": "127.0.0.1", "port": port, "debug": true,
         "simulationServers": simulation_servers, "loadRefresh": 0.1,
     });
-    Builder::new(env!("CARGO_BIN_EXE_session-server"), "session-server", config, port)
+    Builder::new(env!("CARGO_BIN_EXE_session-server"), config, port)
 }
 
 /// A simulation server with so many places, which starts this program as Webots and allows worlds of
@@ -59,8 +59,7 @@ pub fn simulation_server(webots: &Path, repositories: &Path, places: u16) -> Bui
         // The stand-in for Webots may be built in somebody's home.
         "environment": ["DEMO_SIMULATOR_BIND"], "sandbox": {"readable": [env!("CARGO_BIN_EXE_demo-simulator")]},
     });
-    Builder::new(env!("CARGO_BIN_EXE_simulation-server"), "simulation-server", config, port)
-        .env("DEMO_SIMULATOR_BIND", "127.0.0.1")
+    Builder::new(env!("CARGO_BIN_EXE_simulation-server"), config, port).env("DEMO_SIMULATOR_BIND", "127.0.0.1")
 }
 
 /// A simulation server with a forge of its own that has `lab/arm`, and with the demo simulator.
@@ -88,8 +87,8 @@ pub fn server_that_is(state: &str) -> (Builder, Option<TcpListener>) {
 }
 
 impl Builder {
-    fn new(program: &'static str, name: &'static str, config: Value, port: u16) -> Self {
-        let environment = Vec::new();
+    fn new(program: &'static str, config: Value, port: u16) -> Self {
+        let (name, environment) = (program.rsplit('/').next().unwrap(), Vec::new());
         Self { program, name, config, port, environment, folder: None, before: None, parts: None }
     }
 
@@ -208,11 +207,6 @@ impl Server {
     /// The folder of its cache.
     pub fn cache(&self) -> PathBuf {
         self.folder.join("cache")
-    }
-
-    /// The folder of all that it writes.
-    pub fn folder(&self) -> &Path {
-        &self.folder
     }
 
     /// `HOST:PORT`.
