@@ -10,12 +10,8 @@ use tokio::io::{AsyncBufReadExt, BufReader};
 use tokio::process::{Child, Command};
 
 use crate::support::authority::Authority;
-use crate::support::git::{Forge, arm};
-use crate::support::ports;
-use crate::support::program::{Server, session_server, simulation_server};
 use crate::support::stand_in::{Script, StandIn};
-use crate::support::webots::Webots;
-use crate::support::{SOON, until};
+use crate::support::{SOON, Server, arm, demo_server, ports, session_server, until};
 
 /// How long a rehearsal may take.
 const BOUND: Duration = Duration::from_secs(90);
@@ -24,43 +20,50 @@ const BOUND: Duration = Duration::from_secs(90);
 struct Fleet {
     session: Server,
     simulation: Server,
-    _stand_ins: (Forge, Webots),
 }
 
 impl Fleet {
     async fn with_places(places: u16) -> Self {
-        let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-        let simulation = simulation_server(&webots.path(), forge.path(), places).start().await;
+        let simulation = demo_server(places).start().await;
         // What else runs on this machine must not close the fleet.
         let session = session_server(&[simulation.address()]).set("loadThreshold", 1000).start().await;
-        Self { session, simulation, _stand_ins: (forge, webots) }
+        Self { session, simulation }
     }
 
-    async fn rehearse(&self, arguments: &[&str]) -> Output {
+    async fn rehearse(&self, arguments: &[&str]) -> Said {
         rehearse(&self.session.url(""), arguments).await
     }
 }
 
-async fn rehearse(fleet: &str, arguments: &[&str]) -> Output {
-    output(command(fleet, &arm()).args(arguments)).await
+/// How a rehearsal has ended, and what it has printed.
+#[derive(Debug)]
+struct Said {
+    code: Option<i32>,
+    out: String,
+    err: String,
 }
 
-fn command(fleet: &str, world: &str) -> Command {
+async fn rehearse(fleet: &str, arguments: &[&str]) -> Said {
+    said(command(fleet).args(arguments)).await
+}
+
+fn command(fleet: &str) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_rehearse"));
-    command.arg(fleet).args(["--world", world]).stdin(Stdio::null()).kill_on_drop(true);
+    command.arg(fleet).args(["--world", &arm()]).stdin(Stdio::null()).kill_on_drop(true);
     command
 }
 
-async fn output(command: &mut Command) -> Output {
-    actix_rt::time::timeout(BOUND, command.output()).await.expect("it ends").unwrap()
+async fn said(command: &mut Command) -> Said {
+    of(actix_rt::time::timeout(BOUND, command.output()).await.expect("it ends").unwrap())
+}
+
+fn of(output: Output) -> Said {
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
+    Said { code: output.status.code(), out: text(output.stdout), err: text(output.stderr) }
 }
 
 /// One client that stays for a second, whatever its pace is.
 const ONE: [&str; 8] = ["--clients", "1", "--over", "0s", "--stay", "1s", "--real-time", "0"];
-
-fn text(bytes: &[u8]) -> String {
-    String::from_utf8_lossy(bytes).into_owned()
-}
 
 #[actix_rt::test]
 async fn a_class_that_fits_is_told_so() {
@@ -68,10 +71,9 @@ async fn a_class_that_fits_is_told_so() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("class.json");
     let class = ["--clients", "3", "--over", "0s", "--stay", "5s", "--real-time", "0.1", "--expect", "3", "--json"];
-    let output = fleet.rehearse(&[&class[..], &[file.to_str().unwrap()]].concat()).await;
-    let said = text(&output.stdout);
-    assert!(output.status.success(), "{said}{}", text(&output.stderr));
-    assert!(said.contains("All 3 fit.") && said.contains(": 3 clients at once, each for 5s"), "{said}");
+    let said = fleet.rehearse(&[&class[..], &[file.to_str().unwrap()]].concat()).await;
+    assert!(said.code == Some(0) && said.out.contains("All 3 fit."), "{said:?}");
+    assert!(said.out.contains(": 3 clients at once, each for 5s"), "{said:?}");
     let report: Value = serde_json::from_str(&std::fs::read_to_string(file).unwrap()).unwrap();
     assert_eq!((&report["seats"]["given"], &report["seats"]["fit"]), (&3.into(), &3.into()), "{report}");
     let visits = report["visits"].as_array().unwrap();
@@ -86,65 +88,55 @@ async fn a_class_that_does_not_fit_is_told_why_and_time_in_the_line_counts_as_wa
     let file = folder.path().join("class.json");
     let class =
         ["--clients", "2", "--over", "1s", "--stay", "5s", "--real-time", "0.1", "--json", file.to_str().unwrap()];
-    let output = fleet.rehearse(&class).await;
+    let said = fleet.rehearse(&class).await;
     let report: Value = serde_json::from_str(&std::fs::read_to_string(&file).unwrap()).unwrap();
-    assert!(output.status.success(), "{report}");
+    assert_eq!(said.code, Some(0), "{report}");
     let waiting = report["times"].as_array().unwrap().iter().find(|row| row["step"] == "waiting").unwrap();
     assert!(waiting["worst"].as_f64().unwrap() > 1.5, "one waited until the other had left: {report}");
     // Nobody leaves soon enough for the second one.
     let stays = ["--stay", "10s", "--real-time", "0", "--patience", "5s", "--expect", "2"];
-    let output = fleet.rehearse(&[&class[..4], &stays].concat()).await;
-    let said = text(&output.stdout);
-    assert_eq!(output.status.code(), Some(1), "{said}");
-    assert!(said.contains("1 of 2"), "{said}");
+    let said = fleet.rehearse(&[&class[..4], &stays].concat()).await;
+    assert!(said.code == Some(1) && said.out.contains("1 of 2"), "{said:?}");
 }
 
 #[actix_rt::test]
 async fn a_class_that_reloads_comes_back_to_its_simulations() {
     let fleet = Fleet::with_places(4).await;
     let arguments = ["--clients", "2", "--over", "0s", "--stay", "8s", "--reload", "100", "--expect", "2"];
-    let told = fleet.rehearse(&[&arguments[..], &["--real-time", "0"]].concat()).await;
-    assert!(told.status.success(), "{}", text(&told.stdout));
+    let said = fleet.rehearse(&[&arguments[..], &["--real-time", "0"]].concat()).await;
+    assert_eq!(said.code, Some(0), "{said:?}");
     let status = fleet.simulation.status().await;
-    assert_eq!(status["instances"]["arrivals"], 2, "they began anew: {}", text(&told.stdout));
-    let refused = fleet.rehearse(&["--reload", "60", "--misbehave", "drop=41"]).await;
-    assert!(text(&refused.stderr).contains("the shares are 101 percent"), "{}", text(&refused.stderr));
+    assert_eq!(status["instances"]["arrivals"], 2, "they began anew: {said:?}");
+    let said = fleet.rehearse(&["--reload", "60", "--misbehave", "drop=41"]).await;
+    assert!(said.err.contains("the shares are 101 percent"), "{said:?}");
 }
 
 #[actix_rt::test]
 async fn the_acceptance_run_finds_the_demo_as_expected() {
     let fleet = Fleet::with_places(1).await;
-    let output = fleet.rehearse(&["--explain"]).await;
-    let said = text(&output.stdout);
-    assert!(output.status.success(), "{said}{}", text(&output.stderr));
-    assert!(said.contains("| step | at | took | expected | came | |"), "{said}");
-    assert!(said.contains("| availability |") && said.matches("| ok |").count() >= 15, "{said}");
+    let Said { code, out, err } = fleet.rehearse(&["--explain"]).await;
+    assert!(code == Some(0) && out.contains("| step | at | took | expected | came | |"), "{out}{err}");
+    assert!(out.contains("| availability |") && out.matches("| ok |").count() >= 15, "{out}");
 }
 
 #[actix_rt::test]
-async fn a_fleet_that_is_not_there_and_one_elsewhere_are_refused_in_one_line() {
-    let (_taken, port) = ports::dead_port();
-    let output = rehearse(&format!("http://127.0.0.1:{port}"), &["--clients", "1"]).await;
-    let said = text(&output.stderr);
-    assert!(output.status.code() == Some(1) && said.starts_with("error: ") && said.lines().count() == 1, "{said}");
-    // Nobody is there to agree. Nothing is sent: the address is one for documentation.
-    let output = rehearse("http://192.0.2.1:1999", &["--clients", "1"]).await;
-    let said = text(&output.stderr);
-    assert_eq!(
-        (output.status.code(), said.as_str()),
-        (Some(2), "error: nobody agreed to load http://192.0.2.1:1999/; --yes agrees\n")
-    );
-}
-
-#[actix_rt::test]
-async fn who_names_a_simulation_server_in_place_of_a_session_server_is_told_so() {
-    let fleet = Fleet::with_places(1).await;
-    for arguments in [&ONE[..], &["--explain"]] {
-        let output = rehearse(&fleet.simulation.url(""), arguments).await;
-        let said = text(&output.stderr);
-        assert_eq!(output.status.code(), Some(1), "{said}");
-        assert!(said.starts_with("error: ws://") && said.lines().count() == 1, "{said}");
-        assert!(said.ends_with(": no session server, maybe a simulation server\n"), "{said}");
+async fn a_fleet_that_is_not_there_or_elsewhere_or_only_a_part_is_refused_in_one_line() {
+    let ((_taken, port), fleet) = (ports::dead_port(), Fleet::with_places(1).await);
+    let no_session_server = (1, "error: ws://", ": no session server, maybe a simulation server\n");
+    for (url, arguments, (code, begin, end)) in [
+        (format!("http://127.0.0.1:{port}"), &ONE[..], (1, "error: ", "\n")),
+        // Nobody is there to agree. Nothing is sent: the address is one for documentation.
+        (
+            "http://192.0.2.1:1999".to_owned(),
+            &ONE[..],
+            (2, "error: nobody agreed to load http://192.0.2.1:1999/; --yes agrees\n", ""),
+        ),
+        (fleet.simulation.url(""), &ONE[..], no_session_server),
+        (fleet.simulation.url(""), &["--explain"], no_session_server),
+    ] {
+        let said = rehearse(&url, arguments).await;
+        assert!(said.code == Some(code) && said.err.lines().count() == 1, "{said:?}");
+        assert!(said.err.starts_with(begin) && said.err.ends_with(end), "{said:?}");
     }
 }
 
@@ -176,10 +168,9 @@ async fn the_verdict_says_why_a_class_does_not_fit() {
         (Script::default(), [&ONE[..], &["--misbehave", "vanish=100"]].concat(), unseen),
     ] {
         let fleet = StandIn::start(script).await;
-        let output = rehearse(&format!("http://{}", fleet.address), &arguments).await;
-        let said = text(&output.stdout);
-        assert_eq!(output.status.code(), Some(1), "{said}");
-        assert!(words.iter().all(|words| said.contains(&words.replace("{}", &fleet.address))), "{words:?}: {said}");
+        let Said { code, out, .. } = rehearse(&format!("http://{}", fleet.address), &arguments).await;
+        assert_eq!(code, Some(1), "{out}");
+        assert!(words.iter().all(|words| out.contains(&words.replace("{}", &fleet.address))), "{words:?}: {out}");
     }
 }
 
@@ -195,47 +186,41 @@ async fn a_fleet_behind_https_is_rehearsed_where_its_certificate_is_trusted() {
     let url = format!("https://{}", fleet.address);
     // Long enough for a look at the load, which comes each second.
     let class = ["--clients", "1", "--over", "0s", "--stay", "5s", "--real-time", "0"];
-    let trusting = output(command(&url, &arm()).args(class).env("SSL_CERT_FILE", lab.file())).await;
-    let said = text(&trusting.stdout);
-    assert!(trusting.status.success() && said.contains("All 1 fit."), "{said}{}", text(&trusting.stderr));
-    assert!(said.contains(" 1 % "), "the load of the simulation server is seen: {said}");
-    let trusting_another = output(command(&url, &arm()).args(ONE).env("SSL_CERT_FILE", other.file())).await;
-    let said = text(&trusting_another.stderr);
-    assert_eq!(trusting_another.status.code(), Some(1), "{said}");
-    assert!(said.contains("its certificate is not trusted") && said.lines().count() == 1, "{said}");
+    let Said { code, out, err } = said(command(&url).args(class).env("SSL_CERT_FILE", lab.file())).await;
+    assert!(code == Some(0) && out.contains("All 1 fit."), "{out}{err}");
+    assert!(out.contains(" 1 % "), "the load of the simulation server is seen: {out}");
+    let Said { code, err, .. } = said(command(&url).args(ONE).env("SSL_CERT_FILE", other.file())).await;
+    assert!(code == Some(1) && err.contains("its certificate is not trusted") && err.lines().count() == 1, "{err}");
 }
 
 #[actix_rt::test]
 async fn who_was_too_late_for_a_place_waits_for_the_next_one_until_the_patience_ends() {
     let full = "Error: no simulation server available at the moment.";
-    let session = vec![full, full, "ws://{}"];
-    let fleet = StandIn::start(Script { session, ..Script::default() }).await;
-    let output = rehearse(&format!("http://{}", fleet.address), &ONE).await;
-    let said = text(&output.stdout);
-    assert!(said.contains("All 1 fit."), "{said}{}", text(&output.stderr));
-    assert_eq!(fleet.asked("/session").len(), 3);
-    let fleet = StandIn::start(Script { session: vec![full], ..Script::default() }).await;
-    let output = rehearse(&format!("http://{}", fleet.address), &[&ONE[..], &["--patience", "4s"]].concat()).await;
-    let said = text(&output.stdout);
-    let verdict =
-        "None fits; 1 got none: no simulation within 4s: Error: no simulation server available at the moment.";
-    assert!(said.contains(verdict) && output.status.code() == Some(1), "{said}");
-    let asked = fleet.asked("/session").len();
-    assert!((2..=5).contains(&asked), "nobody asks without a pause: {asked} times");
-    // What won't change is no reason to wait.
-    let session = vec!["Error: no simulation server accepts https://github.com/lab/arm."];
-    let fleet = StandIn::start(Script { session, ..Script::default() }).await;
-    let output = rehearse(&format!("http://{}", fleet.address), &ONE).await;
-    assert!(text(&output.stdout).contains("1 got none: Error: no simulation server accepts"));
-    assert_eq!(fleet.asked("/session").len(), 1);
+    let never = "Error: no simulation server accepts https://github.com/lab/arm.";
+    let given_up = format!("None fits; 1 got none: no simulation within 4s: {full}");
+    for (session, verdict, code, asked) in [
+        (vec![full, full, "ws://{}"], "All 1 fit.", 0, 3..=3),
+        // Nobody asks without a pause.
+        (vec![full], given_up.as_str(), 1, 2..=5),
+        // What won't change is no reason to wait.
+        (vec![never], "1 got none: Error: no simulation server accepts", 1, 1..=1),
+    ] {
+        let fleet = StandIn::start(Script { session, ..Script::default() }).await;
+        let patience = if code == 0 { "60s" } else { "4s" };
+        let arguments = [&ONE[..], &["--patience", patience]].concat();
+        let said = rehearse(&format!("http://{}", fleet.address), &arguments).await;
+        assert!(said.code == Some(code) && said.out.contains(verdict), "{said:?}");
+        let times = fleet.asked("/session").len();
+        assert!(asked.contains(&times), "it was asked {times} times");
+    }
 }
 
 /// What the acceptance run prints of a fleet that speaks so.
 async fn explained(script: Script) -> String {
     let fleet = StandIn::start(script).await;
-    let output = rehearse(&format!("http://{}", fleet.address), &["--explain", "--patience", "6s"]).await;
-    assert_eq!(output.status.code(), Some(1), "{}", text(&output.stderr));
-    text(&output.stdout)
+    let said = rehearse(&format!("http://{}", fleet.address), &["--explain", "--patience", "6s"]).await;
+    assert_eq!(said.code, Some(1), "{said:?}");
+    said.out
 }
 
 #[actix_rt::test]
@@ -260,7 +245,7 @@ async fn the_acceptance_run_ends_at_a_step_that_never_does_or_fails_and_says_whe
 #[actix_rt::test]
 async fn the_acceptance_run_prints_each_step_as_it_is_known() {
     let fleet = StandIn::start(Script { webots: vec!["world:a"], ..Script::default() }).await;
-    let mut command = command(&format!("http://{}", fleet.address), &arm());
+    let mut command = command(&format!("http://{}", fleet.address));
     let mut child = command.args(["--explain", "--patience", "50s"]).stdout(Stdio::piped()).spawn().unwrap();
     let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
     let reading = async { while !lines.next_line().await.unwrap().unwrap().starts_with("| stream |") {} };
@@ -279,9 +264,9 @@ async fn simulation_servers_elsewhere_behind_a_session_server_here_are_not_loade
     let refusal =
         format!("error: nobody agreed to load ws://192.0.2.1:2000, where {url}/ sends its clients; --yes agrees\n");
     for arguments in [&["--clients", "3", "--over", "0s"][..], &["--explain"]] {
-        let output = rehearse(&url, arguments).await;
-        assert_eq!((output.status.code(), text(&output.stderr)), (Some(2), refusal.clone()), "{arguments:?}");
-        assert!(!text(&output.stdout).contains("as expected"), "nothing was measured");
+        let Said { code, out, err } = rehearse(&url, arguments).await;
+        assert_eq!((code, &err), (Some(2), &refusal), "{arguments:?}");
+        assert!(!out.contains("as expected"), "nothing was measured");
     }
     assert_eq!(fleet.asked("/client"), [""; 0]);
 }
@@ -299,7 +284,7 @@ async fn interrupt(by: Signal) {
     let fleet = StandIn::start(Script::default()).await;
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("class.json");
-    let mut command = command(&format!("http://{}", fleet.address), &arm());
+    let mut command = command(&format!("http://{}", fleet.address));
     command.args(["--clients", "2", "--over", "10m", "--stay", "10m", "--json"]).arg(&file);
     let child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     until("the first client connects to Webots", async || !fleet.asked("/webots").is_empty()).await;
@@ -307,10 +292,9 @@ async fn interrupt(by: Signal) {
     let before = fleet.asked("/load").len();
     until("time passes", async || fleet.asked("/load").len() > before + 2).await;
     signal(&child, by);
-    let output = actix_rt::time::timeout(SOON, child.wait_with_output()).await.expect("it ends").unwrap();
-    let said = text(&output.stdout);
-    assert_eq!(output.status.code(), Some(130), "{said}{}", text(&output.stderr));
-    assert!(said.contains(", interrupted\n") && said.contains("| ran, their end unseen "), "{said}");
+    let said = of(actix_rt::time::timeout(SOON, child.wait_with_output()).await.expect("it ends").unwrap());
+    assert_eq!(said.code, Some(130), "{said:?}");
+    assert!(said.out.contains(", interrupted\n") && said.out.contains("| ran, their end unseen "), "{said:?}");
     let report: Value = serde_json::from_str(&std::fs::read_to_string(file).unwrap()).unwrap();
     assert_eq!((&report["seats"]["asked"], &report["seats"]["unseen"]), (&1.into(), &1.into()), "{report}");
     assert!(report["interrupted"] == true && !report["visits"][0]["pace"].as_array().unwrap().is_empty(), "{report}");
@@ -318,13 +302,11 @@ async fn interrupt(by: Signal) {
 
 #[actix_rt::test]
 async fn a_time_that_is_too_long_is_refused() {
-    let fleet = StandIn::start(Script::default()).await;
+    let fleet = "http://127.0.0.1:1";
     for name in ["--over", "--stay", "--patience", "--soak"] {
         for time in ["500000000000y", "31d"] {
-            let output = rehearse(&format!("http://{}", fleet.address), &[name, time]).await;
-            let said = text(&output.stderr);
-            assert_eq!(output.status.code(), Some(2), "{said}");
-            assert!(said.contains(name) && said.contains("allowed is up to 30d"), "{said}");
+            let Said { code, err, .. } = rehearse(fleet, &[name, time]).await;
+            assert!(code == Some(2) && err.contains(name) && err.contains("allowed is up to 30d"), "{err}");
         }
     }
 }
@@ -332,33 +314,23 @@ async fn a_time_that_is_too_long_is_refused() {
 #[actix_rt::test]
 async fn what_can_not_be_done_is_told_before_anything_is_begun() {
     let told = async |command: &mut Command| {
-        let output = output(command).await;
-        assert_eq!(output.status.code(), Some(2), "{output:?}");
-        String::from_utf8(output.stderr).unwrap()
+        let said = said(command).await;
+        assert_eq!(said.code, Some(2), "{said:?}");
+        said.err
     };
     // Nobody is there: whoever began would say so.
     let fleet = "http://127.0.0.1:1";
-    let error = told(command(fleet, &arm()).args(["--json", "/nowhere/a.json"])).await;
+    let error = told(command(fleet).args(["--json", "/nowhere/a.json"])).await;
     assert!(error.starts_with("error: /nowhere/a.json can't be written: "), "{error}");
-    let error = told(command(fleet, &arm()).args(["--explain", "--expect", "3"])).await;
-    assert!(error.contains("'--explain' cannot be used with '--expect <CLIENTS>'"), "{error}");
-    for (name, value) in [("--stay", "2s"), ("--real-time", "0.5")] {
-        let error = told(command(fleet, &arm()).args(["--explain", name, value])).await;
+    for (name, value) in [("--expect", "3"), ("--stay", "2s"), ("--real-time", "0.5")] {
+        let error = told(command(fleet).args(["--explain", name, value])).await;
         assert!(error.contains(&format!("'--explain' cannot be used with '{name} ")), "{error}");
     }
-    let error = told(&mut command("http://me:secret@127.0.0.1:1", &arm())).await;
+    let error = told(&mut command("http://me:secret@127.0.0.1:1")).await;
     assert!(error.contains("a user name or a password") && !error.contains("secret"), "{error}");
-    let mut limited = Command::new("sh");
-    limited.args([
-        "-c",
-        "ulimit -n 100 && exec \"$@\"",
-        "sh",
-        env!("CARGO_BIN_EXE_rehearse"),
-        fleet,
-        "--world",
-        &arm(),
-    ]);
-    let error = told(limited.args(["--clients", "50"])).await;
+    let mut limited = Command::new("prlimit");
+    limited.args(["--nofile=100", env!("CARGO_BIN_EXE_rehearse"), fleet, "--world", &arm(), "--clients", "50"]);
+    let error = told(&mut limited).await;
     assert_eq!(error, "error: 50 clients need 264 open files, and the system allows 100 (ulimit -Hn)\n");
 }
 
@@ -381,8 +353,8 @@ async fn no_text_of_a_server_steers_the_terminal_or_fills_it() {
         let stand_in = StandIn::start(script).await;
         let fleet = format!("http://{}", stand_in.address);
         for more in [&ONE[..], &["--explain"]] {
-            let output = rehearse(&fleet, &[more, &["--patience", "5s"]].concat()).await;
-            let said = text(&output.stdout) + &text(&output.stderr);
+            let Said { out, err, .. } = rehearse(&fleet, &[more, &["--patience", "5s"]].concat()).await;
+            let said = out + &err;
             assert!(!said.contains(['\u{1b}', '\u{7}', '\r', '\u{202e}']), "{said:?}");
             assert!(!said.contains("\nAll 3 fit."), "{said}");
             assert!(said.len() < 20_000, "{} bytes", said.len());

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use crate::Verdict;
 use crate::support::client::Client;
-use crate::support::git::{Forge, arm};
+use crate::support::git::arm;
 use crate::support::program::Server;
 
 #[path = "../../tests/containers/daemon.rs"]
@@ -23,14 +23,14 @@ const PATIENCE: Duration = Duration::from_secs(300);
 /// Compares so many starts at once, in turns, of which the medians count.
 pub async fn measure(verdict: &mut Verdict, sizes: &[u16], rounds: usize) {
     let Some(_docker) = daemon::docker().await else { return };
-    let (forge, most) = (Forge::with_arm(), *sizes.iter().max().unwrap());
-    let server = daemon::server(forge.path(), most)
+    let most = *sizes.iter().max().unwrap();
+    let server = daemon::server(most)
         .set("maxPlacesPerAddress", most)
         .set("timing", serde_json::json!({ "launch": 300, "silence": 600 }))
         .start()
         .await;
     let mut first = Client::start(&server, &arm()).await;
-    first.patiently("webots:", PATIENCE).await;
+    first.within("webots:", PATIENCE).await;
     let project = ByHand::of(&server, most);
     first.leave().await;
     gone(&server).await;
@@ -59,7 +59,7 @@ async fn started(server: &Server, count: u16) -> Duration {
         client.send(&serde_json::json!({ "start": { "url": arm() } }).to_string()).await;
     }
     for client in &mut clients {
-        client.patiently("webots:", PATIENCE).await;
+        client.within("webots:", PATIENCE).await;
     }
     let time = begin.elapsed();
     drop(clients);

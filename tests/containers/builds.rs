@@ -1,38 +1,24 @@
 //! Images that are built: a project's own Dockerfile, what it may not do, and what happens when a build fails.
 
-use std::time::Duration;
+use webots_fleet::simulation::container::ResourceOwner;
 
-use super::daemon::{ask, containers, docker, of_service, server};
+use super::daemon::{ask, containers, docker, dockerfile, of_service, running, server, server_built, server_with};
 use super::image::NAME;
-use crate::support::client::Client;
-use crate::support::git::{Forge, WORLD, arm, world};
-use crate::support::until;
-
-/// How long a build may take on a busy machine.
-const BUILT: Duration = Duration::from_secs(90);
-
-fn with(dockerfile: &str) -> Forge {
-    let forge = Forge::with_arm();
-    forge.commit("lab/arm", "main", &[("Dockerfile", dockerfile)]);
-    forge
-}
+use crate::support::{Client, WORLD, arm, is_told, until};
 
 #[actix_rt::test]
 async fn a_projects_own_dockerfile_is_built_once_for_all_who_want_it_and_what_it_makes_is_there() {
     let Some(_docker) = docker().await else { return };
-    let forge = with(&format!(
+    let dockerfile = format!(
         "FROM {NAME}\nARG PROJECT_PATH\nRUN mkdir -p $PROJECT_PATH\nCOPY . $PROJECT_PATH\nRUN sleep 2 && cp \
          $PROJECT_PATH/controllers/c/c.py $PROJECT_PATH/controllers/c/built\nHEALTHCHECK --interval=1ms CMD true\n"
-    ));
-    forge.commit(
-        "lab/arm",
-        "main",
-        &[("docker-compose.yml", "services: {webots: {privileged: true}}\n"), (".env", "PORT=1\n")],
     );
-    let server = server(forge.path(), 2).start().await;
+    let compose = ("docker-compose.yml", "services: {webots: {privileged: true}}\n");
+    let server = server(2).start().await;
+    server.forge().commit("lab/arm", "main", &[("Dockerfile", &dockerfile), compose, (".env", "PORT=1\n")]);
     let (mut one, mut two) = (Client::start(&server, &arm()).await, Client::start(&server, &arm()).await);
     for client in [&mut one, &mut two] {
-        client.patiently("webots:", BUILT).await;
+        client.patiently("webots:").await;
         let heard = client.heard.join("\n");
         for words in [
             "loading: Step 5/9 : COPY . $PROJECT_PATH",
@@ -43,7 +29,7 @@ async fn a_projects_own_dockerfile_is_built_once_for_all_who_want_it_and_what_it
         }
     }
     let images = ask(&["image", "ls", "--format", "{{.Repository}}:{{.Tag}}"]);
-    let owner = webots_fleet::simulation::container::ResourceOwner::of(&server.cache());
+    let owner = ResourceOwner::of(&server.cache());
     let mine = |name: &&str| name.starts_with(&format!("webots-fleet/{}:", owner.0));
     assert_eq!(images.lines().filter(mine).count(), 1, "{images}");
     for container in of_service(&server, "webots") {
@@ -58,7 +44,7 @@ async fn a_projects_own_dockerfile_is_built_once_for_all_who_want_it_and_what_it
     one.leave().await;
     until("one is gone", async || containers(&server).len() == 1).await;
     let mut next = Client::start(&server, &arm()).await;
-    next.patiently("webots:", BUILT).await;
+    next.patiently("webots:").await;
     assert!(!next.heard.iter().any(|text| text.contains("COPY .")), "{:?}", next.heard);
 }
 
@@ -66,12 +52,12 @@ async fn a_projects_own_dockerfile_is_built_once_for_all_who_want_it_and_what_it
 async fn an_image_is_built_again_when_the_one_below_it_has_changed() {
     let Some(_docker) = docker().await else { return };
     const BASE: &str = "webots-fleet.test/base";
-    let forge = with(&format!("FROM {BASE}\nCOPY . /usr/local/webots-project\n"));
-    let server = server(forge.path(), 1).start().await;
+    let dockerfile = format!("FROM {BASE}\nCOPY . /usr/local/webots-project\n");
+    let server = server_with(&[("Dockerfile", &dockerfile)]).start().await;
     for version in ["one", "two"] {
         super::daemon::build_from(&format!("FROM {NAME}\nRUN echo {version} >/usr/local/version\n"), BASE);
         let mut client = Client::start(&server, &arm()).await;
-        client.patiently("webots:", BUILT).await;
+        client.patiently("webots:").await;
         assert_eq!(ask(&["exec", &of_service(&server, "webots")[0], "cat", "/usr/local/version"]), version);
         client.leave().await;
         until("its container is gone", async || containers(&server).is_empty()).await;
@@ -81,11 +67,7 @@ async fn an_image_is_built_again_when_the_one_below_it_has_changed() {
 #[actix_rt::test]
 async fn a_makefile_is_run_in_the_default_image() {
     let Some(_docker) = docker().await else { return };
-    let forge = Forge::with_arm();
-    forge.commit("lab/arm", "main", &[("Makefile", "all:\n\tcp controllers/c/c.py made\n")]);
-    let server = server(forge.path(), 1).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.patiently("webots:", BUILT).await;
+    let (server, _client) = running(server_with(&[("Makefile", "all:\n\tcp controllers/c/c.py made\n")])).await;
     let made = ask(&["exec", &of_service(&server, "webots")[0], "cat", "/usr/local/webots-project/made"]);
     assert_eq!(made, "print('original')");
 }
@@ -95,32 +77,25 @@ async fn what_can_not_be_built_is_told_in_words_and_leaves_nothing() {
     let Some(_docker) = docker().await else { return };
     let table = [
         (
-            format!("FROM {NAME}\nCOPY . /usr/local/webots-project\nRUN echo 'gcc: not found' && exit 3\n"),
-            "The image of this project can't be built: The command 'sh -c echo 'gcc: not found' ‹?",
+            dockerfile("RUN echo 'gcc: not found' && exit 3"),
+            "The image of this project can't be built: The command 'sh -c echo 'gcc: not found'",
         ),
         ("FROM webots-fleet.test/nothing:1\n".to_owned(), "webots-fleet.test/nothing:1"),
         (format!("FROM {NAME}\nADD http://127.0.0.1/secret /x\n"), "line 2, `ADD http://127.0.0.1/secret x`: ADD may"),
         (format!("FROM {NAME}\n"), "The image of this project has no folder webots-project"),
-        (format!("FROM {NAME}\nCOPY . /usr/local/webots-project\nVOLUME /data\n"), "line 3, `VOLUME data`: a volume"),
+        (dockerfile("VOLUME /data"), "line 3, `VOLUME data`: a volume"),
         (
             "FROM webots-fleet.test/volume\nCOPY . /usr/local/webots-project\n".to_owned(),
             "The image that it begins with has `VOLUME",
         ),
-        (
-            format!("FROM {NAME}\nCOPY . /usr/local/webots-project\nRUN rm -r /usr/local/webots-project/worlds\n"),
-            "has no worlds/a.wbt",
-        ),
+        (dockerfile("RUN rm -r /usr/local/webots-project/worlds"), "has no worlds/a.wbt"),
         ("no Dockerfile at all\n".to_owned(), "can't be built"),
     ];
     super::daemon::build_from(&format!("FROM {NAME}\nVOLUME [\"/a:b\"]\n"), "webots-fleet.test/volume");
-    let forge = Forge::with_arm();
-    let server = server(forge.path(), 1).start().await;
+    let server = server(1).start().await;
     for (dockerfile, words) in table {
-        forge.commit("lab/arm", "main", &[("Dockerfile", &dockerfile)]);
-        let mut client = Client::start(&server, &arm()).await;
-        let told = client.patiently("loading: Error:", BUILT).await;
-        let words = words.trim_end_matches(" ‹?");
-        assert!(told.contains(words), "{told:?} does not have {words:?}; heard {:#?}", client.heard);
+        server.forge().commit("lab/arm", "main", &[("Dockerfile", &dockerfile)]);
+        is_told(&server, &arm(), words).await;
         until("nothing is left", async || containers(&server).is_empty()).await;
     }
 }
@@ -128,101 +103,87 @@ async fn what_can_not_be_built_is_told_in_words_and_leaves_nothing() {
 #[actix_rt::test]
 async fn a_version_without_an_image_is_told_in_words() {
     let Some(_docker) = docker().await else { return };
-    let forge = Forge::with_arm();
-    forge.commit("lab/old", "main", &[("worlds/a.wbt", &WORLD.replace("R2025a", "R2022b"))]);
     // A registry that says at once that it is not there.
-    let server = server(forge.path(), 1)
-        .set("container", serde_json::json!({"image": "127.0.0.1:1/webots:{version}"}))
-        .start()
-        .await;
-    let told = Client::start(&server, &world("lab/old", "main", "worlds/a.wbt"))
-        .await
-        .patiently("loading: Error:", BUILT)
-        .await;
-    assert!(told.contains("127.0.0.1:1/webots:R2022b"), "{told}");
+    let image = serde_json::json!({"image": "127.0.0.1:1/webots:{version}"});
+    let server = server_with(&[("worlds/a.wbt", &WORLD.replace("R2025a", "R2022b"))]).set("container", image);
+    is_told(&server.start().await, &arm(), "127.0.0.1:1/webots:R2022b").await;
 }
 
 #[actix_rt::test]
 async fn a_client_that_leaves_in_the_middle_of_a_build_ends_it() {
     let Some(_docker) = docker().await else { return };
-    let forge = with(&format!("FROM {NAME}\nLABEL test.long=yes\nRUN sleep 1000\n"));
-    let server = server(forge.path(), 1).start().await;
+    let long = format!("FROM {NAME}\nLABEL test.long=yes\nRUN sleep 1000\n");
+    let server = server_with(&[("Dockerfile", &long)]).start().await;
     let mut client = Client::start(&server, &arm()).await;
-    client.patiently("loading: Step 4/6 : RUN sleep 1000", BUILT).await;
+    client.patiently("loading: Step 4/6 : RUN sleep 1000").await;
     let builds = async || ask(&["ps", "--all", "--quiet", "--filter", "label=test.long=yes"]).lines().count();
     until("it is built", async || builds().await == 1).await;
     client.leave().await;
     until("the build is gone", async || builds().await == 0).await;
     // The place is free again.
-    forge.commit("lab/arm", "main", &[("Dockerfile", &format!("FROM {NAME}\nCOPY . /usr/local/webots-project\n"))]);
-    Client::start(&server, &arm()).await.patiently("webots:", BUILT).await;
+    server.forge().commit("lab/arm", "main", &[("Dockerfile", &dockerfile(""))]);
+    Client::start(&server, &arm()).await.patiently("webots:").await;
 }
 
 #[actix_rt::test]
 async fn a_build_that_takes_too_long_is_ended_and_told() {
     let Some(_docker) = docker().await else { return };
-    let forge = with(&format!("FROM {NAME}\nRUN sleep 1000\n"));
-    let server = server(forge.path(), 1).set("timing.build", 3).start().await;
-    let told = Client::start(&server, &arm()).await.patiently("loading: Error:", BUILT).await;
-    assert!(told.contains("timing.build"), "{told}");
+    is_told(&server_built("RUN sleep 1000").set("timing.build", 3).start().await, &arm(), "timing.build").await;
 }
 
 #[actix_rt::test]
 async fn images_of_ours_that_are_old_are_removed_and_no_others() {
     let Some(_docker) = docker().await else { return };
-    let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
-    std::fs::create_dir(folder.path().join("cache")).unwrap();
-    let owner = webots_fleet::simulation::container::ResourceOwner::of(&folder.path().join("cache"));
-    let names = [("old", owner.0.as_str()), ("others", "000000000000"), ("running", owner.0.as_str())];
-    for (tag, owner) in names {
-        load(folder.path(), &format!("webots-fleet.test/{tag}:1"), owner, "2020-01-01T00:00:00Z");
-    }
-    let label = "com.docker.compose.project=webots-fleet.test";
-    let running = ask(&["create", "--label", label, "--network", "none", "webots-fleet.test/running:1", "true"]);
-    let is_there = |tag: &str| !ask(&["image", "ls", "--quiet", &format!("webots-fleet.test/{tag}:1")]).is_empty();
-    assert!(names.iter().all(|(tag, _)| is_there(tag)));
-    let server = server(forge.path(), 1).folder(folder.path()).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.patiently("webots:", BUILT).await;
+    let (folder, owner, used) = images(&[("old", true), ("others", false), ("running", true)], "running", "-6 years");
+    let (_server, client) = running(server(1).folder(folder.path())).await;
     // It is looked for what nobody needs when a simulation has ended.
     client.leave().await;
     until("the old one is gone", async || !is_there("old")).await;
     assert!(is_there("others") && is_there("running"));
-    assert_eq!(ask(&["image", "ls", "--quiet", &format!("webots-fleet/{}", owner.0)]).lines().count(), 1);
-    ask(&["rm", &running]);
+    assert_eq!(ask(&["image", "ls", "--quiet", &format!("webots-fleet/{owner}")]).lines().count(), 1);
+    ask(&["rm", &used]);
 }
 
 #[actix_rt::test]
 async fn a_full_disk_is_freed_of_images_that_no_container_uses() {
     let Some(_docker) = docker().await else { return };
-    let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
-    std::fs::create_dir(folder.path().join("cache")).unwrap();
-    let owner = webots_fleet::simulation::container::ResourceOwner::of(&folder.path().join("cache"));
-    let names = [("unused", owner.0.as_str()), ("of-others", "000000000000"), ("used", owner.0.as_str())];
-    let hours = |count: i64| format!("-{count} hours");
-    for (tag, owner) in names {
-        load(folder.path(), &format!("webots-fleet.test/{tag}:1"), owner, &created(&hours(2)));
-    }
-    load(folder.path(), "webots-fleet.test/new:1", owner.0.as_str(), &created(&hours(0)));
-    let label = "com.docker.compose.project=webots-fleet.test";
-    let used = ask(&["create", "--label", label, "--network", "none", "webots-fleet.test/used:1", "true"]);
-    let is_there = |tag: &str| !ask(&["image", "ls", "--quiet", &format!("webots-fleet.test/{tag}:1")]).is_empty();
+    let (folder, owner, used) = images(&[("unused", true), ("of-others", false), ("used", true)], "used", "-2 hours");
+    load(folder.path(), "new", &owner, "now");
     // No disk has so much room.
-    let full = server(forge.path(), 1).folder(folder.path()).set("diskReserve", 100_000_000);
+    let full = server(1).folder(folder.path()).set("diskReserve", 100_000_000);
     let _server = full.start().await;
     until("the one that nobody uses is gone", async || !is_there("unused")).await;
     assert!(["of-others", "used", "new"].iter().all(|tag| is_there(tag)));
     ask(&["rm", &used]);
 }
 
-/// A time as images have it, as `date` reads it.
-fn created(when: &str) -> String {
-    let output = std::process::Command::new("date").args(["--utc", "+%FT%TZ", "--date", when]).output().unwrap();
-    String::from_utf8(output.stdout).unwrap().trim().to_owned()
+/// Images that the server of a folder, or another, has built at this time, and a container of one of them. Returns the folder,
+/// the server's name as an owner, and the container.
+fn images(tags: &[(&str, bool)], used: &str, created: &str) -> (tempfile::TempDir, String, String) {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::create_dir(folder.path().join("cache")).unwrap();
+    let owner = ResourceOwner::of(&folder.path().join("cache")).0;
+    for (tag, is_own) in tags {
+        load(folder.path(), tag, if *is_own { &owner } else { "000000000000" }, created);
+        assert!(is_there(tag));
+    }
+    let label = "com.docker.compose.project=webots-fleet.test";
+    let container = ask(&["create", "--label", label, "--network", "none", &image(used), "true"]);
+    (folder, owner, container)
 }
 
-/// Gives the daemon an image that a server has built at this time.
-fn load(folder: &std::path::Path, name: &str, owner: &str, created: &str) {
+fn image(tag: &str) -> String {
+    format!("webots-fleet.test/{tag}:1")
+}
+
+fn is_there(tag: &str) -> bool {
+    !ask(&["image", "ls", "--quiet", &image(tag)]).is_empty()
+}
+
+/// Gives the daemon an image that a server has built at this time, as `date` reads it.
+fn load(folder: &std::path::Path, tag: &str, owner: &str, created: &str) {
+    let time = std::process::Command::new("date").args(["--utc", "+%FT%TZ", "--date", created]).output().unwrap();
+    let (name, created) = (image(tag), String::from_utf8(time.stdout).unwrap().trim().to_owned());
     let files = folder.join("image");
     std::fs::create_dir_all(&files).unwrap();
     std::fs::write(files.join("layer.tar"), [0; 1024]).unwrap();

@@ -4,25 +4,14 @@
 use std::io::Write;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
 use tokio::sync::{RwLock, RwLockReadGuard, RwLockWriteGuard};
 
 use super::image;
-use crate::support::SOON;
-use crate::support::program::{Builder, simulation_server};
-
-/// The daemon, for a test that shares it with others.
-pub struct Docker {
-    _shared: RwLockReadGuard<'static, ()>,
-}
-
-/// The daemon, for a test that has it alone and may stop it.
-pub struct Alone {
-    _alone: RwLockWriteGuard<'static, ()>,
-}
+use crate::support::{Builder, Client, SOON, Server, arm, demo_server};
 
 struct Daemon {
     folder: PathBuf,
@@ -38,19 +27,15 @@ pub const NETWORKS: u16 = 2;
 const INTERFACE: &str = "webots-fleet";
 
 /// The daemon, started by whoever asks first; nothing, and a word, where there can be none.
-pub async fn docker() -> Option<Docker> {
+pub async fn docker() -> Option<RwLockReadGuard<'static, ()>> {
     let shared = USERS.read().await;
-    started().then_some(Docker { _shared: shared })
+    DAEMON.get_or_init(start).is_some().then_some(shared)
 }
 
-/// The same, when nobody else uses it.
-pub async fn alone() -> Option<Alone> {
+/// The same, when nobody else uses it: it may be stopped.
+pub async fn alone() -> Option<RwLockWriteGuard<'static, ()>> {
     let alone = USERS.write().await;
-    started().then_some(Alone { _alone: alone })
-}
-
-fn started() -> bool {
-    DAEMON.get_or_init(start).is_some()
+    DAEMON.get_or_init(start).is_some().then_some(alone)
 }
 
 fn start() -> Option<Daemon> {
@@ -112,35 +97,15 @@ impl Daemon {
         std::thread::spawn(move || {
             let path = |name: &str| folder.join(name).display().to_string();
             let mut command = Command::new("setpriv");
-            command.args([
-                "--pdeathsig",
-                "KILL",
-                "unshare",
-                "--pid",
-                "--fork",
-                "--kill-child=KILL",
-                "--mount",
-                "--mount-proc",
-            ]);
+            command.args(["--pdeathsig", "KILL", "unshare", "--pid", "--fork", "--kill-child=KILL"]);
+            command.args(["--mount", "--mount-proc"]);
             command.args(["dockerd", "--host", &socket, "--data-root", &path("data"), "--exec-root", &path("exec")]);
-            command.args([
-                "--pidfile",
-                &path("pid"),
-                "--bridge=none",
-                "--iptables=false",
-                "--ip6tables=false",
-                "--ip-masq=false",
-                // Two halves.
-                "--default-address-pool=base=10.213.0.0/16,size=17",
-            ]);
-            command.args(options);
-            let mut child: Child = command
-                .stdin(Stdio::null())
-                .stdout(log.try_clone().unwrap())
-                .stderr(log)
-                .process_group(0)
-                .spawn()
-                .unwrap();
+            command.args(["--pidfile", &path("pid"), "--bridge=none", "--ip-masq=false"]);
+            command.args(["--iptables=false", "--ip6tables=false"]);
+            // Two halves.
+            command.arg("--default-address-pool=base=10.213.0.0/16,size=17").args(options).process_group(0);
+            let outputs = command.stdin(Stdio::null()).stdout(log.try_clone().unwrap()).stderr(log);
+            let mut child = outputs.spawn().unwrap();
             std::fs::write(folder.join("keeper"), child.id().to_string()).unwrap();
             child.wait().ok();
             std::fs::remove_file(folder.join("keeper")).ok();
@@ -174,10 +139,10 @@ pub fn open_socket() {
 pub const ORDINARY: u32 = 12345;
 
 /// Has a server, whose files are in this folder, run as an ordinary user.
-pub fn as_ordinary(server: Builder, repositories: &Path, folder: &Path) -> Builder {
+pub fn as_ordinary(server: Builder, folder: &Path) -> Builder {
     open_socket();
     let owner = format!("{ORDINARY}:{ORDINARY}");
-    for path in [repositories, folder] {
+    for path in [server.forge().path(), folder] {
         assert!(Command::new("chown").arg("-R").arg(&owner).arg(path).status().unwrap().success());
     }
     let user = format!("exec setpriv --reuid {ORDINARY} --regid {ORDINARY} --clear-groups \"$0\" \"$@\"");
@@ -218,9 +183,9 @@ pub fn ask(arguments: &[&str]) -> String {
     String::from_utf8_lossy(&output.stdout).trim().to_owned()
 }
 
-/// A simulation server with so many places that runs simulations in containers of the daemon.
-pub fn server(repositories: &Path, places: u16) -> Builder {
-    simulation_server(Path::new("/nowhere"), repositories, places)
+/// A simulation server with so many places that runs simulations in containers of the daemon. It has a forge of its own.
+pub fn server(places: u16) -> Builder {
+    demo_server(places)
         .set("isolation", "container")
         .set("webots", serde_json::Value::Null)
         // A client of a test reads nothing, not even pings, while the test waits for an image that another one needs.
@@ -229,16 +194,53 @@ pub fn server(repositories: &Path, places: u16) -> Builder {
         .env("DOCKER_CONFIG", &daemon().folder.display().to_string())
 }
 
+/// Starts a server and a client, whose simulation runs.
+pub async fn running(server: Builder) -> (Server, Client) {
+    let server = server.start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.patiently("webots:").await;
+    (server, client)
+}
+
+/// What a client is told whose simulation can't run, and the code with which its connection ends.
+pub async fn refused(server: &Server, world: &str) -> (String, Option<u16>) {
+    let mut client = Client::start(server, world).await;
+    (client.patiently("loading: Error:").await, client.closed().await)
+}
+
+/// A server with one place, whose project has these files too.
+pub fn server_with(files: &[(&str, &str)]) -> Builder {
+    let server = server(1);
+    server.forge().commit("lab/arm", "main", files);
+    server
+}
+
+/// The same with a Dockerfile: these lines come after those that copy the project.
+pub fn server_built(lines: &str) -> Builder {
+    server_with(&[("Dockerfile", &dockerfile(lines))])
+}
+
+/// The same with this script as its Webots.
+pub fn server_running(webots: &str) -> Builder {
+    let install = "RUN install /usr/local/webots-project/fake /usr/local/webots/webots";
+    server_with(&[("Dockerfile", &dockerfile(install)), ("fake", &format!("#!/bin/bash\n{webots}\n"))])
+}
+
+/// A Dockerfile that copies a project, and has these lines.
+pub fn dockerfile(lines: &str) -> String {
+    format!("FROM {}\nCOPY . /usr/local/webots-project\n{lines}\n", image::NAME)
+}
+
 /// What `--check` prints for a server's configuration.
-pub fn check(server: &crate::support::program::Server) -> String {
+pub fn check(server: &Server) -> String {
     let mut command = Command::new(env!("CARGO_BIN_EXE_simulation-server"));
-    command.arg("--check").arg(server.folder().join("config.json")).env("DOCKER_HOST", host());
+    command.arg("--check").arg(server.folder.join("config.json")).env("DOCKER_HOST", host());
     let output = command.output().unwrap();
     format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
 }
 
 /// The containers of a server, those that have ended among them.
-pub fn containers(server: &crate::support::program::Server) -> Vec<String> {
+pub fn containers(server: &Server) -> Vec<String> {
     containers_of(&prefix(server))
 }
 
@@ -249,14 +251,14 @@ pub fn containers_of(prefix: &str) -> Vec<String> {
 }
 
 /// How the names of a server's projects begin.
-pub fn prefix(server: &crate::support::program::Server) -> String {
+pub fn prefix(server: &Server) -> String {
     let owner = webots_fleet::simulation::container::ResourceOwner::of(&server.cache());
     format!("webots-fleet-{}-", owner.0)
 }
 
 /// The containers of one service of a server, as soon as there is one. What a container prints may come before Docker counts
 /// it among those that run.
-pub fn of_service(server: &crate::support::program::Server, service: &str) -> Vec<String> {
+pub fn of_service(server: &Server, service: &str) -> Vec<String> {
     let (prefix, deadline) = (prefix(server), Instant::now() + SOON);
     let filter = format!("label=com.docker.compose.service={service}");
     let format = "{{.Label \"com.docker.compose.project\"}} {{.ID}}";
@@ -272,21 +274,19 @@ pub fn of_service(server: &crate::support::program::Server, service: &str) -> Ve
     }
 }
 
-impl Alone {
-    /// Kills the daemon, and with it everything that it runs.
-    pub fn kill(&self) {
-        let keeper = daemon().folder.join("keeper");
-        let pid: i32 = std::fs::read_to_string(&keeper).unwrap().parse().unwrap();
-        nix::sys::signal::kill(nix::unistd::Pid::from_raw(pid), nix::sys::signal::Signal::SIGKILL).unwrap();
-        let deadline = Instant::now() + START;
-        while keeper.exists() {
-            assert!(Instant::now() < deadline, "the daemon is still there");
-            std::thread::sleep(Duration::from_millis(20));
-        }
+/// Kills the daemon, and with it everything that it runs.
+pub fn kill() {
+    let keeper = daemon().folder.join("keeper");
+    let pid: i32 = std::fs::read_to_string(&keeper).unwrap().parse().unwrap();
+    nix::sys::signal::kill(nix::unistd::Pid::from_raw(pid), nix::sys::signal::Signal::SIGKILL).unwrap();
+    let deadline = Instant::now() + START;
+    while keeper.exists() {
+        assert!(Instant::now() < deadline, "the daemon is still there");
+        std::thread::sleep(Duration::from_millis(20));
     }
+}
 
-    /// Starts it again, with more options.
-    pub fn start(&self, options: &'static [&str]) {
-        daemon().launch(options);
-    }
+/// Starts it again, with more options.
+pub fn start_again(options: &'static [&str]) {
+    daemon().launch(options);
 }

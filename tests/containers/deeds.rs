@@ -2,44 +2,20 @@
 
 use std::time::{Duration, Instant};
 
-use serde_json::json;
-
-use super::daemon::{ask, containers, docker, of_service, server};
+use super::daemon::{ask, containers, docker, of_service, running, server_running};
 use super::image::NAME;
-use crate::support::client::Client;
-use crate::support::git::{Forge, arm};
-use crate::support::program::{Builder, Server};
-use crate::support::until;
+use crate::support::{Builder, arm, is_told, until};
 
-/// How long a build may take on a busy machine.
-const BUILT: Duration = Duration::from_secs(90);
-
-/// A world whose Webots does this and then heartbeats.
-fn doing(script: &str) -> Forge {
-    let forge = Forge::with_arm();
-    let webots = format!("#!/bin/bash\n{script}\nwhile :; do echo .; sleep 0.2; done\n");
-    let dockerfile = format!(
-        "FROM {NAME}\nCOPY . /usr/local/webots-project\nRUN cp /usr/local/webots-project/fake /usr/local/webots/webots && chmod 755 \
-         /usr/local/webots/webots\n"
-    );
-    forge.commit("lab/arm", "main", &[("fake", &webots), ("Dockerfile", &dockerfile)]);
-    forge
-}
-
-async fn running(builder: Builder) -> (Server, Client) {
-    let server = builder.start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.patiently("webots:", BUILT).await;
-    (server, client)
+/// A server whose Webots does this and then heartbeats.
+fn doing(script: &str) -> Builder {
+    server_running(&format!("{script}\nwhile :; do echo .; sleep 0.2; done"))
 }
 
 #[actix_rt::test]
 async fn a_program_sees_its_image_and_its_project_only() {
     let Some(_docker) = docker().await else { return };
-    let forge = doing("");
     // Variables of the server's own mean nothing to compose.
-    let builder =
-        server(forge.path(), 1).env("SECRET", "xyz").env("PORT", "9").env("PROJECT", "/etc").env("BIND", "nobody");
+    let builder = doing("").env("SECRET", "xyz").env("PORT", "9").env("PROJECT", "/etc").env("BIND", "nobody");
     let (server, _client) = running(builder).await;
     let webots = &of_service(&server, "webots")[0];
     assert_eq!(ask(&["exec", webots, "cat", "/usr/local/webots-project/controllers/c/c.py"]), "print('original')");
@@ -65,18 +41,17 @@ async fn a_program_sees_its_image_and_its_project_only() {
 #[actix_rt::test]
 async fn memory_without_end_is_told_and_ended() {
     let Some(_docker) = docker().await else { return };
-    let forge = doing("sleep 1; perl -e 'my @a; push @a, \"x\" x 1000000 while 1' & wait $!; exit 137");
-    let server = server(forge.path(), 1).set("limits", json!({ "memory": 64 })).start().await;
-    let told = Client::start(&server, &arm()).await.patiently("loading: Error:", BUILT).await;
-    assert!(told.contains("limits.memory"), "{told}");
+    let server = doing("sleep 1; perl -e 'my @a; push @a, \"x\" x 1000000 while 1' & wait $!; exit 137");
+    let server = server.set("limits.memory", 64).start().await;
+    is_told(&server, &arm(), "limits.memory").await;
     until("it is gone", async || containers(&server).is_empty()).await;
 }
 
 #[actix_rt::test]
 async fn forks_without_end_stay_few_and_end_with_the_client() {
     let Some(_docker) = docker().await else { return };
-    let forge = doing("(while :; do sleep 1000 & done) 2>/dev/null &");
-    let (server, client) = running(server(forge.path(), 1).set("limits", json!({ "processes": 60 }))).await;
+    let server = doing("(while :; do sleep 1000 & done) 2>/dev/null &").set("limits.processes", 60);
+    let (server, client) = running(server).await;
     let webots = of_service(&server, "webots")[0].clone();
     let count = || ask(&["top", &webots]).lines().count();
     until("there are as many as there may be", async || count() >= 50).await;
@@ -88,17 +63,16 @@ async fn forks_without_end_stay_few_and_end_with_the_client() {
 #[actix_rt::test]
 async fn what_fills_the_project_is_told_and_ended() {
     let Some(_docker) = docker().await else { return };
-    let forge = doing("(sleep 1; dd if=/dev/zero of=/usr/local/webots-project/big bs=1M count=50 2>/dev/null) &");
-    let server = server(forge.path(), 1).set("limits", json!({ "disk": 20 })).start().await;
-    let told = Client::start(&server, &arm()).await.patiently("loading: Error:", BUILT).await;
-    assert!(told.contains("limits.disk"), "{told}");
+    let server = doing("(sleep 1; dd if=/dev/zero of=/usr/local/webots-project/big bs=1M count=50 2>/dev/null) &");
+    let server = server.set("limits.disk", 20).start().await;
+    is_told(&server, &arm(), "limits.disk").await;
 }
 
 #[actix_rt::test]
 async fn prints_without_end_are_read_at_their_pace() {
     let Some(_docker) = docker().await else { return };
-    let forge = doing("(while :; do echo xxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxx; done) &");
-    let (server, client) = running(server(forge.path(), 1).set("limits", json!({ "output": 64 }))).await;
+    let server = doing("(while :; do echo xxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxx; done) &");
+    let (server, client) = running(server.set("limits.output", 64)).await;
     let ticks = || {
         let stat = procfs::process::Process::new(server.pid()).unwrap().stat().unwrap();
         stat.utime + stat.stime
@@ -114,15 +88,15 @@ async fn prints_without_end_are_read_at_their_pace() {
 #[actix_rt::test]
 async fn links_in_the_project_lead_no_other_container_astray() {
     let Some(_docker) = docker().await else { return };
-    let forge = doing("");
+    // Webots replaces the participant's folder by a link to the machine's files, and is reset.
+    let server = server_running(
+        "cd /usr/local/webots-project\nrm -rf controllers\nln -s /etc controllers\nln -s /etc c\n\
+         while :; do echo .; echo reset; sleep 0.2; done",
+    );
     let yml = "dockerCompose: \"competition:webots-project/controllers/c\"\n";
     let controller = format!("FROM {NAME}\nCOPY . /usr/local/webots-project/controllers\nCMD [\"sleep\", \"1000\"]\n");
-    forge.commit("lab/arm", "main", &[("webots.yml", yml), ("controllers/Dockerfile", &controller)]);
-    // Webots replaces the participant's folder by a link to the machine's files, and is reset.
-    let webots = "#!/bin/bash\nrm -rf /usr/local/webots-project/controllers\nln -s /etc /usr/local/webots-project/controllers\nln -s \
-                  /etc /usr/local/webots-project/c\nwhile :; do echo .; echo reset; sleep 0.2; done\n";
-    forge.commit("lab/arm", "main", &[("fake", webots)]);
-    let (server, _client) = running(server(forge.path(), 1)).await;
+    server.forge().commit("lab/arm", "main", &[("webots.yml", yml), ("controllers/Dockerfile", &controller)]);
+    let (server, _client) = running(server).await;
     let controller = of_service(&server, "controller")[0].clone();
     let starts = || ask(&["inspect", "--format", "{{.State.StartedAt}}", &controller]);
     let first = starts();

@@ -1,75 +1,51 @@
 //! What a project tries in the files that are read before its simulation runs, and what odd surroundings do to that.
 
-use std::time::Duration;
-
-use serde_json::json;
-
-use super::daemon::{as_ordinary, ask, docker, of_service, server};
+use super::daemon::{as_ordinary, ask, docker, dockerfile, of_service, refused, running, server, server_built};
 use super::image::NAME;
-use crate::support::client::Client;
-use crate::support::git::{Forge, arm, world};
-use crate::support::http;
-
-/// How long a build may take on a busy machine.
-const BUILT: Duration = Duration::from_secs(90);
-
-fn with(dockerfile: &str) -> Forge {
-    let forge = Forge::with_arm();
-    forge.commit("lab/arm", "main", &[("Dockerfile", dockerfile)]);
-    forge
-}
+use crate::support::{arm, arm_at, is_told};
 
 #[actix_rt::test]
 async fn a_link_in_an_image_leads_no_build_to_files_of_the_machine() {
     let Some(_docker) = docker().await else { return };
     let outside = tempfile::tempdir().unwrap();
     std::fs::write(outside.path().join("secret"), "xyz").unwrap();
-    let forge = with(&format!(
-        "FROM {NAME}\nCOPY . /usr/local/webots-project\nRUN rm -r /usr/local/webots-project/controllers && ln -s {} \
-         /usr/local/webots-project/controllers\n",
+    let link = format!(
+        "WORKDIR /usr/local/webots-project\nRUN rm -r controllers && ln -s {} controllers",
         outside.path().display()
-    ));
+    );
     let controller = format!("FROM {NAME}\nCOPY . /stolen\nRUN cat /stolen/secret && false\n");
     let yml = "dockerCompose: \"competition:webots-project/controllers/c\"\n";
-    forge.commit("lab/arm", "main", &[("webots.yml", yml), ("controllers/Dockerfile", &controller)]);
-    let server = server(forge.path(), 1).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    let told = client.patiently("loading: Error:", BUILT).await;
-    assert!(told.contains("The project has no folder controllers"), "{told}; heard {:#?}", client.heard);
+    let server = server_built(&link);
+    server.forge().commit("lab/arm", "main", &[("webots.yml", yml), ("controllers/Dockerfile", &controller)]);
+    is_told(&server.start().await, &arm(), "The project has no folder controllers").await;
 }
 
 #[actix_rt::test]
 async fn a_build_has_no_more_memory_than_a_simulation() {
     let Some(_docker) = docker().await else { return };
     // It ends by itself, without having been stopped, at 200 MB.
-    let eats = "perl -e 'my @a; push @a, \"x\" x 1000000 for 1..200'";
-    let forge = with(&format!("FROM {NAME}\nCOPY . /usr/local/webots-project\nRUN {eats}\n"));
-    let server = server(forge.path(), 1).set("limits", json!({ "memory": 64 })).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    let told = client.patiently("loading: Error:", BUILT).await;
+    let server = server_built("RUN perl -e 'my @a; push @a, \"x\" x 1000000 for 1..200'").set("limits.memory", 64);
+    let (told, _) = refused(&server.start().await, &arm()).await;
     assert!(told.contains("can't be built") && told.contains("137"), "{told}");
 }
 
 #[actix_rt::test]
 async fn what_an_image_does_to_folders_and_devices_is_its_projects_fault() {
     let Some(_docker) = docker().await else { return };
-    let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
+    let (server, folder) = (server(1), tempfile::tempdir().unwrap());
     let replaced = |folder| (format!("rm -rf {folder} && touch {folder}"), "");
     // An ordinary user can't even copy a device out of the image.
     let device = ("mknod /usr/local/webots-project/zero c 1 5".to_owned(), "not permitted");
     let all = [replaced("/tmp"), replaced("/run"), replaced("/var/tmp"), device];
     for (branch, (line, _)) in ["a", "b", "c", "d"].into_iter().zip(&all) {
-        let dockerfile = format!("FROM {NAME}\nCOPY . /usr/local/webots-project\nRUN {line}\n");
-        forge.commit("lab/arm", branch, &[("Dockerfile", &dockerfile)]);
+        server.forge().commit("lab/arm", branch, &[("Dockerfile", &dockerfile(&format!("RUN {line}")))]);
     }
-    let server = as_ordinary(server(forge.path(), 1), forge.path(), folder.path()).start().await;
+    let server = as_ordinary(server, folder.path()).start().await;
     for (branch, (line, words)) in ["a", "b", "c", "d"].into_iter().zip(all) {
-        let mut client = Client::start(&server, &world("lab/arm", branch, "worlds/a.wbt")).await;
-        let told = client.patiently("loading: Error:", BUILT).await;
-        assert_eq!(client.closed().await, Some(1000), "{line}: {told}");
-        let status = http::get(&server.url("/status")).await.json();
-        assert_eq!(status["failedStarts"], 0, "{line}: {told}");
-        assert!(told.contains(words) && !told.contains(server.folder().to_str().unwrap()), "{line}: {told}");
+        let (told, code) = refused(&server, &arm_at(branch)).await;
+        assert_eq!(code, Some(1000), "{line}: {told}");
+        assert_eq!(server.status().await["failedStarts"], 0, "{line}: {told}");
+        assert!(told.contains(words) && !told.contains(server.folder.to_str().unwrap()), "{line}: {told}");
     }
 }
 
@@ -77,12 +53,9 @@ async fn what_an_image_does_to_folders_and_devices_is_its_projects_fault() {
 async fn a_device_that_a_dockerfile_makes_in_the_project_opens_nothing() {
     let Some(_docker) = docker().await else { return };
     // The memory of the machine, and a disk that there may be.
-    let devices = "cd /usr/local/webots-project && mknod mem c 1 1 && mknod disk b 254 0 && mknod controllers/zero c 1 5 \
+    let devices = "RUN cd /usr/local/webots-project && mknod mem c 1 1 && mknod disk b 254 0 && mknod controllers/zero c 1 5 \
                    && chmod 666 mem disk controllers/zero";
-    let forge = with(&format!("FROM {NAME}\nCOPY . /usr/local/webots-project\nRUN {devices}\n"));
-    let server = server(forge.path(), 1).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.patiently("webots:", BUILT).await;
+    let (server, _client) = running(server_built(devices)).await;
     let webots = &of_service(&server, "webots")[0];
     for device in ["mem", "disk"] {
         let read = format!("head -c 1 /usr/local/webots-project/{device} 2>&1 || true");

@@ -1,33 +1,23 @@
 //! What a project may ask for in its webots.yml: an editor, a competition; and the administrator's templates.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use super::daemon::{ORDINARY, as_ordinary, ask, check, containers, docker, of_service, server};
+use serde_json::json;
+
+use super::daemon::{
+    ORDINARY, as_ordinary, ask, check, containers, docker, of_service, running, server, server_running, server_with,
+};
 use super::image::NAME;
-use crate::support::client::Client;
-use crate::support::git::{Forge, WORLD, arm};
-use crate::support::until;
-
-/// How long a build may take on a busy machine.
-const BUILT: Duration = Duration::from_secs(90);
-
-fn port_of(address: &str) -> u16 {
-    address.rsplit(':').next().unwrap().parse().unwrap()
-}
+use crate::support::{Client, WORLD, arm, is_told, until};
 
 #[actix_rt::test]
 async fn a_project_has_an_editor_on_the_port_of_webots_plus_500() {
     let Some(_docker) = docker().await else { return };
-    let forge = Forge::with_arm();
     let yml = "publish: true\ntype: demo\ndockerCompose:theia:webots-project/controllers/c/\n";
-    forge.commit("lab/arm", "main", &[("webots.yml", yml)]);
-    let server = server(forge.path(), 1).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    let address = client.patiently("webots:", BUILT).await;
-    let told: Vec<_> =
-        client.heard.iter().filter(|text| !text.starts_with("loading:")).skip(1).take(3).cloned().collect();
+    let (server, client) = running(server_with(&[("webots.yml", yml)])).await;
+    let told: Vec<_> = client.heard.iter().filter(|text| !text.starts_with("loading:")).skip(1).take(3).collect();
     assert_eq!(told, ["ide: enable", "type:demo\n", "shutdownTimeout: 7200"]);
-    let editor = ("127.0.0.1", port_of(&address) + 500);
+    let editor = ("127.0.0.1", server.port + 501);
     until("the editor listens", async || tokio::net::TcpStream::connect(editor).await.is_ok()).await;
     let theia = &of_service(&server, "theia")[0];
     assert_eq!(ask(&["exec", theia, "cat", "/home/project/webots-project/c.py"]), "print('original')");
@@ -41,20 +31,18 @@ async fn a_project_has_an_editor_on_the_port_of_webots_plus_500() {
 #[actix_rt::test]
 async fn a_folder_that_leads_out_of_the_project_or_has_an_odd_name_is_not_shown_to_an_editor() {
     let Some(_docker) = docker().await else { return };
-    let forge = Forge::with_arm();
-    let work = forge.work_tree("lab/arm", "main");
+    let server = server(1).start().await;
+    let work = server.forge().work_tree("lab/arm", "main");
     // As a line of its own it would say where the project is.
     let folder = work.join("controllers/x\nPROJECT=/etc");
     std::fs::create_dir_all(&folder).unwrap();
     std::fs::write(folder.join("file"), "").unwrap();
-    let server = server(forge.path(), 1).start().await;
     for (target, words) in [("/etc", "The project has no folder controllers/edit"), ("x\nPROJECT=/etc", "line break")] {
         std::fs::remove_file(work.join("controllers/edit")).ok();
         std::os::unix::fs::symlink(target, work.join("controllers/edit")).unwrap();
         std::fs::write(work.join("webots.yml"), "dockerCompose: \"theia:webots-project/controllers/edit\"\n").unwrap();
-        forge.commit_work_tree("lab/arm", "main");
-        let told = Client::start(&server, &arm()).await.patiently("loading: Error:", BUILT).await;
-        assert!(told.contains(words), "{told}");
+        server.forge().commit_work_tree("lab/arm", "main");
+        is_told(&server, &arm(), words).await;
     }
 }
 
@@ -78,15 +66,11 @@ const COMPETITION: [(&str, &str); 4] = [
 #[actix_rt::test]
 async fn a_participant_connects_to_webots_and_what_the_editor_changes_counts_after_a_reset() {
     let Some(_docker) = docker().await else { return };
-    let forge = Forge::with_arm();
     let files = COMPETITION.map(|(path, text)| (path, text.replace("{NAME}", NAME)));
     let world = format!("{WORLD}Robot {{ name \"participant\" controller \"participant\" }}\n");
     let files = files.iter().map(|(path, text)| (*path, text.as_str())).chain([("worlds/a.wbt", world.as_str())]);
-    forge.commit("lab/arm", "main", &files.collect::<Vec<_>>());
-    let server = server(forge.path(), 1).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    let address = client.patiently("webots:", BUILT).await;
-    let port = port_of(&address);
+    let (server, client) = running(server_with(&files.collect::<Vec<_>>())).await;
+    let port = server.port + 1;
     let webots = of_service(&server, "webots")[0].clone();
     let connected = || -> Vec<serde_json::Value> {
         let folder = format!("/tmp/webots/webots/{port}/ipc/participant");
@@ -96,7 +80,7 @@ async fn a_participant_connects_to_webots_and_what_the_editor_changes_counts_aft
     until("the participant is connected", async || connected().len() == 1).await;
     let seen = connected().remove(0);
     for (key, value) in [
-        ("arguments", serde_json::json!(["--robot-name=participant", format!("--port={port}"), "participant.py"])),
+        ("arguments", json!(["--robot-name=participant", format!("--port={port}"), "participant.py"])),
         ("PORT", port.to_string().into()),
         ("WEBOTS_STDOUT_REDIRECT", "1".into()),
         ("WEBOTS_STDERR_REDIRECT", "1".into()),
@@ -113,7 +97,7 @@ async fn a_participant_connects_to_webots_and_what_the_editor_changes_counts_aft
     // The editor changes the program, and the client resets the simulation.
     let theia = &of_service(&server, "theia")[0];
     ask(&["exec", theia, "sh", "-c", "echo 'print(2)' >/home/project/webots-project/participant.py"]);
-    let mut viewer = Client::connect(&address.trim_start_matches("webots:").replace("localhost", "127.0.0.1")).await;
+    let mut viewer = Client::connect(&format!("ws://127.0.0.1:{port}/")).await;
     viewer.send("x3d").await;
     viewer.until("model:").await;
     viewer.send("reset").await;
@@ -128,10 +112,8 @@ async fn a_participant_connects_to_webots_and_what_the_editor_changes_counts_aft
 #[actix_rt::test]
 async fn what_an_image_keeps_at_home_is_found_and_can_be_changed() {
     let Some(_docker) = docker().await else { return };
-    let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
-    let server = as_ordinary(server(forge.path(), 1), forge.path(), folder.path()).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.patiently("webots:", BUILT).await;
+    let folder = tempfile::tempdir().unwrap();
+    let (server, client) = running(as_ordinary(server(1), folder.path())).await;
     let webots = of_service(&server, "webots")[0].clone();
     let inside = |command: &str| ask(&["exec", &webots, "sh", "-c", command]);
     assert_eq!(inside("id -u"), ORDINARY.to_string());
@@ -150,28 +132,16 @@ async fn what_an_image_keeps_at_home_is_found_and_can_be_changed() {
 #[actix_rt::test]
 async fn resets_without_end_start_a_controller_once_a_second_at_most() {
     let Some(_docker) = docker().await else { return };
-    let forge = Forge::with_arm();
     let controller = format!(
-        "FROM {NAME}\nCOPY . /usr/local/webots-project/controllers\nCMD [\"sh\", \"-c\", \"echo x >>/tmp/webots/starts; exec sleep 1000\"]\n"
+        "FROM {NAME}\nCOPY . /usr/local/webots-project/controllers\nCMD echo x >>/tmp/webots/starts; exec sleep 1000\n"
     );
-    let webots = "#!/bin/sh\necho .\nwhile :; do echo reset; done\n";
-    forge.commit(
-        "lab/arm",
-        "main",
-        &[
-            ("controllers/participant/participant.py", "print(1)\n"),
-            ("controllers/Dockerfile", &controller),
-            ("fake", webots),
-            ("Dockerfile", &format!("FROM {NAME}\nCOPY . /usr/local/webots-project\nRUN cp /usr/local/webots-project/fake /usr/local/webots/webots && chmod 755 /usr/local/webots/webots\n")),
-            ("webots.yml", "dockerCompose: \"competition:webots-project/controllers/participant\"\n"),
-        ],
-    );
-    let server = server(forge.path(), 1).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.patiently("webots:", BUILT).await;
+    let yml = "dockerCompose: \"competition:webots-project/controllers/c\"\n";
+    let server = server_running("echo .\nwhile :; do echo reset; done");
+    server.forge().commit("lab/arm", "main", &[("controllers/Dockerfile", &controller), ("webots.yml", yml)]);
+    let (server, _client) = running(server).await;
     let webots = of_service(&server, "webots")[0].clone();
     let starts = || ask(&["exec", &webots, "sh", "-c", "cat /tmp/webots/starts || true"]).lines().count();
-    let (begin, before) = (std::time::Instant::now(), starts());
+    let (begin, before) = (Instant::now(), starts());
     until("it has been started again and again", async || starts() >= before + 4).await;
     let count = starts() - before;
     assert!(
@@ -185,16 +155,13 @@ async fn resets_without_end_start_a_controller_once_a_second_at_most() {
 #[actix_rt::test]
 async fn an_administrators_template_counts_and_what_protects_stays() {
     let Some(_docker) = docker().await else { return };
-    let (forge, templates) = (Forge::with_arm(), tempfile::tempdir().unwrap());
+    let templates = tempfile::tempdir().unwrap();
     let template = "services:\n  webots:\n    image: ${IMAGE}\n    command: sh -c 'touch /tmp/mine && exec ${WEBOTS}'\n    \
                     privileged: true\n    read_only: false\n    ports: [\"${BIND}:${PORT}:${PORT}\"]\n    volumes: \
                     [\"${PROJECT}:${PROJECT_PATH}\"]\n";
     std::fs::write(templates.path().join("docker-compose-default.yml"), template).unwrap();
-    let settings =
-        serde_json::json!({ "templates": templates.path(), "newPrivileges": true, "capabilities": ["SYS_PTRACE"] });
-    let server = server(forge.path(), 1).set("container", settings).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.patiently("webots:", BUILT).await;
+    let settings = json!({ "templates": templates.path(), "newPrivileges": true, "capabilities": ["SYS_PTRACE"] });
+    let (server, _client) = running(server(1).set("container", settings)).await;
     let webots = &of_service(&server, "webots")[0];
     ask(&["exec", webots, "ls", "/tmp/mine"]);
     let format =
@@ -205,16 +172,13 @@ async fn an_administrators_template_counts_and_what_protects_stays() {
 #[actix_rt::test]
 async fn a_template_that_can_not_work_here_is_told_when_the_server_starts_and_by_check() {
     let Some(_docker) = docker().await else { return };
-    let (forge, templates) = (Forge::with_arm(), tempfile::tempdir().unwrap());
+    let templates = tempfile::tempdir().unwrap();
     let template = "services:\n  webots:\n    image: ${IMAGE}\n    network_mode: host\n";
     std::fs::write(templates.path().join("docker-compose-theia.yml"), template).unwrap();
-    let server =
-        server(forge.path(), 1).set("container", serde_json::json!({ "templates": templates.path() })).start().await;
+    let (server, _client) = running(server(1).set("container", json!({ "templates": templates.path() }))).await;
     let fault =
         "The template docker-compose-theia.yml of this simulation server can't be used: line 4, `network_mode: host`";
     assert!(server.log().contains(fault), "{}", server.log());
     let checked = check(&server);
     assert!(checked.contains(&format!("warning: templates: {fault}")), "{checked}");
-    // Worlds that want no editor run.
-    Client::start(&server, &arm()).await.patiently("webots:", BUILT).await;
 }

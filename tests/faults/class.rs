@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
-use crate::support::git::arm;
+use crate::support::arm;
 
 /// How many clients come and go.
 const CLIENTS: u32 = 8;

@@ -1,26 +1,20 @@
 //! The faults, each with what heals it: here those of the fleet's processes. Whatever is done to a fleet is undone before the
 //! function returns, but for what the fleet has to mend itself.
 
-use std::collections::BTreeSet;
 use std::future::Future;
 use std::pin::Pin;
 use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-use procfs::process::Process;
 use rand::RngExt;
 use rand::rngs::SmallRng;
 
 use crate::fleet::{Fleet, SERVERS};
-use crate::support::program::Server;
+use crate::support::instances_below;
 use crate::support::relay::Mood;
 use crate::support::stopwatch::Stopwatch;
-use crate::support::webots::instances_below;
 use crate::surroundings::*;
-
-/// What the command line of a guardian has.
-const GUARDIAN: &str = " guard ";
 
 type Injected<'fleet> = Pin<Box<dyn Future<Output = bool> + 'fleet>>;
 
@@ -125,7 +119,8 @@ async fn stop_server(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
 async fn signal(fleet: &Fleet, random: &mut SmallRng, words: &str, signal: Signal) -> bool {
     let deadline = Instant::now() + WHILE;
     while Instant::now() < deadline {
-        let all = descendants(fleet, words);
+        let all = (0..SERVERS).flat_map(|index| instances_below(&fleet.folder(index)));
+        let all: Vec<i32> = all.filter(|(_, command)| command.contains(words)).map(|(pid, _)| pid).collect();
         if !all.is_empty() {
             return kill(Pid::from_raw(all[random.random_range(0..all.len())]), signal).is_ok();
         }
@@ -137,37 +132,8 @@ async fn signal(fleet: &Fleet, random: &mut SmallRng, words: &str, signal: Signa
 
 /// A guardian stands still, but not for good: nothing would be left to end what a server that is killed leaves.
 async fn stop_guardian(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
-    let all = descendants(fleet, GUARDIAN);
-    if all.is_empty() {
-        return false;
-    }
-    let guardian = Pid::from_raw(all[random.random_range(0..all.len())]);
+    let guardian = Pid::from_raw(fleet.servers[random.random_range(0..SERVERS)].guardian());
     kill(guardian, Signal::SIGSTOP).unwrap();
     actix_rt::time::sleep(WHILE).await;
     kill(guardian, Signal::SIGCONT).is_ok()
-}
-
-/// The processes below the simulation servers whose command line has these words.
-fn descendants(fleet: &Fleet, words: &str) -> Vec<i32> {
-    let all: Vec<(i32, i32, Process)> = procfs::process::all_processes()
-        .unwrap()
-        .flatten()
-        .filter_map(|process| Some((process.pid(), process.stat().ok()?.ppid, process)))
-        .collect();
-    let mut family: BTreeSet<i32> = fleet.servers.iter().map(Server::pid).collect();
-    loop {
-        let before = family.len();
-        family.extend(
-            all.iter().filter(|(_, parent, _)| family.contains(parent)).map(|(pid, ..)| *pid).collect::<Vec<_>>(),
-        );
-        if family.len() == before {
-            break;
-        }
-    }
-    let is_one = |process: &Process| process.cmdline().is_ok_and(|command| command.join(" ").contains(words));
-    let servers: BTreeSet<i32> = fleet.servers.iter().map(Server::pid).collect();
-    all.into_iter()
-        .filter(|(pid, _, process)| family.contains(pid) && !servers.contains(pid) && is_one(process))
-        .map(|(pid, ..)| pid)
-        .collect()
 }

@@ -10,14 +10,13 @@ use serde_json::json;
 use crate::class::Class;
 use crate::machine::Clock;
 use crate::network::Network;
-use crate::support::client::{Client, Heard};
-use crate::support::disk;
-use crate::support::git::{Forge, arm};
+use crate::support::client::Heard;
 use crate::support::name_server::NameServer;
-use crate::support::program::{Builder, Server, session_server, simulation_server};
 use crate::support::relay::Relay;
-use crate::support::webots::{Webots, instance_folders_in, instances_below};
-use crate::support::{SOON, http, ports};
+use crate::support::{
+    Builder, Client, Forge, SOON, Server, Webots, arm, disk, http, instance_folders_in, instances_below, ports,
+    session_server, simulation_server,
+};
 
 /// How many simulation servers there are.
 pub const SERVERS: usize = 5;
@@ -41,8 +40,8 @@ pub struct Fleet {
     pub relay: Relay,
     /// Where there can be one.
     pub names: Option<NameServer>,
-    /// That of all servers, where it can be set.
-    pub clock: Option<Clock>,
+    /// That of all servers.
+    pub clock: Clock,
     /// Where packets can be lost.
     pub network: Option<Network>,
     forge: Forge,
@@ -51,7 +50,8 @@ pub struct Fleet {
     session_port: u16,
     ports: Vec<u16>,
     began: Instant,
-    checks: u32,
+    /// How often all that must hold was found to hold.
+    pub checks: u32,
     /// What each server took of memory before anything happened, in bytes.
     memory: Vec<u64>,
 }
@@ -67,12 +67,12 @@ impl Fleet {
         for (index, port) in ports.iter().enumerate() {
             let name = folder.path().join(format!("server-{index}"));
             std::fs::create_dir_all(&name).unwrap();
-            servers.push(configure(&forge, &webots, clock.as_ref()).folder(&name).port(*port).start().await);
+            servers.push(configure(&forge, &webots, &clock).folder(&name).port(*port).start().await);
         }
         let relay = Relay::to(ports[LINKED]).await;
         let session_port = ports::block(1);
         let session = session_builder(&ports, &relay, names.as_ref(), session_port, folder.path());
-        let session = with(clock.as_ref(), session).start().await;
+        let session = clock.of(session).start().await;
         let memory = servers.iter().map(|server| memory(server.pid())).collect();
         let began = Instant::now();
         let fleet = Self {
@@ -119,7 +119,7 @@ impl Fleet {
 
     /// A simulation server at the place of another.
     pub fn configured(&self, index: usize) -> Builder {
-        let builder = configure(&self.forge, &self.webots, self.clock.as_ref());
+        let builder = configure(&self.forge, &self.webots, &self.clock);
         builder.folder(&self.folder(index)).port(self.ports[index])
     }
 
@@ -132,7 +132,7 @@ impl Fleet {
     pub async fn restart_session(&mut self) {
         let session =
             session_builder(&self.ports, &self.relay, self.names.as_ref(), self.session_port, self.folder.path());
-        self.session = with(self.clock.as_ref(), session).start().await;
+        self.session = self.clock.of(session).start().await;
     }
 
     /// Lets a class come again and again for so long.
@@ -144,19 +144,12 @@ impl Fleet {
     pub async fn whole(&mut self, after: &str) -> Instant {
         let deadline = Instant::now() + BOUND;
         loop {
-            let mut seen = self.look().await;
-            if seen.is_ok() {
-                seen = self.try_client().await;
-            }
-            match seen {
-                Ok(()) => {
-                    self.checks += 1;
-                    return Instant::now();
-                }
-                Err(why) if Instant::now() > deadline => panic!("{} s after {after}: {why}", BOUND.as_secs()),
-                Err(_) => actix_rt::time::sleep(Duration::from_millis(50)).await,
-            }
+            let Err(why) = self.look().await else { break };
+            assert!(Instant::now() < deadline, "{} s after {after}: {why}", BOUND.as_secs());
+            actix_rt::time::sleep(Duration::from_millis(50)).await;
         }
+        self.checks += 1;
+        Instant::now()
     }
 
     /// One look at everything that must hold while clients come and go.
@@ -190,11 +183,7 @@ impl Fleet {
                 return Err(format!("server {index} knows {known} simulations, and {taken} of its ports are taken"));
             }
         }
-        Ok(())
-    }
-
-    /// A client of its own gets a simulation.
-    async fn try_client(&self) -> Result<(), String> {
+        // A client of its own gets a simulation.
         let given = http::try_get(&self.session.url("/session")).await?.text();
         try_start(&given).await?.leave().await;
         Ok(())
@@ -207,12 +196,9 @@ impl Fleet {
     /// Waits until nothing is left of any simulation: no process, port or folder, and memory as it was.
     pub async fn empty(&mut self) {
         let deadline = Instant::now() + BOUND;
-        loop {
-            match self.look_for_rests() {
-                Ok(()) => break,
-                Err(why) if Instant::now() > deadline => panic!("{} s after the class: {why}", BOUND.as_secs()),
-                Err(_) => actix_rt::time::sleep(Duration::from_millis(50)).await,
-            }
+        while let Err(why) = self.look_for_rests() {
+            assert!(Instant::now() < deadline, "{} s after the class: {why}", BOUND.as_secs());
+            actix_rt::time::sleep(Duration::from_millis(50)).await;
         }
         self.checks += 1;
     }
@@ -227,7 +213,7 @@ impl Fleet {
                 return Err(format!("server {index} has left folders"));
             }
             let first = self.port(index, 0);
-            if let Some(port) = (first..first + PLACES).find(|port| is_taken(*port)) {
+            if let Some(port) = listening().find(|port| (first..first + PLACES).contains(port)) {
                 return Err(format!("server {index} has left port {port}"));
             }
             let (before, now) = (self.memory[index], memory(server.pid()));
@@ -242,25 +228,13 @@ impl Fleet {
     pub fn age(&self) -> f64 {
         self.began.elapsed().as_secs_f64()
     }
-
-    /// How often all that must hold was found to hold.
-    pub fn checks(&self) -> u32 {
-        self.checks
-    }
 }
 
-fn configure(forge: &Forge, webots: &Webots, clock: Option<&Clock>) -> Builder {
+fn configure(forge: &Forge, webots: &Webots, clock: &Clock) -> Builder {
     let timing = json!({"grace": 1, "heartbeat": 0.5, "ping": 2, "silence": 6, "launch": 20, "checkout": 40});
     let builder = simulation_server(&webots.path(), forge.path(), PLACES).set("hangLimit", 1).set("timing", timing);
     // The small disk has less room than the default.
-    with(clock, builder.set("diskReserve", 8))
-}
-
-fn with(clock: Option<&Clock>, builder: Builder) -> Builder {
-    match clock {
-        Some(clock) => clock.of(builder),
-        None => builder,
-    }
+    clock.of(builder.set("diskReserve", 8))
 }
 
 fn session_builder(ports: &[u16], relay: &Relay, names: Option<&NameServer>, port: u16, folder: &Path) -> Builder {
@@ -292,14 +266,9 @@ fn listening() -> impl Iterator<Item = u16> {
     all.into_iter().filter(|one| one.state == TcpState::Listen).map(|one| one.local_address.port())
 }
 
-fn is_taken(port: u16) -> bool {
-    std::net::TcpListener::bind((std::net::Ipv4Addr::UNSPECIFIED, port)).is_err()
-}
-
 /// What a process has in memory, in bytes.
 fn memory(pid: i32) -> u64 {
-    let pages = procfs::process::Process::new(pid).and_then(|process| process.statm()).unwrap().resident;
-    pages * 4096
+    Process::new(pid).and_then(|process| process.statm()).unwrap().resident * procfs::page_size()
 }
 
 /// A client whose simulation runs on this server.

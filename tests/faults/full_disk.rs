@@ -3,28 +3,22 @@
 
 use std::path::Path;
 
-use serde_json::Value;
-
 use crate::fleet::try_start;
-use crate::support::client::Client;
 use crate::support::disk::{self, Full};
-use crate::support::git::Forge;
-use crate::support::program::{Builder, Server, session_server, simulation_server};
-use crate::support::webots::Webots;
-use crate::support::{http, skip, until};
+use crate::support::{Builder, Client, Server, demo_server, http, session_server, skip, until};
 
 /// How many come.
 const CLASS: u16 = 16;
 
-fn server(forge: &Forge, webots: &Webots, folder: &Path) -> Builder {
+fn server(folder: &Path) -> Builder {
     std::fs::create_dir_all(folder).unwrap();
     // The small disk has 64 MiB.
-    simulation_server(&webots.path(), forge.path(), CLASS).folder(folder).set("diskReserve", 8)
+    demo_server(CLASS).folder(folder).set("diskReserve", 8)
 }
 
 /// The state of the second simulation server, and the last error that was met there.
 async fn second(session: &Server) -> (String, String) {
-    let page: Value = session.status().await;
+    let page = session.status().await;
     let text = |key: &str| page["servers"][1][key].as_str().unwrap_or_default().to_owned();
     (text("state"), text("error"))
 }
@@ -48,9 +42,8 @@ async fn a_server_with_a_full_disk_takes_nobody_and_the_whole_class_runs_elsewhe
     if !disk::small_disk(&small, 64) {
         return skip("a full disk", "only root may mount one");
     }
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let healthy = server(&forge, &webots, &folder.path().join("healthy")).start().await;
-    let full = server(&forge, &webots, &small).start().await;
+    let healthy = server(&folder.path().join("healthy")).start().await;
+    let full = server(&small).start().await;
     let session = session_server(&[healthy.address(), full.address()]).set("loadThreshold", 1000).start().await;
     until("both work", async || second(&session).await.0 == "up").await;
 
@@ -60,14 +53,12 @@ async fn a_server_with_a_full_disk_takes_nobody_and_the_whole_class_runs_elsewhe
     until("the full one is not offered", async || second(&session).await.0 == "down").await;
     let (_, why) = second(&session).await;
     assert!(why.contains("disk is full: less than 8 MiB are left (diskReserve)"), "{why}");
-    let health = http::try_get(&full.url("/health")).await.unwrap();
-    assert!(health.status.as_u16() == 503 && health.text().contains("disk is full"), "{}", health.text());
+    let (status, text) = full.health().await;
+    assert!(status == 503 && text.contains("disk is full"), "{text}");
     let page = full.monitor().await;
     assert!(page.contains("Not ready") && page.contains("disk is full"), "{page}");
     let all = class(&session, CLASS).await;
-    assert_eq!(all.len(), usize::from(CLASS));
-    let known: Value = healthy.status().await;
-    assert_eq!(known["simulations"].as_array().unwrap().len(), usize::from(CLASS));
+    assert_eq!(healthy.simulations().await.len(), usize::from(CLASS));
     running.until(".").await;
 
     // It empties.

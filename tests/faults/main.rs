@@ -79,7 +79,7 @@ async fn the_fleet_is_whole_again_after_each_fault() {
         report["seats"]["given"],
         injected.len(),
         injected.iter().collect::<std::collections::BTreeSet<_>>().len(),
-        fleet.checks(),
+        fleet.checks,
     );
     fleet.empty().await;
     assert!(report["seats"]["given"].as_u64().unwrap() > 0, "no simulation ran: {report}");

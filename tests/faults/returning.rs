@@ -4,11 +4,8 @@ use std::time::{Duration, Instant};
 
 use futures_util::StreamExt;
 
-use crate::support::client::Client;
-use crate::support::git::Forge;
 use crate::support::ports::dead_port;
-use crate::support::program::{session_server, simulation_server};
-use crate::support::webots::Webots;
+use crate::support::{Client, demo_server, session_server};
 
 /// How many clients there are.
 const CLIENTS: usize = 5_000;
@@ -30,8 +27,7 @@ async fn five_thousand_clients_come_back_at_once_and_hear_the_truth() {
     session.signal(nix::sys::signal::Signal::SIGKILL);
     session.ended().await;
     drop((clients, reserved));
-    let (forge, webots) = (Forge::new(), Webots::launcher());
-    let _simulation = simulation_server(&webots.path(), forge.path(), 1).port(simulation_port).start().await;
+    let _simulation = demo_server(1).port(simulation_port).start().await;
     let session = configure().folder(folder.path()).port(port).start().await;
     let began = Instant::now();
     let clients = come(&url, "1").await;

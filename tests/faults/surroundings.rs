@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use nix::sys::signal::Signal;
 use procfs::net::TcpState;
-use procfs::process::Process;
+use procfs::process::{LimitValue, Process};
 use rand::RngExt;
 use rand::rngs::SmallRng;
 
@@ -42,33 +42,19 @@ pub async fn close_folder(fleet: &mut Fleet, name: &str, is_empty: bool) -> bool
 }
 
 pub async fn no_files(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
-    let pid = fleet.servers[random.random_range(0..SERVERS)].pid();
-    let Ok(limits) = limit_files(pid, None) else {
+    let server = Process::new(fleet.servers[random.random_range(0..SERVERS)].pid()).unwrap();
+    let limits = server.limits().unwrap().max_open_files;
+    let (LimitValue::Value(soft), LimitValue::Value(hard)) = (limits.soft_limit, limits.hard_limit) else {
         return false;
     };
-    let open = Process::new(pid).and_then(|process| process.fd_count()).unwrap();
-    limit_files(pid, Some((open as u64, limits.1))).unwrap();
-    actix_rt::time::sleep(WHILE).await;
-    limit_files(pid, Some(limits)).unwrap();
-    true
-}
-
-/// Sets how many files a process may open, as soft and hard limit; returns what was.
-fn limit_files(pid: i32, new: Option<(u64, u64)>) -> Result<(u64, u64), String> {
-    let mut command = std::process::Command::new("prlimit");
-    command.args(["--pid", &pid.to_string(), "--noheadings", "--raw", "--output", "SOFT,HARD"]);
-    match new {
-        Some((soft, hard)) => command.arg(format!("--nofile={soft}:{hard}")),
-        None => command.arg("--nofile"),
+    let limit = |soft: u64| {
+        let mut command = std::process::Command::new("prlimit");
+        let command = command.args(["--pid", &server.pid().to_string(), &format!("--nofile={soft}:{hard}")]);
+        command.status().unwrap().success()
     };
-    let output = command.output().map_err(|error| error.to_string())?;
-    let text = String::from_utf8_lossy(&output.stdout).into_owned();
-    let mut numbers = text.split_whitespace().filter_map(|number| number.parse().ok());
-    match (output.status.success(), numbers.next(), numbers.next()) {
-        (true, Some(soft), Some(hard)) => Ok((soft, hard)),
-        (true, ..) if new.is_some() => Ok(new.unwrap()),
-        _ => Err(String::from_utf8_lossy(&output.stderr).into_owned()),
-    }
+    let is_possible = limit(server.fd_count().unwrap() as u64);
+    actix_rt::time::sleep(WHILE).await;
+    limit(soft) && is_possible
 }
 
 /// A server has no memory for another Webots. The system ends what takes the most: a simulation, or the server itself, which
@@ -98,13 +84,10 @@ pub async fn no_memory(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
 
 /// The time of day of all servers makes a step, and one back.
 pub async fn step_clock(fleet: &mut Fleet, seconds: i64) -> bool {
-    let Some(clock) = &fleet.clock else {
-        return false;
-    };
-    clock.set(seconds);
+    fleet.clock.set(seconds);
     fleet.whole("the clock's step").await;
     actix_rt::time::sleep(WHILE).await;
-    fleet.clock.as_ref().unwrap().set(0);
+    fleet.clock.set(0);
     true
 }
 

@@ -1,20 +1,15 @@
 //! A virtual display of a simulation's own.
 
 use std::io::{Read, Write};
-use std::os::unix::fs::PermissionsExt;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 
 use procfs::process::{FDTarget, Process};
 
-use super::deeds::as_nobody;
+use super::deeds::{as_nobody, open};
 use super::limits::Delegated;
-use crate::simulation::scene::{DEMO, instance_folders, nothing_left};
-use crate::support::client::Client;
-use crate::support::git::Forge;
-use crate::support::program::{Server, simulation_server};
-use crate::support::webots::{Webots, instances_below};
-use crate::support::{display, needs, until};
+use crate::simulation::scene::{instance_folders, nothing_left};
+use crate::support::{Client, DEMO, Server, Webots, demo_server, display, instances_below, needs, server_of, until};
 
 /// The inodes of the sockets that a process has open.
 fn sockets(pid: i32) -> Vec<u64> {
@@ -37,10 +32,8 @@ async fn a_virtual_display_is_inside_of_the_sandbox() {
     let mut users = vec![("root", "true")];
     users.extend(as_nobody().map(|nobody| ("nobody", nobody)));
     for (user, before) in users {
-        let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
-        for folder in [folder.path(), forge.path()] {
-            std::fs::set_permissions(folder, std::fs::Permissions::from_mode(0o777)).unwrap();
-        }
+        let folder = tempfile::tempdir().unwrap();
+        open(folder.path());
         // The cache is hidden from simulations.
         let fonts = folder.path().join("cache/fonts");
         let webots = Webots::script(&format!(
@@ -49,7 +42,7 @@ async fn a_virtual_display_is_inside_of_the_sandbox() {
              {DEMO} \"$@\" & wait",
             fonts.display()
         ));
-        let builder = simulation_server(&webots.path(), forge.path(), 1).set("xvfb", true).set("isolation", "sandbox");
+        let builder = server_of(webots, 1).set("xvfb", true).set("isolation", "sandbox");
         let server = builder.folder(folder.path()).before(before).start().await;
         std::fs::create_dir_all(&fonts).unwrap();
         std::fs::write(fonts.join("fonts.dir"), "0\n").unwrap();
@@ -132,8 +125,8 @@ async fn told_memory(server: &Server) -> u64 {
 async fn what_a_virtual_display_takes_counts_for_its_simulation() {
     let _alone = display::alone().await;
     for level in ["sandbox", "none"] {
-        let (forge, webots, group) = (Forge::with_arm(), Webots::launcher(), Delegated::new());
-        let builder = simulation_server(&webots.path(), forge.path(), 1).set("xvfb", true).set("isolation", level);
+        let group = Delegated::new();
+        let builder = demo_server(1).set("xvfb", true).set("isolation", level);
         let join = group.as_ref().map_or("true".to_owned(), Delegated::join);
         let server = builder.before(&join).start().await;
         let client = Client::ready(&server).await;

@@ -2,12 +2,7 @@
 
 use serde_json::json;
 
-use crate::simulation::scene::arm;
-use crate::support::client::Client;
-use crate::support::git::Forge;
-use crate::support::program::{Builder, demo_server, simulation_server};
-use crate::support::webots::Webots;
-use crate::support::{self};
+use crate::support::{self, Builder, Client, Webots, arm, demo_server, server_of};
 
 /// A folder with git and a shell, and with a bubblewrap that fails if one is wanted.
 fn programs(bubblewrap: Option<&str>) -> tempfile::TempDir {
@@ -24,42 +19,32 @@ fn with(builder: Builder, programs: &tempfile::TempDir, isolation: &str) -> Buil
 }
 
 #[actix_rt::test]
-async fn a_sandbox_that_is_demanded_and_can_not_be_had_refuses_the_start_in_one_line() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let table = [
-        (None, "the package bubblewrap has it; \"none\" runs worlds without it"),
-        (
-            Some("echo 'bwrap: setting up uid map: Permission denied' >&2; exit 1"),
-            "uid map: Permission denied): user namespaces",
-        ),
-        (Some("exec sleep 1000"), "it does not end"),
-    ];
-    for (bubblewrap, words) in table {
-        let programs = programs(bubblewrap);
-        let told = with(simulation_server(&webots.path(), forge.path(), 1), &programs, "sandbox").refused(1).await;
-        let begin = "error: isolation is \"sandbox\", but bubblewrap";
-        assert!(told.starts_with(begin) && told.contains(words), "{told}");
-    }
-}
-
-#[actix_rt::test]
-async fn a_network_that_is_demanded_and_can_not_be_had_refuses_the_start_in_one_line() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let (none, failing) = (programs(None), programs(Some("exit 1")));
-    let server = || simulation_server(&webots.path(), forge.path(), 1).set("sandbox.network", "closed");
+async fn a_level_or_a_network_that_is_demanded_and_can_not_be_had_refuses_the_start_in_one_line() {
+    let (none, ends) = (programs(None), programs(Some("exit 1")));
+    let denied = programs(Some("echo 'bwrap: setting up uid map: Permission denied' >&2; exit 1"));
+    let hangs = programs(Some("exec sleep 1000"));
+    let sandbox = |programs| with(demo_server(1), programs, "sandbox");
+    let closed = |programs| with(demo_server(1).set("sandbox.network", "closed"), programs, "auto");
+    let begin = "error: isolation is \"sandbox\", but bubblewrap";
     let mut table = vec![
-        (with(server(), &none, "auto"), "closed\", but bubblewrap (bwrap) is not there"),
-        (with(server(), &failing, "auto"), "closed\", but bubblewrap makes no sandbox here"),
+        (sandbox(&none), begin, "the package bubblewrap has it; \"none\" runs worlds without it"),
+        (sandbox(&denied), begin, "uid map: Permission denied): user namespaces"),
+        (sandbox(&hangs), begin, "it does not end"),
+        (closed(&none), "error: ", "closed\", but bubblewrap (bwrap) is not there"),
+        (closed(&ends), "error: ", "closed\", but bubblewrap makes no sandbox here"),
+        (
+            with(demo_server(1), &none, "container"),
+            "error: isolation is \"container\", but docker is not there; ",
+            "on Debian and Ubuntu the package docker.io has it",
+        ),
     ];
     if nix::unistd::getuid().is_root() {
-        table.push((
-            server(),
-            "closed\", but pasta gives none to root, run the server as a user of its own; \"shared\"",
-        ));
+        let words = "closed\", but pasta gives none to root, run the server as a user of its own; \"shared\"";
+        table.push((demo_server(1).set("sandbox.network", "closed"), "error: ", words));
     }
-    for (builder, words) in table {
+    for (builder, begin, words) in table {
         let told = builder.refused(1).await;
-        assert!(told.contains(words), "{told}");
+        assert!(told.starts_with(begin) && told.contains(words), "{told}");
     }
 }
 
@@ -94,7 +79,7 @@ async fn a_sandbox_is_what_a_machine_has_by_itself() {
 
 #[actix_rt::test]
 async fn limits_that_a_machine_can_not_keep_are_told_at_the_start_and_by_a_check() {
-    let (forge, webots, programs) = (Forge::with_arm(), Webots::launcher(), programs(None));
+    let programs = programs(None);
     let lines = [
         "limits.openFiles does not hold, and files, core dumps and processes have no limit",
         "limits.memory does not hold: systemd has not delegated control groups with the controller memory",
@@ -104,7 +89,7 @@ async fn limits_that_a_machine_can_not_keep_are_told_at_the_start_and_by_a_check
         let marked = text.lines().filter(|line| line.contains(mark)).map(str::to_owned);
         marked.filter(|line| lines.iter().any(|words| line.contains(words))).collect()
     };
-    let limited = with(simulation_server(&webots.path(), forge.path(), 1), &programs, "none");
+    let limited = with(demo_server(1), &programs, "none");
     let server = limited.set("limits.memory", 1000).set("limits.cores", 1).start().await;
     assert_eq!(told(&server.log(), "WARN").len(), 3, "{}", server.log());
     let check = |path: &std::ffi::OsStr| {
@@ -123,15 +108,13 @@ async fn limits_that_a_machine_can_not_keep_are_told_at_the_start_and_by_a_check
 
 #[actix_rt::test]
 async fn a_level_that_can_not_be_is_refused_in_one_line() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let containers =
-        |places: u16| simulation_server(&webots.path(), forge.path(), places).set("isolation", "container");
-    let sandbox = |folders| simulation_server(&webots.path(), forge.path(), 1).set("sandbox", folders);
-    let docker = simulation_server(&webots.path(), forge.path(), 1).set("docker", true);
+    let containers = || demo_server(1).set("isolation", "container");
+    let sandbox = |folders| demo_server(1).set("sandbox", folders);
+    let docker = demo_server(1).set("docker", true);
     for (builder, words) in [
         (docker.set("isolation", "sandbox"), "docker: true asks for containers, but isolation for another level"),
-        (containers(1).set("isolation", "jail"), "isolation: unknown variant `jail`"),
-        (containers(1).set("isolation", true), "isolation: invalid type: boolean `true`"),
+        (containers().set("isolation", "jail"), "isolation: unknown variant `jail`"),
+        (containers().set("isolation", true), "isolation: invalid type: boolean `true`"),
         (sandbox(json!({"readable": "/"})), "sandbox.readable: \"/\" can't be shown"),
         (sandbox(json!({"writable": ["/srv", "/proc/self/.."]})), "sandbox.writable: \"/proc/self/..\" can't be shown"),
         (sandbox(json!({"network": "open"})), "unknown variant `open`"),
@@ -139,11 +122,11 @@ async fn a_level_that_can_not_be_is_refused_in_one_line() {
             sandbox(json!({"network": "closed"})).set("isolation", "none"),
             "sandbox.network: networks of simulations' own",
         ),
-        (containers(1).set("sandbox", json!({"network": "own"})), "sandbox.network: networks of simulations' own"),
-        (containers(1).set("maxConnections", 501), "allowed are up to 500 places"),
-        (containers(1).set("port", 64_990).set("maxConnections", 100), "editors up to port 65535"),
-        (containers(1).set("container", json!({ "network": "open" })), "unknown variant `open`"),
-        (containers(1).set("container", json!({ "netwrok": "closed" })), "netwrok"),
+        (containers().set("sandbox", json!({"network": "own"})), "sandbox.network: networks of simulations' own"),
+        (containers().set("maxConnections", 501), "allowed are up to 500 places"),
+        (containers().set("port", 64_990).set("maxConnections", 100), "editors up to port 65535"),
+        (containers().set("container", json!({ "network": "open" })), "unknown variant `open`"),
+        (containers().set("container", json!({ "netwrok": "closed" })), "netwrok"),
     ] {
         let told = builder.refused(2).await;
         assert!(told.contains(words), "{told}");
@@ -151,18 +134,10 @@ async fn a_level_that_can_not_be_is_refused_in_one_line() {
 }
 
 #[actix_rt::test]
-async fn containers_without_docker_refuse_the_start_in_one_line() {
-    let told = with(demo_server(1), &programs(None), "container").refused(1).await;
-    let words =
-        "error: isolation is \"container\", but docker is not there; on Debian and Ubuntu the package docker.io has it";
-    assert_eq!(told, words);
-}
-
-#[actix_rt::test]
 async fn a_webots_that_does_not_become_ready_tells_its_level_and_the_keys() {
-    let (forge, webots) = (Forge::with_arm(), Webots::script("echo 'no module named arm'; exit 1"));
     for (isolation, is_told) in [("sandbox", true), ("none", false)] {
-        let server = simulation_server(&webots.path(), forge.path(), 1).set("isolation", isolation).start().await;
+        let webots = Webots::script("echo 'no module named arm'; exit 1");
+        let server = server_of(webots, 1).set("isolation", isolation).start().await;
         let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
         assert!(told.contains("no module named arm"), "{told}");
         assert_eq!(told.contains("It ran in a sandbox") && told.contains("sandbox.readable"), is_told, "{told}");

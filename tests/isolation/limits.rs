@@ -2,12 +2,10 @@
 
 use std::time::{Duration, Instant};
 
-use crate::simulation::scene::{DEMO, arm, instance_folders, nothing_left};
-use crate::support::client::Client;
-use crate::support::git::Forge;
-use crate::support::program::{Server, server_of, simulation_server};
-use crate::support::webots::Webots;
-use crate::support::{SOON, http, skip, until};
+use super::deeds::as_nobody;
+use super::lives::{long, named};
+use crate::simulation::scene::{instance_folders, nothing_left};
+use crate::support::{Client, DEMO, SOON, Server, Webots, arm, http, open_folder, server_of, skip, until};
 
 const LEVELS: [&str; 2] = ["none", "sandbox"];
 
@@ -49,18 +47,6 @@ async fn who_fills_the_disk_is_told_and_ended() {
 }
 
 #[actix_rt::test]
-async fn a_file_can_not_be_larger_than_the_quota() {
-    let forge = Forge::with_arm();
-    let webots = Webots::script("head -c 20000000 /dev/zero > large; wc -c < large; exit 1");
-    for level in LEVELS {
-        let builder = simulation_server(&webots.path(), forge.path(), 1).set("isolation", level);
-        let server = builder.set("limits.disk", 5).start().await;
-        let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
-        assert!(told.contains("5242880"), "{told}");
-    }
-}
-
-#[actix_rt::test]
 async fn who_forks_without_end_is_told_and_ended() {
     // The kernel keeps an ordinary user's sandbox from it, which goes on.
     let levels: &[&str] = if nix::unistd::getuid().is_root() { &LEVELS } else { &["none"] };
@@ -71,20 +57,19 @@ async fn who_forks_without_end_is_told_and_ended() {
 }
 
 #[actix_rt::test]
-async fn files_that_are_open_are_bounded() {
-    let forge = Forge::with_arm();
-    let webots = Webots::script("echo \"files $(ulimit -Sn) $(ulimit -Hn) core $(ulimit -c)\"; exit 1");
+async fn files_are_bounded_in_size_and_those_that_are_open_in_number() {
+    let script = "head -c 20000000 /dev/zero > large; wc -c < large\n\
+        echo \"files $(ulimit -Sn) $(ulimit -Hn) core $(ulimit -c)\"; exit 1";
     for level in LEVELS {
-        let table = [
+        for (limit, of_the_server, words) in [
             (1500, 5000, "files 1024 1500 core 0"),
             (1500, 1200, "files 1024 1200 core 0"),
             (70, 1200, "files 70 70 core 0"),
-        ];
-        for (limit, of_the_server, words) in table {
-            let builder = simulation_server(&webots.path(), forge.path(), 1).set("isolation", level);
+        ] {
+            let builder = server_of(Webots::script(script), 1).set("isolation", level).set("limits.disk", 5);
             let server = builder.set("limits.openFiles", limit).files(of_the_server).start().await;
             let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
-            assert!(told.contains(words), "{told}");
+            assert!(told.contains(words) && told.contains("5242880"), "{told}");
         }
     }
 }
@@ -171,12 +156,12 @@ impl Drop for Delegated {
 async fn a_simulation_has_a_control_group_of_its_own_where_they_are_delegated() {
     let Some(delegated) = Delegated::new() else {
         return skip(
-            "a_simulation_has_a_control_group_of_its_own_where_they_are_delegated",
+            "a control group of a simulation's own",
             "there is no cgroup v2 in which this user may make groups",
         );
     };
     for level in LEVELS {
-        let hidden = format!("1000.{}", rand::random::<u64>());
+        let hidden = long();
         let webots = Webots::script(&format!("(env -i setsid sleep {hidden} &)\n{DEMO} \"$@\" & wait"));
         let builder = server_of(webots, 1).set("isolation", level);
         let server = builder.before(&delegated.join()).set("timing.grace", 0.5).start().await;
@@ -190,20 +175,8 @@ async fn a_simulation_has_a_control_group_of_its_own_where_they_are_delegated() 
         client.leave().await;
         nothing_left(&server, 1).await;
         until("its group is gone", async || delegated.groups() == ["server"]).await;
-        let all = procfs::process::all_processes().unwrap().flatten();
-        let hiding = all.filter(|one| one.cmdline().is_ok_and(|words| words.contains(&hidden)));
-        assert_eq!(hiding.count(), 0, "{level}: what hides ends too");
+        assert_eq!(named(&hidden), [0; 0], "{level}: what hides ends too");
     }
-}
-
-/// A folder for others, if they can run these programs.
-fn open_to_others() -> Option<tempfile::TempDir> {
-    if super::deeds::as_nobody().is_none() && nix::unistd::getuid().is_root() {
-        return None;
-    }
-    let folder = tempfile::tempdir().unwrap();
-    std::fs::set_permissions(folder.path(), std::os::unix::fs::PermissionsExt::from_mode(0o777)).unwrap();
-    Some(folder)
 }
 
 /// What a program says that may start so many threads and processes, itself among them, as a user who has no other.
@@ -221,7 +194,10 @@ fn said_within(processes: u32, program: &str, arguments: &[&str]) -> String {
 
 #[test]
 fn programs_that_may_start_no_thread_say_so_and_do_not_panic() {
-    let Some(folder) = open_to_others() else { return };
+    if as_nobody().is_none() && nix::unistd::getuid().is_root() {
+        return;
+    }
+    let folder = open_folder();
     let (world, config) = (folder.path().join("a.wbt"), folder.path().join("config.json"));
     std::fs::write(&world, "#VRML_SIM R2025a utf8\n").unwrap();
     std::fs::write(&config, "{\"display\": \":59\", \"isolation\": \"none\"}").unwrap();

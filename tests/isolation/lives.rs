@@ -5,31 +5,27 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
-use crate::simulation::scene::{DEMO, gone_within, nothing_left};
-use crate::support::client::Client;
-use crate::support::git::Forge;
-use crate::support::program::{server_of, simulation_server};
-use crate::support::until;
-use crate::support::webots::Webots;
+use crate::simulation::scene::{gone_within, nothing_left};
+use crate::support::{Client, DEMO, Webots, server_of, until};
 
 /// The processes that have this word in their command line.
-fn named(word: &str) -> Vec<i32> {
+pub fn named(word: &str) -> Vec<i32> {
     let all = procfs::process::all_processes().unwrap().flatten();
     let has = |one: &procfs::process::Process| one.cmdline().is_ok_and(|words| words.iter().any(|one| one == word));
     all.filter(has).map(|one| one.pid()).collect()
 }
 
 /// A number of seconds that no other process sleeps.
-fn long() -> String {
+pub fn long() -> String {
     format!("1000.{}", rand::random::<u64>())
 }
 
 #[actix_rt::test]
 async fn what_hides_on_purpose_ends_with_its_sandbox() {
     for (level, reason) in [("sandbox", "client"), ("sandbox", "kill"), ("none", "client")] {
-        let (forge, hidden) = (Forge::with_arm(), long());
+        let hidden = long();
         let webots = Webots::script(&format!("(env -i setsid sleep {hidden} &)\n{DEMO} \"$@\" & wait"));
-        let builder = simulation_server(&webots.path(), forge.path(), 1).set("isolation", level);
+        let builder = server_of(webots, 1).set("isolation", level);
         let mut server = builder.set("timing.grace", 0.5).start().await;
         let client = Client::ready(&server).await;
         until("it hides", async || named(&hidden).len() == 1).await;
@@ -53,12 +49,12 @@ async fn what_hides_on_purpose_ends_with_its_sandbox() {
 #[actix_rt::test]
 async fn a_simulation_has_its_grace_time_at_each_level() {
     for level in ["none", "sandbox"] {
-        let (forge, folder) = (Forge::with_arm(), tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap());
+        let folder = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap();
         let written = folder.path().join("written");
         // As Webots' launcher does: it hands SIGTERM on, and waits.
         let work = format!("sleep 0.3; echo saved > \"{}\"", written.display());
         let webots = Webots::script(&format!("trap '{work}; exit 0' TERM\n{DEMO} \"$@\" & wait"));
-        let builder = simulation_server(&webots.path(), forge.path(), 1).set("isolation", level);
+        let builder = server_of(webots, 1).set("isolation", level);
         let server = builder.set("sandbox.writable", folder.path().to_str().unwrap()).start().await;
         let client = Client::ready(&server).await;
         client.leave().await;

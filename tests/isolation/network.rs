@@ -12,11 +12,11 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
 use super::deeds::{Stage, as_nobody};
-use crate::simulation::scene::{DEMO, arm, gone_within, nothing_left};
-use crate::support::client::{Client, Heard};
-use crate::support::program::{Builder, Server};
-use crate::support::webots::{Webots, instances_below};
-use crate::support::{display, http, needs, programs, skip, until};
+use crate::simulation::scene::{gone_within, nothing_left};
+use crate::support::client::Heard;
+use crate::support::{
+    Builder, Client, DEMO, Server, Webots, arm, display, http, instances_below, is_told, needs, programs, skip, until,
+};
 
 /// What runs a server as an ordinary user who can have networks; nothing, and a word, where there is none.
 fn ordinary(test: &str) -> Option<&'static str> {
@@ -154,13 +154,19 @@ async fn a_simulation_in_its_own_network_does_not_reach_its_neighbour() {
 }
 
 #[actix_rt::test]
-async fn a_display_is_within_reach_of_its_own_network() {
-    let Some(user) = ordinary("a_display_is_within_reach_of_its_own_network") else { return };
+async fn a_display_is_within_reach_at_each_level_and_of_its_own_network() {
     let _alone = display::alone().await;
     needs("xhost", "x11-xserver-utils");
-    let deeds = [("use the display", "xhost".to_owned())];
-    let change = |builder: Builder| builder.before(user).set("sandbox.network", "own").set("xvfb", true);
-    assert_eq!(Stage::new().tried(&deeds, "sandbox", change).await, ["use the display"]);
+    let deeds = [
+        ("use the display", "xhost".to_owned()),
+        ("use it without its authority", "XAUTHORITY=/dev/null xhost".to_owned()),
+    ];
+    let mut cases = vec![("none", "true", "shared"), ("sandbox", "true", "shared")];
+    cases.extend(ordinary("a_display_is_within_reach_of_its_own_network").map(|user| ("sandbox", user, "own")));
+    for (level, user, network) in cases {
+        let change = |builder: Builder| builder.before(user).set("sandbox.network", network).set("xvfb", true);
+        assert_eq!(Stage::new().tried(&deeds, level, change).await, ["use the display"], "{level}, {network}");
+    }
 }
 
 #[actix_rt::test]
@@ -211,11 +217,7 @@ async fn pasta_ends_with_its_simulation_and_with_the_server() {
             }
             "server" => {
                 // The guardian would do the same a moment later.
-                let guards = |one: &procfs::process::Process| {
-                    one.stat().is_ok_and(|stat| stat.ppid == parent)
-                        && one.cmdline().is_ok_and(|words| words.iter().any(|word| word == "guard"))
-                };
-                kill(Pid::from_raw(all().find(guards).unwrap().pid()), Signal::SIGKILL).unwrap();
+                kill(Pid::from_raw(server.guardian()), Signal::SIGKILL).unwrap();
                 server.signal(Signal::SIGKILL);
                 server.ended().await;
             }
@@ -242,8 +244,7 @@ async fn how_a_program_has_ended_is_told_from_its_own_network() {
     ] {
         let webots = Webots::script(script);
         let server = server(&stage, &webots, user, "own").start().await;
-        let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
-        assert!(told.contains(words), "{told}");
+        is_told(&server, &arm(), words).await;
     }
 }
 

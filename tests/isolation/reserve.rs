@@ -1,21 +1,16 @@
 //! The reserve of the disk: whatever simulations write, it is not used up.
 
-use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use nix::sys::statvfs::statvfs;
 
-use super::deeds::as_nobody;
-use crate::simulation::scene::{DEMO, instance_folders, nothing_left};
-use crate::support::client::Client;
+use super::deeds::{as_nobody, open};
+use crate::simulation::scene::{instance_folders, nothing_left};
 use crate::support::disk::{self, Full};
-use crate::support::git::Forge;
-use crate::support::program::{Builder, Server, simulation_server};
-use crate::support::webots::Webots;
-use crate::support::{SOON, skip, until};
+use crate::support::{Builder, Client, DEMO, SOON, Server, Webots, open_folder, server_of, skip, until};
 
 /// The size of the disk, in MiB; `diskReserve` is as it is by itself.
 const SIZE: u32 = 1024;
@@ -48,17 +43,15 @@ fn free(folder: &Path) -> u64 {
 }
 
 /// Notes the least room that a disk has.
-struct Least {
-    bytes: Arc<AtomicU64>,
-    is_over: Arc<AtomicBool>,
-}
+struct Least(Arc<AtomicU64>);
 
 impl Least {
+    /// Until this value is dropped.
     fn of(folder: &Path) -> Self {
-        let least = Self { bytes: Arc::new(AtomicU64::new(free(folder))), is_over: Arc::default() };
-        let (folder, bytes, is_over) = (folder.to_owned(), Arc::clone(&least.bytes), Arc::clone(&least.is_over));
+        let (folder, least) = (folder.to_owned(), Self(Arc::new(AtomicU64::new(u64::MAX))));
+        let bytes = Arc::downgrade(&least.0);
         std::thread::spawn(move || {
-            while !is_over.load(Ordering::Relaxed) {
+            while let Some(bytes) = bytes.upgrade() {
                 bytes.fetch_min(free(&folder), Ordering::Relaxed);
                 std::thread::sleep(Duration::from_millis(1));
             }
@@ -67,23 +60,14 @@ impl Least {
     }
 
     fn mib(&self) -> u64 {
-        self.bytes.load(Ordering::Relaxed) >> 20
-    }
-}
-
-impl Drop for Least {
-    fn drop(&mut self) {
-        self.is_over.store(true, Ordering::Relaxed);
+        self.0.load(Ordering::Relaxed) >> 20
     }
 }
 
 /// A server on a disk of its own, whose simulations do what `go` in their project says.
-async fn server(forge: &Forge, webots: &Webots, folder: &Path, change: impl FnOnce(Builder) -> Builder) -> Server {
-    for folder in [forge.path(), webots.path().parent().unwrap()] {
-        std::fs::set_permissions(folder, std::fs::Permissions::from_mode(0o755)).unwrap();
-    }
-    std::fs::set_permissions(folder, std::fs::Permissions::from_mode(0o777)).unwrap();
-    let builder = simulation_server(&webots.path(), forge.path(), 2).folder(folder).set("timing.heartbeat", 0.5);
+async fn server(webots: Webots, folder: &Path, change: impl FnOnce(Builder) -> Builder) -> Server {
+    open(folder);
+    let builder = server_of(webots, 2).folder(folder).set("timing.heartbeat", 0.5);
     change(builder.set("isolation", "sandbox").set("limits.disk", 1_000_000)).start().await
 }
 
@@ -111,25 +95,21 @@ fn go(folder: &Path, line: &str) {
 #[actix_rt::test]
 async fn simulations_never_use_up_the_reserve_of_the_disk() {
     disk::hide_mounts_from_others();
-    let folder = tempfile::tempdir().unwrap();
-    std::fs::set_permissions(folder.path(), std::fs::Permissions::from_mode(0o755)).unwrap();
+    let folder = open_folder();
     let small = folder.path().join("small");
     if !disk::small_disk(&small, SIZE) {
         return skip("simulations_never_use_up_the_reserve_of_the_disk", "only root may mount a small disk");
     }
-    let (forge, webots) = (Forge::with_arm(), webots());
     let mut users = vec![("root", "true")];
     users.extend(as_nobody().map(|nobody| ("nobody", nobody)));
     for (user, before) in users {
         let own = small.join(user);
         std::fs::create_dir(&own).unwrap();
-        let server = server(&forge, &webots, &own, |builder| builder.before(before)).await;
+        let server = server(webots(), &own, |builder| builder.before(before)).await;
         let (mut innocent, folder) = doing(&server, "").await;
         go(&folder, "true");
-        let mut deeds = vec![("many", MANY, ""), ("nameless", NAMELESS, "")];
         // Root sees what hides, too.
-        deeds.push(("hidden", NAMELESS, "hidden"));
-        for (name, deed, argument) in deeds {
+        for (name, deed, argument) in [("many", MANY, ""), ("nameless", NAMELESS, ""), ("hidden", NAMELESS, "hidden")] {
             let what = format!("{user}, {name}");
             let (mut client, folder) = doing(&server, deed).await;
             let least = Least::of(&small);
@@ -143,8 +123,7 @@ async fn simulations_never_use_up_the_reserve_of_the_disk() {
             eprintln!("{what}: {} MiB were left, {told}", least.mib());
             assert!(least.mib() > 0, "{what}: the reserve was used up");
             until("there is room again", async || free(&small) >> 20 > 512).await;
-            let is_ready = async || server.health().await.0 == 200;
-            until("it is ready again", is_ready).await;
+            until("it is ready again", async || server.health().await.0 == 200).await;
             innocent.until(".").await;
         }
         innocent.leave().await;
@@ -159,8 +138,7 @@ async fn no_simulation_ends_where_another_program_fills_the_disk() {
     if !disk::small_disk(folder.path(), 64) {
         return skip("no_simulation_ends_where_another_program_fills_the_disk", "only root may mount a small disk");
     }
-    let (forge, webots) = (Forge::with_arm(), Webots::script(&format!("{DEMO} \"$@\" & wait")));
-    let server = server(&forge, &webots, folder.path(), |builder| builder.set("diskReserve", 8)).await;
+    let server = server(Webots::launcher(), folder.path(), |builder| builder.set("diskReserve", 8)).await;
     let mut client = Client::ready(&server).await;
     let _filler = Full::at(folder.path());
     until("it is full", async || server.health().await.0 == 503).await;

@@ -2,27 +2,12 @@
 
 use std::path::Path;
 
-use crate::simulation::scene::{DEMO, instance_folders, nothing_left};
-use crate::support::client::Client;
-use crate::support::git::Forge;
-use crate::support::program::simulation_server;
-use crate::support::until;
-use crate::support::webots::Webots;
+use crate::simulation::scene::{instance_folders, nothing_left};
+use crate::support::{Client, DEMO, Webots, server_of, until};
 
 const LEVELS: [&str; 2] = ["none", "sandbox"];
 /// What the controller of [`Forge::with_arm`] has.
 const ORIGINAL: &str = "print('original')\n";
-
-/// Asks for a reset, and gives back the answer.
-async fn reset(client: &mut Client) -> String {
-    client.send(r#"{"reset controller": "c/c.py"}"#).await;
-    loop {
-        let answer = client.until("").await;
-        if answer.starts_with("reset") || answer.starts_with("loading: Error") {
-            return answer;
-        }
-    }
-}
 
 #[actix_rt::test]
 async fn a_reset_replaces_a_link_and_follows_none() {
@@ -37,7 +22,7 @@ async fn a_reset_replaces_a_link_and_follows_none() {
     ];
     for level in LEVELS {
         for (deed, is_restored) in table {
-            let (forge, outside) = (Forge::with_arm(), tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap());
+            let outside = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap();
             let victim = outside.path().join("victim");
             std::fs::write(&victim, "untouched").unwrap();
             std::fs::create_dir(outside.path().join("c")).unwrap();
@@ -46,9 +31,9 @@ async fn a_reset_replaces_a_link_and_follows_none() {
             // What a project's folder says of files and repositories is not for the server's git.
             let git = "echo '*.py working-tree-encoding=UTF-16' > .gitattributes; echo 'gitdir: /tmp' > .git";
             let webots = Webots::script(&format!("{deed}\n{git}\n{DEMO} \"$@\" & wait"));
-            let server = simulation_server(&webots.path(), forge.path(), 1).set("isolation", level).start().await;
+            let server = server_of(webots, 1).set("isolation", level).start().await;
             let mut client = Client::ready(&server).await;
-            let answer = reset(&mut client).await;
+            let answer = client.reset("c/c.py").await;
             let folder = instance_folders(&server.folder)[0].clone();
             let file = folder.join("project/controllers/c/c.py");
             assert_eq!(answer.starts_with("reset"), is_restored, "{level}, {deed}: {answer}");
@@ -79,17 +64,17 @@ const EXCHANGE: &str = "import ctypes, os, sys\n\
 
 #[actix_rt::test]
 async fn who_exchanges_folders_and_links_during_a_reset_leads_nothing_out_of_the_project() {
-    let (forge, outside) = (Forge::with_arm(), tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap());
+    let outside = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap();
     let outside_shown = outside.path().display();
     let webots = Webots::script(&format!("python3 -c \"{EXCHANGE}\" '{outside_shown}' &\n{DEMO} \"$@\" & wait"));
-    let server = simulation_server(&webots.path(), forge.path(), 1).set("isolation", "sandbox");
+    let server = server_of(webots, 1).set("isolation", "sandbox");
     // A client may ask for so much between two pings.
     let server = server.set("timing.ping", 0.2).start().await;
     let mut client = Client::ready(&server).await;
     let project = instance_folders(&server.folder)[0].join("project");
     until("the names are exchanged", async || project.join("exchanging").exists()).await;
     for _ in 0..100 {
-        reset(&mut client).await;
+        client.reset("c/c.py").await;
     }
     let written = std::fs::read_dir(outside.path()).unwrap().count();
     assert_eq!(written, 0, "it was written outside of the project");

@@ -1,9 +1,6 @@
 //! Whose worlds run here.
 
-use crate::support::client::Client;
-use crate::support::git::Forge;
-use crate::support::program::simulation_server;
-use crate::support::webots::Webots;
+use crate::support::{Forge, Webots, is_told, simulation_server};
 
 #[actix_rt::test]
 async fn a_world_runs_only_where_its_repository_is_allowed() {
@@ -16,30 +13,19 @@ async fn a_world_runs_only_where_its_repository_is_allowed() {
     let server = builder.set("blockedRepositories", blocked).start().await;
     let end = "blob/main/worlds/a.wbt";
     let not_allowed = "Docker not enabled: cannot host simulations from repositories outside of those that this simulation server allows";
-    let wrong = "Wrong Webots simulation URL";
+    let is_blocked = "Cannot run simulation from blocked repository";
     let table = [
         (format!("https://github.com/lab/arm/{end}"), "Its last output: ran"),
-        (format!("https://GITHUB.com/lab/arm/{end}"), "Its last output: ran"),
         (format!("https://github.com/lab-evil/arm/{end}"), not_allowed),
-        (format!("https://github.com/lab/secret/{end}"), "Cannot run simulation from blocked repository"),
-        (format!("https://github.com/LAB/Secret/{end}"), "Cannot run simulation from blocked repository"),
-        (format!("https://github.com/lab/secret.git/{end}"), "Cannot run simulation from blocked repository"),
-        (format!("https://github.com/lab/secret.git.git/{end}"), "ends in .git more than once"),
-        ("https://github.com/lab/secret/src/branch/main/worlds/a.wbt".to_owned(), "blocked repository"),
-        ("https://github.com/lab/secret/-/blob/main/worlds/a.wbt".to_owned(), "blocked repository"),
-        (format!("https://github.com/lab/../lab-evil/arm/{end}"), wrong),
-        (format!("https://github.com/lab/%2e%2e/lab-evil/arm/{end}"), wrong),
-        (format!("https://github.com/lab%2farm/x/{end}"), wrong),
-        (format!("https://github.com//lab/arm/{end}"), "Its last output: ran"),
         (format!("https://github.com//lab-evil//arm/{end}"), not_allowed),
-        (format!("https://github.com:444/lab/arm/{end}"), not_allowed),
-        (format!("https://evil.org/github.com/lab/{end}"), not_allowed),
         (format!("https://github.com.evil.org/lab/arm/{end}"), not_allowed),
-        (format!("https://github.com/LAB/Secret.git/{end}"), "Cannot run simulation from blocked repository"),
-        (format!("https://github.com@evil.org/lab/arm/{end}"), wrong),
+        (format!("https://evil.org/github.com/lab/{end}"), not_allowed),
+        (format!("https://github.com/LAB/Secret.git/{end}"), is_blocked),
+        ("https://github.com/lab/secret/src/branch/main/worlds/a.wbt".to_owned(), is_blocked),
+        ("https://github.com/lab/secret/-/blob/main/worlds/a.wbt".to_owned(), is_blocked),
+        (format!("https://github.com/lab/%2e%2e/lab-evil/arm/{end}"), "Wrong Webots simulation URL"),
     ];
     for (url, words) in table {
-        let told = Client::start(&server, &url).await.until("loading: Error:").await;
-        assert!(told.contains(words), "{url}: {told}");
+        is_told(&server, &url, words).await;
     }
 }

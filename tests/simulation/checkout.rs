@@ -7,13 +7,12 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
 use super::git_wrapper::GitWrapper;
-use super::opened::{cached, noise, outcome, reader, size_of, world_text};
-use super::scene::{arm, instance_folders, nothing_left};
-use crate::support::client::Client;
-use crate::support::git::{Forge, git, world};
-use crate::support::program::simulation_server;
-use crate::support::until;
-use crate::support::webots::{Webots, instances_below};
+use super::opened::{cached, reader, size_of, world_text};
+use super::scene::{instance_folders, nothing_left};
+use crate::support::git::git;
+use crate::support::{
+    Client, Forge, Webots, arm, arm_at, instances_below, is_told, outcome, server_of, simulation_server, until, world,
+};
 
 #[actix_rt::test]
 async fn every_kind_of_url_opens_its_world() {
@@ -59,8 +58,7 @@ async fn every_kind_of_url_opens_its_world() {
         (format!("https://gitea.lab:3000/lab/arm/src/commit/{first}/worlds/a.wbt"), "root of main"),
     ];
     for (url, mark) in table {
-        let told = outcome(&server, &url).await;
-        assert!(told.contains(&format!("opened [{mark}]")), "{url}: {told}");
+        is_told(&server, &url, &format!("opened [{mark}]")).await;
     }
     assert!(!server.folder.join("pwned").exists() && !Path::new("pwned").exists(), "a name was run");
     assert!(server.log().contains("is for Webots R2025a"));
@@ -91,11 +89,8 @@ async fn what_is_not_there_or_no_world_is_told_in_words() {
     let none = "0123456789012345678901234567890123456789";
     let table = [
         (world("lab/none", "main", "worlds/a.wbt"), "https://github.com/lab/none does not exist or is not public"),
-        (
-            world("lab/arm", "none", "worlds/a.wbt"),
-            "https://github.com/lab/arm has no branch, tag or commit called \"none\"",
-        ),
-        (world("lab/arm", none, "worlds/a.wbt"), "is in no branch or tag of https://github.com/lab/arm"),
+        (arm_at("none"), "https://github.com/lab/arm has no branch, tag or commit called \"none\""),
+        (arm_at(none), "is in no branch or tag of https://github.com/lab/arm"),
         (world("lab/arm", "main", "worlds/none.wbt"), "worlds/none.wbt in main does not exist"),
         (world("lab/arm", "main", "p/worlds/a.wbt"), "p/worlds/a.wbt in main does not exist"),
         (world("lab/arm", "main", "worlds/passwd.wbt"), "passwd.wbt leads out of its repository"),
@@ -107,7 +102,7 @@ async fn what_is_not_there_or_no_world_is_told_in_words() {
         (world("lab/arm", "main", "project/worlds/b.wbt"), "project/worlds/b.wbt in main does not exist"),
         (world("lab/arm", "main", "etc/worlds/b.wbt"), "etc/worlds/b.wbt in main does not exist"),
         (world("lab/arm", "main", "far/worlds/b.wbt"), "b.wbt does not exist"),
-        (world("lab/arm", &tip[..9], "worlds/a.wbt"), "has no branch, tag or commit called"),
+        (arm_at(&tip[..9]), "has no branch, tag or commit called"),
     ];
     for (url, words) in table {
         let told = outcome(&server, &url).await;
@@ -140,39 +135,25 @@ async fn a_repository_can_run_nothing() {
     }
     // Settings of the user as whom the server runs.
     let home = trap.path().join("home");
-    std::fs::create_dir(&home).unwrap();
+    std::fs::create_dir_all(home.join(".config/git")).unwrap();
+    std::fs::write(home.join(".config/git/attributes"), "*.wbt text eol=crlf\n").unwrap();
     std::fs::write(
         home.join(".gitconfig"),
         format!("[filter \"evil\"]\n\tsmudge = {}\n[core]\n\tsshCommand = false\n", touch("home")),
     )
     .unwrap();
-    let server = simulation_server(&webots.path(), forge.path(), 2).env("HOME", home.to_str().unwrap()).start().await;
-    let told = outcome(&server, &arm()).await;
-    assert!(told.contains("opened [WorldInfo"), "{told}");
+    let builder = simulation_server(&webots.path(), forge.path(), 2).env("HOME", home.to_str().unwrap());
+    let server = builder.env("XDG_CONFIG_HOME", home.join(".config").to_str().unwrap()).start().await;
+    is_told(&server, &arm(), "opened [WorldInfo { title \"Test\" basicTimeStep 32 }]").await;
     let left: Vec<_> = std::fs::read_dir(trap.path()).unwrap().flatten().map(|entry| entry.file_name()).collect();
     assert_eq!(left, ["home"]);
 }
 
 #[actix_rt::test]
-async fn attributes_in_a_home_change_no_checkout() {
-    let (forge, webots, home) = (Forge::with_arm(), Webots::launcher(), tempfile::tempdir().unwrap());
-    let settings = home.path().join(".config/git");
-    std::fs::create_dir_all(&settings).unwrap();
-    // A program at level `none` could write this.
-    std::fs::write(settings.join("attributes"), "*.py text eol=crlf\n").unwrap();
-    let server = simulation_server(&webots.path(), forge.path(), 1).env("HOME", home.path().to_str().unwrap());
-    let server = server.env("XDG_CONFIG_HOME", home.path().join(".config").to_str().unwrap()).start().await;
-    let mut client = Client::start(&server, &world("lab/arm", "main", "worlds/a.wbt")).await;
-    client.until("webots:").await;
-    let file = instance_folders(&server.folder)[0].join("project/controllers/c/c.py");
-    assert_eq!(std::fs::read_to_string(file).unwrap(), "print('original')\n");
-}
-
-#[actix_rt::test]
 async fn equal_checkouts_are_done_once_and_a_cached_start_fetches_nothing() {
-    let (forge, webots) = (Forge::with_arm(), reader());
     let wrapper = GitWrapper::new("case \"$*\" in *fetch*) sleep 0.7;; esac");
-    let server = simulation_server(&webots.path(), forge.path(), 6).env("PATH", &wrapper.path()).start().await;
+    let server = server_of(reader(), 6).env("PATH", &wrapper.path()).start().await;
+    let forge = server.forge();
     let all = join_all((0..5).map(|_| async { outcome(&server, &arm()).await })).await;
     assert!(all.iter().all(|told| told.contains("opened [WorldInfo")), "{all:?}");
     let count = |what: &str| wrapper.calls().iter().filter(|call| call.split(' ').any(|word| word == what)).count();
@@ -180,13 +161,11 @@ async fn equal_checkouts_are_done_once_and_a_cached_start_fetches_nothing() {
     outcome(&server, &arm()).await;
     assert_eq!((count("ls-remote"), count("fetch"), count("checkout")), (2, 1, 6));
     // Only what has changed is fetched.
-    let work = forge.work_tree("lab/arm", "main");
-    std::fs::write(work.join("noise"), noise(1 << 20)).unwrap();
-    forge.commit_work_tree("lab/arm", "main");
+    forge.commit_noise("lab/arm", 1 << 20);
     outcome(&server, &arm()).await;
     let before = size_of(&server.folder.join("cache/git"));
     forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("changed"))]);
-    assert!(outcome(&server, &arm()).await.contains("opened [changed]"));
+    is_told(&server, &arm(), "opened [changed]").await;
     let grown = size_of(&server.folder.join("cache/git")) - before;
     assert!(before > 1 << 20 && grown < 20_000, "{grown} bytes were fetched");
     // A client that waits alone ends git when it leaves.
@@ -200,11 +179,10 @@ async fn equal_checkouts_are_done_once_and_a_cached_start_fetches_nothing() {
 
 #[actix_rt::test]
 async fn progress_moves_in_percent() {
-    let (forge, webots) = (Forge::with_arm(), reader());
     let wrapper = GitWrapper::new(
         "case \"$*\" in *fetch*) for n in 10 35 60 85; do for again in 1 2 3 4; do printf 'Receiving objects: %s%% (1/2)\\r' $n >&2; sleep 0.25; done; done;; esac",
     );
-    let server = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path()).start().await;
+    let server = server_of(reader(), 1).env("PATH", &wrapper.path()).start().await;
     let mut client = Client::start(&server, &arm()).await;
     // Of a step, Webots' page reads one digit before the slash and one after it.
     client.until("loading: Step 1/9 : looking for").await;
@@ -221,9 +199,7 @@ async fn progress_moves_in_percent() {
 #[actix_rt::test]
 async fn a_kill_in_the_middle_of_a_fetch_harms_no_later_start() {
     let (forge, webots) = (Forge::with_arm(), reader());
-    let work = forge.work_tree("lab/arm", "main");
-    std::fs::write(work.join("noise"), noise(3 << 20)).unwrap();
-    forge.commit_work_tree("lab/arm", "main");
+    forge.commit_noise("lab/arm", 3 << 20);
     let folder = tempfile::tempdir().unwrap();
     let start = || simulation_server(&webots.path(), forge.path(), 2).folder(folder.path());
     // Half a pack, then nothing more. It is said again and again: of what comes close together clients hear the newest only,
@@ -249,7 +225,7 @@ async fn a_kill_in_the_middle_of_a_fetch_harms_no_later_start() {
         server.ended().await;
         until("git has ended", async || instances_below(folder.path()).is_empty()).await;
         let server = start().start().await;
-        assert!(outcome(&server, &arm()).await.contains("opened [WorldInfo"));
+        is_told(&server, &arm(), "opened [WorldInfo").await;
         let is_whole = async || !cached(&server).iter().any(|path| has_half_a_pack(path));
         until("the half of a pack is gone", is_whole).await;
         std::fs::remove_dir_all(folder.path().join("cache/git")).unwrap();
@@ -263,47 +239,20 @@ fn has_half_a_pack(repository: &Path) -> bool {
 }
 
 #[actix_rt::test]
-async fn one_controller_is_reset_at_a_time() {
+async fn a_controller_is_reset_and_nothing_else_and_one_at_a_time() {
     let (forge, webots, folder) = (Forge::with_arm(), Webots::launcher(), tempfile::tempdir().unwrap());
+    forge.commit("lab/arm", "main", &[("protos/p.txt", "original")]);
     let mark = folder.path().join("wait");
     let wrapper = GitWrapper::new(&format!("while [ -e {} ]; do sleep 0.05; done", mark.display()));
-    let builder = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path());
-    let server = builder.start().await;
-    let mut client = Client::ready(&server).await;
-    std::fs::write(&mark, "").unwrap();
-    for _ in 0..3 {
-        client.send(r#"{"reset controller": "c/c.py"}"#).await;
-    }
-    let ignored = "a controller is being reset already";
-    until("two are ignored", async || server.log().matches(ignored).count() == 2).await;
-    std::fs::remove_file(&mark).unwrap();
-    client.until("reset controller: c/c.py").await;
-    client.send(r#"{"reset controller": "c/c.py"}"#).await;
-    client.until("reset controller: c/c.py").await;
-}
-
-#[actix_rt::test]
-async fn a_controller_is_reset_and_nothing_else() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    forge.commit("lab/arm", "main", &[("protos/p.txt", "original")]);
-    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
+    let server = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path()).start().await;
     let mut client = Client::ready(&server).await;
     let project = instance_folders(&server.folder)[0].join("project");
     let file = project.join("controllers/c/c.py");
-    let reset = async |client: &mut Client, name: &str| {
-        client.send(&serde_json::json!({ "reset controller": name }).to_string()).await;
-        loop {
-            let answer = client.until("").await;
-            if answer.starts_with("reset") || answer.starts_with("loading: Error") {
-                return answer;
-            }
-        }
-    };
     std::fs::write(&file, "changed").unwrap();
-    assert_eq!(reset(&mut client, "c/c.py").await, "reset controller: c/c.py");
+    assert_eq!(client.reset("c/c.py").await, "reset controller: c/c.py");
     assert_eq!(std::fs::read_to_string(&file).unwrap(), "print('original')\n");
     std::fs::remove_file(&file).unwrap();
-    assert_eq!(reset(&mut client, "c/c.py").await, "reset controller: c/c.py");
+    assert_eq!(client.reset("c/c.py").await, "reset controller: c/c.py");
     assert!(file.is_file());
     std::fs::write(project.join("protos/p.txt"), "changed").unwrap();
     for name in [
@@ -318,10 +267,20 @@ async fn a_controller_is_reset_and_nothing_else() {
         ":/protos/p.txt",
         "*/c.py",
     ] {
-        let answer = reset(&mut client, name).await;
+        let answer = client.reset(name).await;
         assert!(answer.ends_with("is no file below the project's controllers folder"), "{name:?}: {answer}");
     }
     assert_eq!(std::fs::read_to_string(project.join("protos/p.txt")).unwrap(), "changed");
+    // One at a time.
+    std::fs::write(&mark, "").unwrap();
+    for _ in 0..3 {
+        client.send(r#"{"reset controller": "c/c.py"}"#).await;
+    }
+    let ignored = "a controller is being reset already";
+    until("two are ignored", async || server.log().matches(ignored).count() == 2).await;
+    std::fs::remove_file(&mark).unwrap();
+    client.until("reset controller: c/c.py").await;
+    assert_eq!(client.reset("c/c.py").await, "reset controller: c/c.py");
 }
 
 #[actix_rt::test]

@@ -1,10 +1,9 @@
 //! Commits by their hash: those of branches and tags, and nothing that a forge has from elsewhere.
 
 use super::git_wrapper::GitWrapper;
-use super::opened::{cached, outcome, reader, world_text};
-use crate::support::git::{Forge, WORLD, git, world};
-use crate::support::program::simulation_server;
-use crate::support::until;
+use super::opened::{cached, reader, world_text};
+use crate::support::git::git;
+use crate::support::{Forge, WORLD, arm, arm_at, is_told, outcome, simulation_server, until, world};
 
 #[actix_rt::test]
 async fn any_commit_of_a_branch_or_tag_runs() {
@@ -21,7 +20,7 @@ async fn any_commit_of_a_branch_or_tag_runs() {
         let wrapper = GitWrapper::new("");
         let builder = simulation_server(&webots.path(), forge.path(), 2).env("PATH", &wrapper.path());
         let server = builder.start().await;
-        let run = async |commit: &str| outcome(&server, &world("lab/arm", commit, "worlds/a.wbt")).await;
+        let run = async |commit: &str| outcome(&server, &arm_at(commit)).await;
         for (commit, text) in [(&commits[0], "first"), (&tagged[0], "tagged before"), (&commits[1], "second")] {
             let told = run(commit).await;
             assert!(told.contains(&format!("opened [{text}]")), "{told}");
@@ -38,7 +37,10 @@ async fn any_commit_of_a_branch_or_tag_runs() {
         let before = calls();
         assert!(run(&commits[0]).await.contains("opened [first]"));
         assert_eq!(calls(), before + 2, "ls-tree and checkout: {:#?}", wrapper.calls());
-        // A newer commit than the history has.
+        // A newer commit than the history has, in which a killed fetch has left locks.
+        for lock in ["refs/heads/main.lock", "packed-refs.lock"] {
+            std::fs::write(history.join(lock), "").unwrap();
+        }
         let next = commit("main", can_filter);
         commit("main", "newest");
         assert!(run(&next).await.contains(&format!("opened [{can_filter}]")));
@@ -62,11 +64,10 @@ async fn a_commit_that_no_branch_or_tag_vouches_for_runs_only_where_that_is_allo
         git(&bare, &["config", "uploadpack.allowFilter", can_filter]);
         let none = "0123456789012345678901234567890123456789";
         for hash in [proposed.as_str(), tree.trim(), none] {
-            let url = world("lab/arm", hash, "worlds/a.wbt");
+            let url = arm_at(hash);
             let server = start(false).await;
             for _ in 0..2 {
-                let told = outcome(&server, &url).await;
-                assert!(told.contains("is in no branch or tag of https://github.com/lab/arm. Forges"), "{told}");
+                is_told(&server, &url, "is in no branch or tag of https://github.com/lab/arm. Forges").await;
             }
             drop(server);
             // What was allowed once is not allowed for ever.
@@ -75,18 +76,6 @@ async fn a_commit_that_no_branch_or_tag_vouches_for_runs_only_where_that_is_allo
             assert_eq!(told.contains("opened [WorldInfo"), hash != none, "{told}");
         }
     }
-}
-
-#[actix_rt::test]
-async fn a_history_that_is_too_large_is_told() {
-    let (forge, webots) = (Forge::with_arm(), reader());
-    let old = forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("old"))]);
-    let work = forge.work_tree("lab/arm", "main");
-    std::fs::write(work.join("noise"), super::opened::noise(6 << 20)).unwrap();
-    forge.commit_work_tree("lab/arm", "main");
-    let server = simulation_server(&webots.path(), forge.path(), 2).set("projectSize", 1).start().await;
-    let told = outcome(&server, &world("lab/arm", &old, "worlds/a.wbt")).await;
-    assert_eq!(told, "loading: Error: The history of https://github.com/lab/arm is larger than 1 MiB");
 }
 
 #[actix_rt::test]
@@ -101,26 +90,8 @@ async fn a_branch_that_moves_while_it_is_fetched_gives_the_commit_that_it_named(
     );
     let wrapper = GitWrapper::new(&moves);
     let server = simulation_server(&webots.path(), forge.path(), 2).env("PATH", &wrapper.path()).start().await;
-    let told = outcome(&server, &world("lab/arm", "main", "worlds/a.wbt")).await;
-    assert!(told.contains("opened [first]"), "{told}");
-    let told = outcome(&server, &world("lab/arm", "main", "worlds/a.wbt")).await;
-    assert!(told.contains("opened [second]"), "{told}");
-}
-
-#[actix_rt::test]
-async fn locks_that_a_killed_fetch_of_the_history_has_left_stop_no_other() {
-    let (forge, webots) = (Forge::new(), reader());
-    let commit = |text: &str| forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text(text))]);
-    let commits = [commit("first"), commit("second")];
-    let server = simulation_server(&webots.path(), forge.path(), 2).start().await;
-    assert!(outcome(&server, &world("lab/arm", &commits[0], "worlds/a.wbt")).await.contains("opened [first]"));
-    let history = cached(&server).into_iter().find(|path| path.to_string_lossy().contains("history")).unwrap();
-    for lock in ["refs/heads/main.lock", "packed-refs.lock"] {
-        std::fs::write(history.join(lock), "").unwrap();
-    }
-    commit("third");
-    let told = outcome(&server, &world("lab/arm", &commits[1], "worlds/a.wbt")).await;
-    assert!(told.contains("opened [second]"), "{told}");
+    is_told(&server, &arm(), "opened [first]").await;
+    is_told(&server, &arm(), "opened [second]").await;
 }
 
 #[actix_rt::test]
@@ -138,19 +109,16 @@ async fn wrong_names_are_told_in_words_and_no_cache_is_thrown_away_for_them() {
         let wrapper = GitWrapper::new("");
         let builder = simulation_server(&webots.path(), forge.path(), 2).env("PATH", &wrapper.path());
         let server = builder.set("anyCommit", any).start().await;
-        assert!(outcome(&server, &world("lab/arm", "main", "worlds/a.wbt")).await.contains("opened"));
+        is_told(&server, &arm(), "opened").await;
         for name in ["folder", "noted"] {
-            let told = outcome(&server, &world("lab/arm", name, "worlds/a.wbt")).await;
-            assert!(told.contains("opened [WorldInfo"), "{told}");
+            is_told(&server, &arm_at(name), "opened [WorldInfo").await;
         }
         for name in ["file", "note", &"a".repeat(64)] {
-            let told = outcome(&server, &world("lab/arm", name, "worlds/a.wbt")).await;
-            assert!(told.contains(&format!("has no branch, tag or commit called {name:?}")), "{told}");
+            is_told(&server, &arm_at(name), &format!("has no branch, tag or commit called {name:?}")).await;
         }
         assert_eq!(wrapper.calls().iter().filter(|call| call.contains(" init ")).count(), 1, "{:#?}", wrapper.calls());
         assert!(!server.log().contains("broken"), "{}", server.log());
-        let told = outcome(&server, &world("lab/none", "main", "worlds/a.wbt")).await;
-        assert!(told.contains("does not exist"), "{told}");
+        is_told(&server, &world("lab/none", "main", "worlds/a.wbt"), "does not exist").await;
         let entries = || std::fs::read_dir(server.folder.join("cache/git")).unwrap().flatten();
         until("nothing is left of it", async || {
             !entries().any(|entry| entry.file_name().to_string_lossy().contains("none"))

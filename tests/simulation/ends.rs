@@ -1,23 +1,28 @@
 //! How simulations end: under one id in the messages, the log, `simulations.csv`, the counters, the monitor and the output.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 
-use super::scene::{DEMO, arm};
-use crate::support::client::Client;
-use crate::support::git::{Forge, world};
-use crate::support::program::{Server, server_of, simulation_server};
-use crate::support::webots::Webots;
-use crate::support::{http, until};
+use super::scene::nothing_left;
+use crate::support::http::{PASSWORD, get_as_administrator};
+use crate::support::{
+    Client, DEMO, Forge, Server, Webots, arm, http, is_told, server_of, simulation_server, until, world,
+};
 
-/// A simulator that ends as a file says: its exit code, at once or once the file is there.
-fn ending(at_once: bool, file: &Path) -> Webots {
-    let (begin, file) = (if at_once { "" } else { "echo begun\n" }, file.display());
-    let demo = if at_once { String::new() } else { format!("{DEMO} \"$@\" &\n") };
-    Webots::script(&format!(
-        "{begin}{demo}until [ -e {file} ]; do sleep 0.02; done\necho last words\nkill %1 2>/dev/null\nexit $(cat {file})"
-    ))
+/// A simulator that ends with an exit code, once that is in a file.
+fn ending(file: &Path) -> Webots {
+    let begun = "printf 'begun\\nred \\033[31m text\\n\\377 no text\\n' >&2";
+    let (demo, file) = (format!("{DEMO} \"$@\" >/dev/null 2>&1 &"), file.display());
+    let ended = format!("until [ -e {file} ]; do sleep 0.02; done\nprintf 'last words\\nwithout end'");
+    Webots::script(&format!("{begun}\n{demo}\n{ended}\nkill %1 2>/dev/null\nexit $(cat {file})"))
+}
+
+/// A server with one such simulator, its forge and the file.
+async fn ending_server() -> (Server, tempfile::TempDir, PathBuf) {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("code");
+    (server_of(ending(&file), 1).set("isolation", "none").start().await, folder, file)
 }
 
 /// The lines of `simulations.csv`, without the first.
@@ -41,10 +46,7 @@ async fn ends(server: &Server, reason: &str) -> f64 {
 
 #[actix_rt::test]
 async fn a_simulation_has_one_id_from_its_first_message_to_its_last_trace() {
-    let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
-    let file = folder.path().join("code");
-    let webots = ending(false, &file);
-    let server = simulation_server(&webots.path(), forge.path(), 1).set("isolation", "none").start().await;
+    let (server, _folder, file) = ending_server().await;
     let mut client = Client::ready(&server).await;
     assert!(client.heard[0].starts_with("session: "), "{:?}", client.heard);
     let id = client.id().to_owned();
@@ -52,7 +54,8 @@ async fn a_simulation_has_one_id_from_its_first_message_to_its_last_trace() {
     assert_eq!(status["simulations"][0]["id"], id.as_str());
     assert!(server.monitor().await.contains(&id));
     let url = server.url(&format!("/output?id={id}"));
-    assert_eq!(http::get(&url).await.text(), "begun\n");
+    let begun = "begun\nred  [31m text\n\u{fffd} no text\n";
+    assert_eq!(http::get(&url).await.text(), begun);
     std::fs::write(&file, "3").unwrap();
     let told = client.until("loading: Error:").await;
     assert!(told.contains("Webots ended with exit code 3"), "{told}");
@@ -66,9 +69,8 @@ async fn a_simulation_has_one_id_from_its_first_message_to_its_last_trace() {
     let kept = async || http::get(&url).await.text();
     until("the output is kept with the events", async || kept().await.contains("ended (crashed)")).await;
     let kept = kept().await;
-    for words in
-        ["asks for https://github.com/lab/arm", ": ready\n", "Webots ended with exit code 3", "begun\nlast words\n"]
-    {
+    let printed = format!("\n\n{begun}last words\nwithout end");
+    for words in ["asks for https://github.com/lab/arm", ": ready\n", "Webots ended with exit code 3", &printed] {
         assert!(kept.contains(words), "{words:?}: {kept}");
     }
     let page = server.monitor().await;
@@ -82,10 +84,7 @@ async fn a_simulation_has_one_id_from_its_first_message_to_its_last_trace() {
 
 #[actix_rt::test]
 async fn each_kind_of_end_is_told_as_such() {
-    let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
-    let file = folder.path().join("code");
-    let webots = ending(false, &file);
-    let mut server = simulation_server(&webots.path(), forge.path(), 1).set("isolation", "none").start().await;
+    let (mut server, _folder, file) = ending_server().await;
     let start = async || Client::ready(&server).await;
     // It ends in order.
     let mut finished = start().await;
@@ -139,23 +138,29 @@ async fn what_a_simulation_has_taken_is_told() {
 
 #[actix_rt::test]
 async fn what_is_kept_needs_the_password_where_there_is_one() {
-    let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
-    let file = folder.path().join("code");
-    std::fs::write(&file, "7").unwrap();
-    let broken = ending(true, &file);
-    let builder = simulation_server(&broken.path(), forge.path(), 1).set("isolation", "none");
-    let server = builder.set("adminPassword", "open sesame").start().await;
+    let server = server_of(Webots::script("exit 7"), 1).set("adminPassword", PASSWORD).start().await;
     let mut client = Client::start(&server, &arm()).await;
     client.until("loading: Error:").await;
     line(&server, client.id()).await;
     let url = server.url(&format!("/output?id={}", client.id()));
     assert_eq!(http::get(&url).await.status.as_u16(), 401);
-    let ask = |url: &str| awc::Client::default().get(url).basic_auth("admin", "open sesame").send();
-    until("it is kept", async || ask(&url).await.is_ok_and(|answer| answer.status() == 200)).await;
+    until("it is kept", async || get_as_administrator(&url).await.status == 200).await;
     for id in ["..%2F..%2Fconfig", "%2Fetc%2Fpasswd", "1-1", ""] {
         let url = server.url(&format!("/output?id={id}"));
-        assert_eq!(ask(&url).await.unwrap().status(), 404, "{id}");
+        assert_eq!(get_as_administrator(&url).await.status, 404, "{id}");
     }
+}
+
+#[actix_rt::test]
+async fn an_output_that_can_not_be_kept_fails_no_start() {
+    let server = server_of(Webots::script("echo 'last words'; exit 3"), 1).start().await;
+    let logs = server.folder.join("log/simulation");
+    std::fs::create_dir_all(&logs).unwrap();
+    // Not even root can make a folder in a file.
+    std::fs::write(logs.join("instances"), "").unwrap();
+    is_told(&server, &arm(), "Webots ended with exit code 3. Its last output: last words").await;
+    assert_eq!(server.log().matches("what Webots prints is not kept").count(), 1);
+    nothing_left(&server, 1).await;
 }
 
 #[actix_rt::test]
@@ -165,7 +170,7 @@ async fn what_hides_or_turns_letters_around_in_a_worlds_name_is_shown_as_such() 
     let (file, encoded) = ("a\u{202e}b\u{2028}\u{200b}.wbt", "c%E2%80%AEd%E2%80%A8.wbt");
     let decoded = "worlds/c\u{202e}d\u{2028}.wbt";
     forge.commit("lab/arm", "main", &[(&format!("worlds/{file}"), text), (decoded, text)]);
-    let webots = Webots::script(&format!("{DEMO} \"$@\" & wait"));
+    let webots = Webots::launcher();
     let server = simulation_server(&webots.path(), forge.path(), 2).start().await;
     let mut clients = Vec::new();
     for name in [file, encoded] {

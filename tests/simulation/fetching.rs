@@ -5,12 +5,10 @@ use std::time::Duration;
 use futures_util::future::join_all;
 
 use super::git_wrapper::GitWrapper;
-use super::opened::{cached, outcome, reader, world_text};
+use super::opened::{cached, reader, world_text};
 use super::scene::stages;
-use crate::support::client::Client;
-use crate::support::git::{Forge, git, world};
-use crate::support::program::simulation_server;
-use crate::support::until;
+use crate::support::git::git;
+use crate::support::{Client, Forge, arm, arm_at, is_told, outcome, simulation_server, until, world};
 
 /// A forge with `lab/arm`: each of these branches has two worlds that name it.
 fn forge(branches: &[&str]) -> Forge {
@@ -38,17 +36,16 @@ async fn a_fetch_that_hangs_holds_up_nobody_who_needs_no_fetch_and_others_only_f
     let builder = simulation_server(&webots.path(), forge.path(), 5).env("PATH", &wrapper.path());
     let server = builder.set("timing.checkout", 18).start().await;
     let ask = async |name: &str, text: &str| {
-        let told = outcome(&server, &world("lab/arm", name, "worlds/a.wbt")).await;
-        assert!(told.contains(&format!("opened [{text}]")), "{name}: {told}");
+        is_told(&server, &arm_at(name), &format!("opened [{text}]")).await;
     };
     ask("main", "main").await;
     let fetches = |commit: &str| wrapper.calls().iter().filter(|call| call.contains(&format!("+{commit}:"))).count();
-    let mut stuck = Client::start(&server, &world("lab/arm", "slow", "worlds/a.wbt")).await;
+    let mut stuck = Client::start(&server, &arm_at("slow")).await;
     until("it hangs", async || fetches(&slow) == 1).await;
     ask("main", "main").await;
     ask(&main, "main").await;
     // The same commit is fetched once, by whatever name and for whatever world, also when the first has left.
-    let mut by_hash = Client::start(&server, &world("lab/arm", &slow, "worlds/a.wbt")).await;
+    let mut by_hash = Client::start(&server, &arm_at(&slow)).await;
     by_hash.until("loading: Step 2/9 : fetching https://github.com/lab/arm: halted").await;
     let mut heir = Client::start(&server, &world("lab/arm", "as-slow", "worlds/b.wbt")).await;
     heir.until("loading: Step 2/9 : fetching https://github.com/lab/arm: halted").await;
@@ -57,7 +54,7 @@ async fn a_fetch_that_hangs_holds_up_nobody_who_needs_no_fetch_and_others_only_f
     until("it has gone", async || stages(&server).await.len() == 2).await;
     // Who comes when most of its time has passed has time left after it.
     actix_rt::time::sleep(Duration::from_secs(8)).await;
-    let mut next = Client::start(&server, &world("lab/arm", "one", "worlds/a.wbt")).await;
+    let mut next = Client::start(&server, &arm_at("one")).await;
     next.until("loading: Step 2/9 : fetching https://github.com/lab/arm: waiting for another fetch").await;
     assert_eq!(fetches(&slow), 1);
     // It ends with its time limit, for all who wait for it.
@@ -81,7 +78,7 @@ async fn many_commits_that_are_wanted_at_once_all_come() {
         [("main", "newer"), ("old", "main"), ("one", "one"), ("two", "two"), ("three", "three"), ("four", "four")];
     let all = wanted.map(|(name, text)| {
         let server = &server;
-        async move { (outcome(server, &world("lab/arm", name, "worlds/a.wbt")).await, text) }
+        async move { (outcome(server, &arm_at(name)).await, text) }
     });
     for (told, text) in join_all(all).await {
         assert!(told.contains(&format!("opened [{text}]")), "{text}: {told}");
@@ -103,7 +100,7 @@ async fn a_git_that_is_stopped_fails_once() {
         let wrapper = GitWrapper::new(&stop);
         let builder = simulation_server(&webots.path(), forge.path(), 2).env("PATH", &wrapper.path());
         let server = builder.set("timing.checkout", 10).start().await;
-        let ask = async || Client::start(&server, &world("lab/arm", "main", "worlds/a.wbt")).await;
+        let ask = async || Client::start(&server, &arm()).await;
         let mut first = ask().await;
         until("it is stopped", async || marks.path().join("stopped").exists()).await;
         let told = first.until("loading: Error:").await;

@@ -1,6 +1,6 @@
 //! A `git` that stands before the real one in the path: it notes each call, and can misbehave.
 
-use std::os::unix::fs::PermissionsExt;
+use crate::support::make_program;
 
 /// A folder with the wrapper.
 pub struct GitWrapper {
@@ -13,14 +13,9 @@ impl GitWrapper {
         let folder = tempfile::tempdir().unwrap();
         let paths = std::env::var_os("PATH").unwrap();
         let real = std::env::split_paths(&paths).map(|folder| folder.join("git")).find(|path| path.is_file()).unwrap();
-        let (file, log) = (folder.path().join("git"), folder.path().join("calls"));
-        let text = format!(
-            "#!/usr/bin/env bash\nREAL={}\necho \"$*\" >> {}\n{script}\nexec \"$REAL\" \"$@\"\n",
-            real.display(),
-            log.display()
-        );
-        std::fs::write(&file, text).unwrap();
-        std::fs::set_permissions(&file, std::fs::Permissions::from_mode(0o755)).unwrap();
+        let (real, log) = (real.display(), folder.path().join("calls"));
+        let note = format!("REAL={real}\necho \"$*\" >> {}", log.display());
+        make_program(&folder.path().join("git"), &format!("{note}\n{script}\nexec \"$REAL\" \"$@\""));
         Self { folder }
     }
 

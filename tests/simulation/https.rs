@@ -5,12 +5,11 @@ use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use super::opened::{cached, outcome, reader, world_text};
+use super::opened::{cached, reader, world_text};
 use crate::support::authority::Authority;
-use crate::support::git::{Forge, git, world};
+use crate::support::git::git;
 use crate::support::listener::{Request, serve};
-use crate::support::program::{Builder, simulation_server};
-use crate::support::webots::Webots;
+use crate::support::{Builder, Forge, Webots, arm, arm_at, is_told, simulation_server, world};
 
 /// A forge that is reached by HTTPS alone.
 struct Https {
@@ -100,9 +99,9 @@ async fn a_forge_is_asked_over_https_and_followed_nowhere_else() {
     let server = server.set("blockedRepositories", serde_json::json!(["https://github.com/lab/secret"])).start().await;
     let missing = "does not exist or is not public";
     let table = [
-        (world("lab/arm", "main", "worlds/a.wbt"), "opened [new]"),
-        (world("lab/arm", &old, "worlds/a.wbt"), "opened [old]"),
-        (world("lab/arm", "main", "worlds/a.wbt"), "opened [new]"),
+        (arm(), "opened [new]"),
+        (arm_at(&old), "opened [old]"),
+        (arm(), "opened [new]"),
         ("https://www.GitHub.com/LAB/Arm.git/blob/main/worlds/a.wbt".to_owned(), "opened [new]"),
         (world("lab/none", "main", "worlds/a.wbt"), missing),
         // Nobody is asked for a password.
@@ -125,16 +124,14 @@ async fn a_forge_is_asked_over_https_and_followed_nowhere_else() {
         (world(&format!("lab/{}arm", "old-".repeat(9)), "main", "worlds/a.wbt"), "has moved again and again"),
     ];
     for (url, words) in table {
-        let told = outcome(&server, &url).await;
-        assert!(told.contains(words), "{url}: {told}");
+        is_told(&server, &url, words).await;
     }
     assert!(plain.accept().is_err(), "a redirect was followed");
     let cached: Vec<_> = cached(&server).into_iter().filter(|folder| folder.join("HEAD").is_file()).collect();
     assert_eq!(cached.len(), 3, "two repositories and the history of one, in whatever spelling: {cached:?}");
     // A forge whose certificate nobody trusts is none.
     let server = https.server(&webots).start().await;
-    let told = outcome(&server, &world("lab/arm", "main", "worlds/a.wbt")).await;
-    assert!(told.contains("certificate"), "{told}");
+    is_told(&server, &arm(), "certificate").await;
 }
 
 #[actix_rt::test]
@@ -151,8 +148,6 @@ async fn what_the_administrator_has_set_for_git_holds_and_what_a_world_could_hav
         let builder = https.server(&webots).env("HOME", home.path().to_str().unwrap());
         builder.env("GIT_SSL_CAINFO", https.certificate().to_str().unwrap())
     };
-    let told = outcome(&start().start().await, &url).await;
-    assert!(told.contains("does not exist or is not public"), "the user's own file counts for nothing: {told}");
-    let told = outcome(&start().set("gitConfig", ours.to_str().unwrap()).start().await, &url).await;
-    assert!(told.contains("opened [private]"), "{told}");
+    is_told(&start().start().await, &url, "does not exist or is not public").await;
+    is_told(&start().set("gitConfig", ours.to_str().unwrap()).start().await, &url, "opened [private]").await;
 }

@@ -5,11 +5,9 @@ use std::time::{Duration, Instant};
 use serde_json::json;
 
 use super::life::quick;
-use super::resuming::{ENDED, refused, time};
-use super::scene::{arm, nothing_left};
-use crate::support::client::Client;
-use crate::support::program::demo_server;
-use crate::support::until;
+use super::resuming::{ENDED, refused};
+use super::scene::nothing_left;
+use crate::support::{Client, arm, demo_server, until};
 
 /// In minutes: three seconds. Half of it before the end the client is told.
 const LIMIT: f64 = 0.05;
@@ -46,18 +44,17 @@ async fn who_stays_paused_is_told_and_keeps_its_simulation_or_loses_it() {
 async fn who_runs_is_never_ended_for_it() {
     let server = quick(demo_server(1)).set("idleTimeout", LIMIT).start().await;
     let (mut client, _) = Client::resumable(&server).await;
-    let mut viewer = Client::connect(&format!("ws://127.0.0.1:{}/", server.port + 1)).await.with_scene().await;
-    viewer.send("real-time:-1").await;
+    let mut viewer = Client::connect(&format!("ws://127.0.0.1:{}/", server.port + 1)).await.with_running_scene().await;
     // Twice as long as it may be paused.
-    while time(&mut viewer).await < 6000.0 {}
+    while viewer.time().await < 6000.0 {}
     client.until(".").await;
     assert!(!client.heard.iter().any(|text| text.starts_with("idle: 2")), "{:?}", client.heard);
     viewer.send("pause").await;
     assert_eq!(client.until("idle:").await, TOLD);
     viewer.send("real-time:-1").await;
     assert_eq!(client.until("idle:").await, "idle: never");
-    let now = time(&mut viewer).await;
-    while time(&mut viewer).await < now + 3000.0 {}
+    let now = viewer.time().await;
+    while viewer.time().await < now + 3000.0 {}
     assert_eq!(server.simulations().await.len(), 1);
 }
 

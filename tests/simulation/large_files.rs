@@ -3,13 +3,9 @@
 use std::path::Path;
 
 use super::git_wrapper::GitWrapper;
-use super::opened::{outcome, reader};
-use super::scene::arm;
-use crate::support::client::Client;
-use crate::support::git::{Forge, git};
-use crate::support::program::simulation_server;
-use crate::support::webots::Webots;
-use crate::support::{needs, programs};
+use super::opened::reader;
+use crate::support::git::git;
+use crate::support::{Client, Forge, Webots, arm, is_told, make_program, needs, outcome, programs, simulation_server};
 
 const POINTER: &str = "version https://git-lfs.github.com/spec/v1\noid sha256:0000000000000000000000000000000000000000000000000000000000000000\nsize 12345\n";
 
@@ -42,9 +38,8 @@ async fn what_a_forge_sends_as_large_files_is_bounded_whatever_the_pointers_say(
     // A git-lfs that loads more and more for 12345 bytes.
     let wrapper = GitWrapper::new("");
     let lfs = wrapper.path().split(':').next().map(|folder| Path::new(folder).join("git-lfs")).unwrap();
-    let script = "#!/bin/sh\nmkdir -p \"$GIT_DIR/lfs/tmp\"\nhead -c 5000000 /dev/zero >\"$GIT_DIR/lfs/tmp/a\"\nexec sleep 1000\n";
-    std::fs::write(&lfs, script).unwrap();
-    std::fs::set_permissions(&lfs, std::os::unix::fs::PermissionsExt::from_mode(0o755)).unwrap();
+    let loads = "mkdir -p \"$GIT_DIR/lfs/tmp\"\nhead -c 5000000 /dev/zero >\"$GIT_DIR/lfs/tmp/a\"\nexec sleep 1000";
+    make_program(&lfs, loads);
     let server = simulation_server(&webots.path(), forge.path(), 1).set("projectSize", 1).env("PATH", &wrapper.path());
     let told = outcome(&server.start().await, &arm()).await;
     assert_eq!(told, "loading: Error: The project is larger than 1 MiB");
@@ -66,8 +61,7 @@ async fn files_in_git_lfs_are_loaded() {
     git(&work, &["lfs", "push", "--all", "origin"]);
     let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
     for _ in 0..2 {
-        let told = outcome(&server, &arm()).await;
-        assert!(told.contains("mesh [the real mesh"), "{told}\n{}", server.log());
+        is_told(&server, &arm(), "mesh [the real mesh").await;
     }
     let limited = simulation_server(&webots.path(), forge.path(), 1).set("projectSize", 1).start().await;
     std::fs::write(work.join("meshes/a.dae"), "x".repeat(3 << 20)).unwrap();

@@ -1,12 +1,10 @@
 //! Leaving a simulation in every state and for every reason: nothing of it is left.
 //!
-//! The states are those of [`State`]: connected, waiting, checking out, launching, idle, running, stopping.
+//! The states are those of [`ALL`]: connected, queued, checking out, launching, idle, running, stopping.
 //!
 //! | reason | in which states | tested by |
 //! |---|---|---|
-//! | its client closes | all but stopping, in which it has no client | `a_client_that_closes_leaves_nothing_in_any_state` |
-//! | the connection breaks | the same | `a_connection_that_breaks_leaves_nothing_in_any_state` |
-//! | the connection is half open | the same | `a_half_open_connection_is_found_by_ping_in_any_state` |
+//! | its client closes, the connection breaks or is half open | all but stopping, in which it has no client | `a_client_that_goes...` |
 //! | Webots ends, in three ways | launching, idle, running: in others there is none | `a_client_is_told_how_webots_ended` |
 //! | Webots does not end when asked | stopping | `isolation::lives::a_simulation_that_takes_no_notice_is_killed_after_its_grace_time` |
 //! | git is killed, or hangs | checking out | `checkout::a_kill_in_the_middle_of_a_fetch...`, `fetching::a_git_that_is_stopped...` |
@@ -22,11 +20,8 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
-use super::scene::{ALL, DEMO, Scene, State, arm, gone_within, instance_folders, nothing_left, stages};
-use crate::support::client::Client;
-use crate::support::program::{Builder, Server, demo_server, server_of};
-use crate::support::until;
-use crate::support::webots::{Webots, instances_below};
+use super::scene::{ALL, Scene, gone_within, instance_folders, nothing_left, stages};
+use crate::support::{Builder, Client, DEMO, Webots, arm, demo_server, instances_below, server_of, until};
 
 /// The grace time of most tests here, in seconds.
 const GRACE: f64 = 0.3;
@@ -35,55 +30,53 @@ pub fn quick(builder: Builder) -> Builder {
     builder.set("timing.grace", GRACE).set("timing.heartbeat", 0.2)
 }
 
-const WITH_CLIENT: [State; 6] =
-    [State::Connected, State::Waiting, State::CheckingOut, State::Launching, State::Idle, State::Running];
-
 #[actix_rt::test]
-async fn a_client_that_closes_leaves_nothing_in_any_state() {
-    for state in WITH_CLIENT {
-        let mut scene = Scene::new(state, quick).await;
-        let mut left = Instant::now();
-        scene.client.take().unwrap().leave().await;
-        if let Some(other) = scene.other.take() {
-            until("the line is empty", async || stages(&scene.server).await == ["idle"]).await;
-            left = Instant::now();
-            other.leave().await;
+async fn a_client_that_goes_in_whatever_way_leaves_nothing_in_any_state() {
+    // All but the last, in which it has no client.
+    for state in &ALL[..6] {
+        for way in ["closes", "breaks", "is half open"] {
+            // A client that is not polled answers no pings, and its connection stays open.
+            let silence = if way == "is half open" { 1.5 } else { 60.0 };
+            let change = |builder| quick(builder).set("timing.ping", 0.1).set("timing.silence", silence);
+            let mut scene = Scene::new(state, change).await;
+            let mut left = Instant::now();
+            match way {
+                "closes" => {
+                    scene.client.take().unwrap().leave().await;
+                    if let Some(other) = scene.other.take() {
+                        until("the line is empty", async || stages(&scene.server).await == ["idle"]).await;
+                        left = Instant::now();
+                        other.leave().await;
+                    }
+                }
+                // Dropped without a word.
+                "breaks" => drop((scene.client.take(), scene.other.take())),
+                _ if *state == "connected" => {
+                    until("it is sent away", async || scene.server.log().contains("silent for too long")).await;
+                }
+                _ => {}
+            }
+            if way == "is half open" {
+                nothing_left(&scene.server, 1).await;
+            } else {
+                gone_within(GRACE, left, &scene.server).await;
+            }
+            assert!(!scene.server.log().contains("Wrong message"), "every closed laptop does that");
         }
-        gone_within(GRACE, left, &scene.server).await;
-    }
-}
-
-#[actix_rt::test]
-async fn a_connection_that_breaks_leaves_nothing_in_any_state() {
-    for state in WITH_CLIENT {
-        let mut scene = Scene::new(state, quick).await;
-        // Dropped without a word.
-        let left = Instant::now();
-        drop((scene.client.take(), scene.other.take()));
-        gone_within(GRACE, left, &scene.server).await;
-        assert!(!scene.server.log().contains("Wrong message"), "every closed laptop does that");
-    }
-}
-
-#[actix_rt::test]
-async fn a_half_open_connection_is_found_by_ping_in_any_state() {
-    for state in WITH_CLIENT {
-        // A client that is not polled answers no pings, and its connection stays open.
-        let change = |builder| quick(builder).set("timing.ping", 0.1).set("timing.silence", 1.5);
-        let scene = Scene::new(state, change).await;
-        if state == State::Connected {
-            until("it is sent away", async || scene.server.log().contains("silent for too long")).await;
-        }
-        nothing_left(&scene.server, 1).await;
     }
 }
 
 #[actix_rt::test]
 async fn a_server_that_stops_tells_its_clients_and_leaves_nothing_in_any_state() {
     for state in ALL {
-        let mut scene = Scene::new(state, |builder| quick(builder).set("timing.grace", 1.0)).await;
+        let mut scene = Scene::new(state, |builder| quick(builder).set("timing.grace", 2.0)).await;
         let asked = Instant::now();
         scene.server.signal(Signal::SIGTERM);
+        if state == "stopping" {
+            until("it stops", async || scene.server.log().contains("stopping")).await;
+            // It takes no new ones.
+            scene.client = Some(Client::start(&scene.server, &arm()).await);
+        }
         for client in [&mut scene.client, &mut scene.other].into_iter().flatten() {
             assert_eq!(client.until("loading: Error:").await, "loading: Error: This simulation server is stopping");
             assert_eq!(client.closed().await, Some(1001), "{state:?}");
@@ -111,9 +104,9 @@ async fn a_server_that_is_killed_leaves_nothing_in_any_state() {
 
 #[actix_rt::test]
 async fn what_a_killed_server_has_left_is_removed_at_the_next_start() {
-    let mut scene = Scene::new(State::CheckingOut, quick).await;
+    let mut scene = Scene::new("checkingout", quick).await;
     // The guardian, which does it otherwise, is killed too.
-    kill(Pid::from_raw(guardian(&scene.server)), Signal::SIGKILL).unwrap();
+    kill(Pid::from_raw(scene.server.guardian()), Signal::SIGKILL).unwrap();
     scene.server.signal(Signal::SIGKILL);
     scene.server.ended().await;
     assert_eq!(instance_folders(scene.folder.path()).len(), 1);
@@ -128,19 +121,8 @@ async fn what_a_killed_server_has_left_is_removed_at_the_next_start() {
     until("git is gone", async || instances_below(scene.folder.path()).is_empty()).await;
 }
 
-/// The child of a server that ends the simulations when the server is gone.
-pub fn guardian(server: &Server) -> i32 {
-    let line = |pid: &i32| procfs::process::Process::new(*pid).and_then(|one| one.cmdline()).unwrap_or_default();
-    children(server.pid()).into_iter().find(|pid| line(pid).get(1).is_some_and(|word| word == "guard")).unwrap()
-}
-
 pub fn is_there(pid: i32) -> bool {
     procfs::process::Process::new(pid).is_ok_and(|process| process.stat().is_ok_and(|stat| stat.state != 'Z'))
-}
-
-pub fn children(pid: i32) -> Vec<i32> {
-    let all = procfs::process::all_processes().unwrap().flatten();
-    all.filter(|one| one.stat().is_ok_and(|stat| stat.ppid == pid)).map(|one| one.pid()).collect()
 }
 
 #[actix_rt::test]
@@ -170,15 +152,4 @@ async fn a_client_is_told_how_webots_ended() {
             nothing_left(&server, 1).await;
         }
     }
-}
-
-#[actix_rt::test]
-async fn a_server_that_stops_takes_no_new_clients() {
-    let mut scene = Scene::new(State::Stopping, |builder| quick(builder).set("timing.grace", 2.0)).await;
-    scene.server.signal(Signal::SIGTERM);
-    until("it stops", async || scene.server.log().contains("stopping")).await;
-    let mut late = Client::start(&scene.server, &arm()).await;
-    assert_eq!(late.until("loading: Error:").await, "loading: Error: This simulation server is stopping");
-    assert_eq!(late.closed().await, Some(1001));
-    assert_eq!(scene.server.ended().await, Some(0));
 }

@@ -1,22 +1,27 @@
 //! What is too large, or takes too much.
 
 use super::git_wrapper::GitWrapper;
-use super::opened::{noise, outcome, reader, world_text};
-use super::scene::{arm, nothing_left};
-use crate::support::git::{Forge, WORLD, git, world};
-use crate::support::program::simulation_server;
+use super::opened::{reader, size_of, world_text};
+use super::scene::nothing_left;
+use crate::support::git::git;
+use crate::support::{Forge, WORLD, arm, arm_at, is_told, outcome, simulation_server, until, world};
 
 #[actix_rt::test]
 async fn sizes_are_limited() {
     let (forge, webots) = (Forge::with_arm(), reader());
-    let work = forge.work_tree("lab/arm", "main");
-    std::fs::write(work.join("noise"), noise(6 << 20)).unwrap();
-    forge.commit_work_tree("lab/arm", "main");
+    let old = git(&forge.path().join("lab/arm"), &["rev-parse", "main"]);
+    forge.commit_noise("lab/arm", 6 << 20);
     forge.commit("lab/zeros", "main", &[("worlds/a.wbt", &world_text("zeros")), ("zeros", &"0".repeat(6 << 20))]);
     // A project beside it is small, but all of its commit is fetched.
-    let server = simulation_server(&webots.path(), forge.path(), 2).set("projectSize", 1).start().await;
+    let builder = simulation_server(&webots.path(), forge.path(), 2).set("projectSize", 1);
+    let server = builder.set("cacheSize", 1).start().await;
     let told = outcome(&server, &arm()).await;
     assert!(told.ends_with("is larger than 1 MiB"), "{told}");
+    let told = outcome(&server, &arm_at(old.trim())).await;
+    assert_eq!(told, "loading: Error: The history of https://github.com/lab/arm is larger than 1 MiB");
+    // What was broken off leaves nothing.
+    let cache = server.folder.join("cache/git");
+    until("the cache is within its budget", async || size_of(&cache) < 1 << 20).await;
     let told = outcome(&server, &world("lab/zeros", "main", "worlds/a.wbt")).await;
     assert_eq!(told, "loading: Error: The project is larger than 1 MiB", "it is small only as it is packed");
     // Small files without end: a folder that holds ten times one that holds ten times...
@@ -41,8 +46,7 @@ async fn sizes_are_limited() {
         let root = make_tree(format!("040000 tree {tree}\tbomb\n040000 tree {}\tworlds\n", worlds.trim()));
         let commit = git(&work, &["commit-tree", "-m", "bomb", &root]);
         git(&work, &["push", "--quiet", "--force", "origin", &format!("{}:refs/heads/main", commit.trim())]);
-        let told = outcome(&server, &world("lab/bomb", "main", "worlds/a.wbt")).await;
-        assert!(told.contains(words), "{told}");
+        is_told(&server, &world("lab/bomb", "main", "worlds/a.wbt"), words).await;
     }
     nothing_left(&server, 2).await;
 }
@@ -65,6 +69,5 @@ async fn git_is_bounded_in_memory_and_in_what_it_writes() {
     // The server sets it once git has been started.
     let wrapper = GitWrapper::new("until [ \"$(ulimit -d)\" -le 2097152 ] 2>/dev/null; do sleep 0.01; done");
     let server = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path()).start().await;
-    let told = outcome(&server, &arm()).await;
-    assert!(told.contains("opened"), "{told}");
+    is_told(&server, &arm(), "opened").await;
 }

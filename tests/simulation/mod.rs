@@ -16,7 +16,6 @@ mod limits;
 #[path = "../faults/network.rs"]
 mod network;
 mod opened;
-mod output;
 mod own_failures;
 mod places;
 mod protocol;

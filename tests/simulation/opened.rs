@@ -2,9 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::support::client::Client;
-use crate::support::program::Server;
-use crate::support::webots::Webots;
+use crate::support::{Server, Webots};
 
 /// A Webots that tells which world it was given, and ends: its client hears the world's second line.
 pub fn reader() -> Webots {
@@ -15,16 +13,6 @@ pub fn world_text(mark: &str) -> String {
     format!("#VRML_SIM R2025a utf8\n{mark}\n")
 }
 
-/// What a client that asks for a world is told in the end.
-pub async fn outcome(server: &Server, world: &str) -> String {
-    let mut client = Client::start(server, world).await;
-    let told = client.until("loading: Error:").await;
-    // The words and the code agree in whether another server may take the client.
-    let code = if told.contains(". Connect again: the session server") { 1013 } else { 1000 };
-    assert_eq!(client.closed().await, Some(code), "{told}");
-    told
-}
-
 pub fn size_of(folder: &Path) -> u64 {
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
     entries
@@ -32,13 +20,6 @@ pub fn size_of(folder: &Path) -> u64 {
             if entry.path().is_dir() { size_of(&entry.path()) } else { entry.metadata().map_or(0, |about| about.len()) }
         })
         .sum()
-}
-
-/// Bytes that can't be packed.
-pub fn noise(bytes: usize) -> Vec<u8> {
-    let mut noise = vec![0; bytes];
-    rand::fill(&mut noise[..]);
-    noise
 }
 
 pub fn cached(server: &Server) -> Vec<PathBuf> {

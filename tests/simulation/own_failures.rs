@@ -2,29 +2,29 @@
 //! no text for a client tells where something is on the machine.
 
 use std::os::unix::fs::PermissionsExt;
-use std::path::Path;
-
-use serde_json::Value;
+use std::path::PathBuf;
 
 use super::ends::line;
-use super::scene::{DEMO, arm};
-use crate::support::client::Client;
-use crate::support::git::{Forge, world};
-use crate::support::program::{Server, session_server, simulation_server};
-use crate::support::webots::Webots;
-use crate::support::{http, until};
+use crate::support::{
+    Client, DEMO, Forge, Server, Webots, arm, demo_server, http, server_of, session_server, simulation_server, until,
+    world,
+};
 
 async fn failed_starts(server: &Server) -> u64 {
-    let page: Value = server.status().await;
-    page["failedStarts"].as_u64().unwrap()
+    server.status().await["failedStarts"].as_u64().unwrap()
+}
+
+/// A server whose Webots fails until there is a file.
+async fn broken(places: u16) -> (Server, tempfile::TempDir, PathBuf) {
+    let folder = tempfile::tempdir().unwrap();
+    let repaired = folder.path().join("repaired");
+    let webots = Webots::script(&format!("[ -e {} ] || exit 3\n{DEMO} \"$@\" & wait", repaired.display()));
+    (server_of(webots, places).set("isolation", "none").start().await, folder, repaired)
 }
 
 #[actix_rt::test]
 async fn a_client_whose_start_fails_for_the_servers_reason_is_sent_elsewhere_and_the_server_tells_so() {
-    let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
-    let repaired = folder.path().join("repaired");
-    let webots = Webots::script(&format!("[ -e {} ] || exit 3\n{DEMO} \"$@\" & wait", repaired.display()));
-    let server = simulation_server(&webots.path(), forge.path(), 2).set("isolation", "none").start().await;
+    let (server, _folder, repaired) = broken(2).await;
     for count in 1..=3 {
         let mut client = Client::start(&server, &arm()).await;
         let told = client.until("loading: Error:").await;
@@ -47,22 +47,14 @@ async fn a_client_whose_start_fails_for_the_servers_reason_is_sent_elsewhere_and
 
 #[actix_rt::test]
 async fn a_black_hole_takes_a_handful_of_clients_and_not_a_class() {
-    let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
-    let repaired = folder.path().join("repaired");
-    let broken = Webots::script(&format!("[ -e {} ] || exit 3\n{DEMO} \"$@\" & wait", repaired.display()));
-    let webots = Webots::launcher();
-    let healthy = simulation_server(&webots.path(), forge.path(), 12).start().await;
-    let hole = simulation_server(&broken.path(), forge.path(), 12).set("isolation", "none").start().await;
+    let (hole, _folder, repaired) = broken(12).await;
+    let healthy = demo_server(12).start().await;
     // What else runs on this machine must not close the fleet.
     let servers = [healthy.address(), hole.address()];
     let session = session_server(&servers).set("loadThreshold", 1000).start().await;
-    let status = async || -> Value { session.status().await };
-    let state = |page: &Value, one: usize| page["servers"][one]["state"].as_str().unwrap().to_owned();
-    until("both work", async || {
-        let page = status().await;
-        state(&page, 0) == "up" && state(&page, 1) == "up"
-    })
-    .await;
+    let status = async || session.status().await;
+    let work = async || status().await["servers"].as_array().unwrap().iter().all(|one| one["state"] == "up");
+    until("both work", work).await;
     let (mut running, mut failures) = (Vec::new(), 0);
     while running.len() < 10 {
         let given = http::get(&session.url("/session")).await.text();
@@ -98,10 +90,6 @@ async fn heard(server: &Server, world: &str) -> Vec<String> {
     client.heard
 }
 
-fn allow(path: &Path, mode: u32) {
-    std::fs::set_permissions(path, std::fs::Permissions::from_mode(mode)).unwrap();
-}
-
 #[actix_rt::test]
 async fn no_text_for_a_client_holds_a_path_of_the_machine() {
     let forge = Forge::with_arm();
@@ -129,7 +117,7 @@ async fn no_text_for_a_client_holds_a_path_of_the_machine() {
     }
     all.extend(heard(&server, &arm()).await);
     // Webots can't be run, and is gone.
-    allow(&webots.path(), 0o644);
+    std::fs::set_permissions(webots.path(), std::fs::Permissions::from_mode(0o644)).unwrap();
     all.extend(heard(&server, &arm()).await);
     std::fs::remove_file(webots.path()).unwrap();
     all.extend(heard(&server, &arm()).await);

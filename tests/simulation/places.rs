@@ -6,31 +6,29 @@ use std::net::TcpListener;
 use std::time::Duration;
 
 use super::git_wrapper::GitWrapper;
-use super::scene::{arm, nothing_left};
-use crate::support::client::Client;
-use crate::support::git::Forge;
-use crate::support::program::{demo_server, simulation_server};
-use crate::support::until;
-use crate::support::webots::Webots;
+use super::scene::nothing_left;
+use crate::support::{Client, Forge, Webots, arm, demo_server, simulation_server, until};
 
 #[actix_rt::test]
 async fn the_waiting_line_is_served_in_order_and_forgets_who_leaves() {
     let server = demo_server(2).set("waitingLine", 4).start().await;
+    // A class behind one address gets every free place and the whole line.
+    let start = async || Client::start_from(&server, "203.0.113.9", &arm()).await;
     let mut inside = Vec::new();
     for place in 1..=2 {
-        let mut client = Client::start(&server, &arm()).await;
+        let mut client = start().await;
         assert_eq!(client.until("webots:").await, format!("webots:ws://localhost:{}", server.port + place));
         assert!(!client.heard.iter().any(|text| text.starts_with("queue")), "{:?}", client.heard);
         inside.push(client);
     }
     let mut line = Vec::new();
     for ahead in 0..4 {
-        let mut client = Client::start(&server, &arm()).await;
+        let mut client = start().await;
         assert_eq!(client.until("").await, format!("queue: {ahead}"));
         client.until("loading: waiting for a place").await;
         line.push(client);
     }
-    let mut late = Client::start(&server, &arm()).await;
+    let mut late = start().await;
     let told = late.until("").await;
     let words = "loading: Error: All 2 places of this simulation server are taken, and 4 clients are waiting already";
     assert!(told.starts_with(words), "{told}");
@@ -90,24 +88,6 @@ async fn one_address_leaves_places_and_a_part_of_the_line_to_others() {
     inside.remove(0).leave().await;
     line[0].until("webots:").await;
     assert_eq!(line[1].until("queue: 0").await, "queue: 0");
-}
-
-#[actix_rt::test]
-async fn a_class_behind_one_address_gets_every_free_place_and_the_whole_line() {
-    let server = demo_server(4).set("waitingLine", 2).start().await;
-    let mut all = Vec::new();
-    for _ in 0..4 {
-        let mut client = Client::start_from(&server, "203.0.113.9", &arm()).await;
-        client.until("webots:").await;
-        all.push(client);
-    }
-    for ahead in 0..2 {
-        let mut client = Client::start_from(&server, "203.0.113.9", &arm()).await;
-        assert_eq!(client.until("").await, format!("queue: {ahead}"));
-        all.push(client);
-    }
-    let told = Client::start_from(&server, "203.0.113.9", &arm()).await.until("").await;
-    assert!(told.starts_with("loading: Error: All 4 places of this simulation server are taken"), "{told}");
 }
 
 #[actix_rt::test]

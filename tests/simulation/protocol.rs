@@ -1,19 +1,18 @@
 //! What clients and pages may ask, and what they are told.
 
-use tokio_tungstenite::tungstenite::client::IntoClientRequest;
-
-use super::scene::{arm, stages};
-use crate::support::client::Client;
-use crate::support::git::{Forge, world};
-use crate::support::http;
-use crate::support::program::{Server, demo_server, simulation_server};
-use crate::support::until;
-use crate::support::webots::{Webots, instances_below};
+use super::scene::{nothing_left, stages};
+use crate::support::{Client, Server, arm, arm_at, demo_server, http, instances_below, until, world};
 
 #[actix_rt::test]
 async fn a_message_that_is_none_is_answered_in_words() {
     let server = demo_server(2).start().await;
-    let (_running, mut viewer, processes) = running(&server).await;
+    let mut running = Client::start(&server, &arm()).await;
+    let url = running.until("webots:").await;
+    let mut viewer = Client::connect(&format!("{}/", url.strip_prefix("webots:").unwrap())).await.with_scene().await;
+    let processes_of =
+        |server: &Server| instances_below(&server.folder).into_iter().map(|(pid, _)| pid).collect::<Vec<_>>();
+    let processes = processes_of(&server);
+    assert!(processes.len() >= 2, "launcher and simulator");
     let start = |url: &str| serde_json::json!({"start": {"url": url}}).to_string();
     let table = [
         ("garbage".to_owned(), "Wrong message"),
@@ -29,38 +28,11 @@ async fn a_message_that_is_none_is_answered_in_words() {
         assert!(told.starts_with("loading: Error: ") && told.contains(words), "{text}: {told}");
         assert_eq!(client.closed().await, Some(1000));
     }
-    goes_on(&server, &mut viewer, &processes).await;
-}
-
-/// A client whose simulation runs, a viewer of it, and its processes.
-async fn running(server: &Server) -> (Client, Client, Vec<i32>) {
-    let mut client = Client::start(server, &arm()).await;
-    let url = client.until("webots:").await;
-    let viewer = Client::connect(&format!("{}/", url.strip_prefix("webots:").unwrap())).await.with_scene().await;
-    let processes = processes(server);
-    assert!(processes.len() >= 2, "launcher and simulator");
-    (client, viewer, processes)
-}
-
-fn processes(server: &Server) -> Vec<i32> {
-    instances_below(&server.folder).into_iter().map(|(pid, _)| pid).collect()
-}
-
-/// Whether that simulation is the only one and has its processes, and whether its viewer is answered.
-async fn goes_on(server: &Server, viewer: &mut Client, before: &[i32]) {
-    until("the others are gone", async || stages(server).await.len() == 1).await;
-    assert_eq!(processes(server), before);
-    viewer.send("pause").await;
-    viewer.until("paused by client").await;
-}
-
-#[actix_rt::test]
-async fn no_text_to_a_client_is_html() {
-    let server = demo_server(2).start().await;
+    // What a client names is no HTML.
     let image = "%3Cimg%20src=x%20onerror=alert(1)%3E";
     for url in [
         world("lab/arm", "main", &format!("worlds/{image}.wbt")),
-        world("lab/arm", image, "worlds/a.wbt"),
+        arm_at(image),
         world(&format!("lab/{image}"), "main", "worlds/a.wbt"),
         world("lab/arm", "main", &format!("worlds/{image}.txt")),
     ] {
@@ -69,6 +41,10 @@ async fn no_text_to_a_client_is_html() {
         let html = client.heard.iter().find(|text| text.contains(['<', '>', '&']));
         assert!(html.is_none() && client.heard.iter().any(|text| text.contains("\u{2039}img")), "{:?}", client.heard);
     }
+    until("the others are gone", async || stages(&server).await.len() == 1).await;
+    assert_eq!(processes_of(&server), processes);
+    viewer.send("pause").await;
+    viewer.until("paused by client").await;
 }
 
 #[actix_rt::test]
@@ -95,88 +71,50 @@ async fn oversized_and_binary_messages_end_the_connection_in_words() {
 }
 
 #[actix_rt::test]
-async fn a_message_may_come_in_pieces() {
+async fn messages_in_pieces_too_early_or_again_and_again_do_no_harm() {
     let server = demo_server(2).start().await;
     let text = serde_json::json!({"start": {"url": arm()}, "é": "é".repeat(3000)}).to_string();
     let mut client = Client::connect(&server.websocket("/client")).await;
-    let pieces: Vec<&[u8]> = text.as_bytes().chunks(1001).collect();
-    assert!(pieces.len() > 5);
-    client.send_pieces(&pieces).await;
-    client.until("webots:").await;
-    client.send_pieces(&[b"{\"reset controller\": ", b"", b"\"c/c.py\"}"]).await;
-    client.until("reset controller: c/c.py").await;
-}
-
-#[actix_rt::test]
-async fn a_reset_that_comes_too_early_ends_nothing() {
-    let server = demo_server(2).start().await;
-    let mut client = Client::connect(&server.websocket("/client")).await;
+    // One that comes too early ends nothing.
     let refused = "loading: Error: A controller can be reset only while a simulation runs";
     let reset = r#"{"reset controller": "c/c.py"}"#;
     client.send(reset).await;
     assert_eq!(client.until("").await, refused);
-    client.send(&serde_json::json!({"start": {"url": arm()}}).to_string()).await;
+    let pieces: Vec<&[u8]> = text.as_bytes().chunks(1001).collect();
+    assert!(pieces.len() > 5);
+    client.send_pieces(&pieces).await;
     client.send(reset).await;
     client.until(refused).await;
     client.until("webots:").await;
-}
-
-#[actix_rt::test]
-async fn who_asks_without_reading_is_sent_away() {
-    let server = demo_server(2).start().await;
-    let mut client = Client::ready(&server).await;
+    client.send_pieces(&[b"{\"reset controller\": ", b"", b"\"c/c.py\"}"]).await;
+    client.until("reset controller: c/c.py").await;
+    let start = serde_json::json!({"start": {"url": arm()}}).to_string();
+    client.send(&start).await;
+    until("it is logged", async || server.log().contains("second simulation on one connection; ignored")).await;
+    assert_eq!(stages(&server).await.len(), 1);
+    // Who asks without reading is sent away.
     for _ in 0..150 {
-        client.send(&serde_json::json!({"start": {"url": arm()}}).to_string()).await;
+        client.send(&start).await;
     }
     assert_eq!(client.closed().await, Some(1008));
-    until("it is gone", async || super::scene::stages(&server).await.is_empty()).await;
-}
-
-#[actix_rt::test]
-async fn a_second_start_on_a_connection_is_ignored() {
-    let server = demo_server(2).start().await;
-    let mut client = Client::ready(&server).await;
-    client.send(&serde_json::json!({"start": {"url": arm()}}).to_string()).await;
-    until("it is logged", async || server.log().contains("second simulation on one connection; ignored")).await;
-    assert_eq!(super::scene::stages(&server).await.len(), 1);
-}
-
-#[actix_rt::test]
-async fn only_pages_of_allowed_origins_may_start_simulations() {
-    let builder = demo_server(1);
-    let server = builder.set("allowedOrigins", serde_json::json!(["https://lab.org"])).start().await;
-    for (origin, allowed) in
-        [(Some("https://lab.org"), true), (Some("https://evil.org"), false), (Some("null"), false), (None, true)]
-    {
-        let mut request = server.websocket("/client").into_client_request().unwrap();
-        if let Some(origin) = origin {
-            request.headers_mut().insert("origin", origin.parse().unwrap());
-        }
-        let result = tokio_tungstenite::connect_async(request).await;
-        assert_eq!(result.is_ok(), allowed, "{origin:?}");
-        if let Err(tokio_tungstenite::tungstenite::Error::Http(answer)) = result {
-            assert_eq!(answer.status(), 403);
-        }
-    }
+    until("it is gone", async || stages(&server).await.is_empty()).await;
 }
 
 #[actix_rt::test]
 async fn connections_are_bounded() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = simulation_server(&webots.path(), forge.path(), 1).set("maxClients", 2).start().await;
+    let server = demo_server(1).set("maxClients", 2).start().await;
     let one = Client::connect(&server.websocket("/client")).await;
     let _other = Client::connect(&server.websocket("/client")).await;
-    let third = tokio_tungstenite::connect_async(server.websocket("/client")).await;
-    assert!(matches!(third, Err(tokio_tungstenite::tungstenite::Error::Http(answer)) if answer.status() == 503));
+    let third = async || Client::with_headers(&server.websocket("/client"), &[]).await;
+    assert_eq!(third().await.err(), Some(503));
     one.leave().await;
-    until("there is room", async || tokio_tungstenite::connect_async(server.websocket("/client")).await.is_ok()).await;
+    until("there is room", async || third().await.is_ok()).await;
     // One address leaves some to others.
-    let server = simulation_server(&webots.path(), forge.path(), 1).set("maxClients", 4).start().await;
-    let connect = async |address| Client::try_from_address(&server, address).await;
+    let server = demo_server(1).set("maxClients", 4).start().await;
+    let connect = async |address| Client::from_address(&server, address).await;
     let greedy = [connect("203.0.113.9").await, connect("203.0.113.9").await, connect("203.0.113.9").await];
     assert!(greedy.iter().all(Result::is_ok));
-    let refused = connect("203.0.113.9").await.map(drop).unwrap_err();
-    assert!(matches!(&*refused, tokio_tungstenite::tungstenite::Error::Http(answer) if answer.status() == 429));
+    assert_eq!(connect("203.0.113.9").await.err(), Some(429));
     connect("203.0.113.10").await.unwrap();
 }
 
@@ -220,7 +158,7 @@ async fn outcomes_are_counted() {
     Client::start(&server, &world("other/x", "main", "worlds/a.wbt")).await.until("loading: Error:").await;
     waits.leave().await;
     ready.leave().await;
-    super::scene::nothing_left(&server, 1).await;
+    nothing_left(&server, 1).await;
     Client::start(&server, &world("lab/none", "main", "worlds/a.wbt")).await.until("loading: Error:").await;
     for (counter, expected) in [
         ("starts_total{outcome=\"ready\"}", 1),

@@ -1,20 +1,14 @@
 //! A server that can start no simulation says so and is not offered; one that is limited says that too.
 
-use std::path::PathBuf;
-
 use serde_json::Value;
 
-use super::scene::{arm, instance_folders, nothing_left};
-use crate::support::client::Client;
-use crate::support::git::Forge;
-use crate::support::program::{Server, demo_server, session_server, simulation_server};
-use crate::support::webots::Webots;
-use crate::support::{http, until};
+use crate::support::{
+    Client, Forge, Server, Webots, arm, demo_server, http, is_told, session_server, simulation_server, until,
+};
 
 /// Whether the session server counts its only simulation server as one that works; a busy machine may make it full.
 async fn works(session: &Server) -> bool {
-    let page: Value = session.status().await;
-    ["up", "full"].contains(&page["servers"][0]["state"].as_str().unwrap())
+    ["up", "full"].contains(&session.status().await["servers"][0]["state"].as_str().unwrap())
 }
 
 #[actix_rt::test]
@@ -41,30 +35,19 @@ async fn a_server_without_webots_says_so_and_is_not_offered_until_there_is_one()
 
 #[actix_rt::test]
 async fn a_display_that_is_missing_is_a_problem_for_webots_itself() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let webots = Webots::launcher();
     let home = webots.path().parent().unwrap().to_str().unwrap().to_owned();
-    let server = simulation_server(&webots.path(), forge.path(), 1)
-        .set("webots", Value::Null)
-        .set("webotsHome", home)
-        .set("display", ":59")
-        .start()
-        .await;
+    let itself = || demo_server(1).set("webots", Value::Null).set("webotsHome", home.as_str());
+    let server = itself().set("display", ":59").start().await;
     until("it is told", async || server.health().await.0 == 503).await;
     assert!(server.health().await.1.contains("no display answers at :59"));
-    let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
-    assert!(told.contains("no display answers at :59"), "{told}");
-}
-
-#[actix_rt::test]
-async fn the_display_of_each_gpu_that_answers_is_needed() {
+    is_told(&server, &arm(), "no display answers at :59").await;
+    // That of each GPU which answers is needed.
     let library = super::readings::gpu_driver();
     let mark = library.path().join("mark");
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = simulation_server(&webots.path(), forge.path(), 1)
+    let server = itself()
         .env("LD_LIBRARY_PATH", library.path().to_str().unwrap())
         .env("NVML_LOST", mark.to_str().unwrap())
-        .set("webots", Value::Null)
-        .set("webotsHome", webots.path().parent().unwrap().to_str().unwrap())
         .set("gpus", "spread")
         .set("displays", serde_json::json!([":59000", ":59001"]))
         .start()
@@ -110,35 +93,13 @@ async fn a_server_that_can_open_no_file_is_not_ready_until_it_can() {
 }
 
 #[actix_rt::test]
-async fn a_limit_of_files_that_allows_no_client_is_refused_in_one_line() {
-    let said = demo_server(1).files(128).refused(1).await;
-    assert!(said.starts_with("error: 128 files may be open, which is not enough for 1 places"), "{said}");
-}
-
-#[actix_rt::test]
-async fn the_limit_of_files_is_raised_as_far_as_it_is_needed() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let builder = simulation_server(&webots.path(), forge.path(), 10).set("maxClients", 300);
-    let server = builder.before("ulimit -Sn 256").start().await;
+async fn the_limit_of_files_is_raised_as_far_as_it_is_needed_and_one_without_clients_is_refused() {
+    let server = demo_server(10).set("maxClients", 300).before("ulimit -Sn 256").start().await;
     let limits = procfs::process::Process::new(server.pid()).unwrap().limits().unwrap();
     let procfs::process::LimitValue::Value(soft) = limits.max_open_files.soft_limit else { panic!("{limits:?}") };
     assert_eq!(soft, 128 + 10 * 8 + 300 * 2);
-    let few = simulation_server(&webots.path(), forge.path(), 10).files(300).start().await;
+    let few = demo_server(10).files(300).start().await;
     assert!(few.log().contains("300 files may be open, which is enough for 46 clients"), "{}", few.log());
-}
-
-#[actix_rt::test]
-async fn clients_that_leave_at_once_leave_no_folder() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = simulation_server(&webots.path(), forge.path(), 8).start().await;
-    let visitor = async |number: u64| {
-        for visit in 0..40 {
-            let client = Client::start(&server, &arm()).await;
-            actix_rt::time::sleep(std::time::Duration::from_millis((number + 5 * visit) % 50)).await;
-            client.leave().await;
-        }
-    };
-    futures_util::future::join_all((0..8).map(visitor)).await;
-    until("no folder is left", async || instance_folders(&server.folder) == Vec::<PathBuf>::new()).await;
-    nothing_left(&server, 8).await;
+    let said = demo_server(1).files(128).refused(1).await;
+    assert!(said.starts_with("error: 128 files may be open, which is not enough for 1 places"), "{said}");
 }

@@ -3,14 +3,7 @@
 use std::path::Path;
 use std::process::Command;
 
-use serde_json::Value;
-
-use super::scene::arm;
-use crate::support::client::Client;
-use crate::support::git::Forge;
-use crate::support::program::{Builder, Server, demo_server, simulation_server};
-use crate::support::webots::Webots;
-use crate::support::{http, needs, until};
+use crate::support::{Builder, Client, Server, arm, demo_server, http, needs, until};
 
 /// A folder with the stand-in for NVIDIA's library.
 pub fn gpu_driver() -> tempfile::TempDir {
@@ -50,8 +43,7 @@ async fn gpus_are_read_and_the_least_busy_one_counts() {
 
 /// The state of a server's GPUs: what is wrong with them.
 async fn gpu_problem(server: &Server) -> Option<String> {
-    let page: Value = server.status().await;
-    page["gpuProblem"].as_str().map(str::to_owned)
+    server.status().await["gpuProblem"].as_str().map(str::to_owned)
 }
 
 #[actix_rt::test]
@@ -103,19 +95,17 @@ async fn a_driver_that_is_loaded_later_or_anew_is_found() {
 async fn a_server_that_requires_gpus_is_ready_only_with_them() {
     let library = gpu_driver();
     let mark = library.path().join("mark");
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     let builder = with(library.path()).set("requireGpu", true);
     let server = builder.env("NVML_LOST", mark.to_str().unwrap()).start().await;
-    let health = async |server: &Server| http::try_get(&server.url("/health")).await.unwrap();
-    until("it is ready", async || health(&server).await.text() == "ok").await;
+    until("it is ready", async || server.health().await.1 == "ok").await;
     std::fs::write(&mark, "").unwrap();
-    until("it is not ready", async || health(&server).await.status.as_u16() == 503).await;
-    let told = health(&server).await.text();
+    until("it is not ready", async || server.health().await.0 == 503).await;
+    let (_, told) = server.health().await;
     assert!(told.contains("(requireGpu), but NVIDIA's driver has lost 1 of 2 GPUs"), "{told}");
     std::fs::remove_file(&mark).unwrap();
-    until("it is ready again", async || health(&server).await.text() == "ok").await;
-    let server = simulation_server(&webots.path(), forge.path(), 1).set("requireGpu", true).start().await;
-    until("it is not ready", async || health(&server).await.text().contains("but sees none")).await;
+    until("it is ready again", async || server.health().await.1 == "ok").await;
+    let server = demo_server(1).set("requireGpu", true).start().await;
+    until("it is not ready", async || server.health().await.1.contains("but sees none")).await;
 }
 
 #[actix_rt::test]
@@ -137,8 +127,7 @@ async fn a_driver_that_hangs_or_is_missing_holds_up_nothing() {
 
 #[actix_rt::test]
 async fn samples_are_written_with_the_columns_of_the_original() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
+    let server = demo_server(1).start().await;
     let _client = Client::ready(&server).await;
     let csv = server.folder.join("log/simulation/monitor.csv");
     let text = || std::fs::read_to_string(&csv).unwrap_or_default();
@@ -151,15 +140,14 @@ async fn samples_are_written_with_the_columns_of_the_original() {
         assert_eq!(values.len(), 12, "{line}");
         assert!(values[0] > 1.0e9 && (0.0..=100.0).contains(&values[3]) && values[4] > 0.0, "{line}");
     }
-    let quiet = simulation_server(&webots.path(), forge.path(), 1).set("monitorLogEnabled", false).start().await;
+    let quiet = demo_server(1).set("monitorLogEnabled", false).start().await;
     until("it has read", async || http::get(&quiet.url("/load")).await.text() != "0").await;
     assert!(!quiet.folder.join("log/simulation/monitor.csv").exists());
 }
 
 /// What of the GPU each simulation of a server with four is told: its number on `/status`, and its variables.
 async fn given(server: &Server) -> Vec<(Option<u64>, String, String)> {
-    let status = server.status().await;
-    let simulations = status["simulations"].as_array().unwrap().clone();
+    let simulations = server.simulations().await;
     let told = simulations.iter().map(|one| {
         let pid = i32::try_from(one["pid"].as_i64().unwrap()).unwrap();
         let environment = procfs::process::Process::new(pid).unwrap().environ().unwrap();

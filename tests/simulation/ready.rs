@@ -8,21 +8,18 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
 use super::ends::line;
-use super::opened::{outcome, world_text};
-use super::scene::{DEMO, arm, nothing_left, stages};
-use crate::support::client::Client;
-use crate::support::git::{Forge, world};
-use crate::support::program::{Server, demo_server, server_of, simulation_server};
+use super::opened::world_text;
+use super::scene::{nothing_left, stages};
 use crate::support::stopwatch::Stopwatch;
-use crate::support::webots::{Webots, instance_folders_in, instances_below};
-use crate::support::{display, programs, until};
+use crate::support::{
+    Client, DEMO, Forge, Server, Webots, arm, demo_server, display, instance_folders_in, instances_below, is_told,
+    outcome, programs, server_of, simulation_server, until, world,
+};
 
 #[actix_rt::test]
 async fn a_launch_that_never_listens_ends_with_its_last_words() {
-    let forge = Forge::with_arm();
     let webots = Webots::script("for n in $(seq 30); do echo \"line $n\"; done; sleep 1000 & wait");
-    let server =
-        simulation_server(&webots.path(), forge.path(), 1).set("timing.launch", 3).set("display", ":57").start().await;
+    let server = server_of(webots, 1).set("timing.launch", 3).set("display", ":57").start().await;
     let mut client = Client::start(&server, &arm()).await;
     let told = client.until("loading: Error:").await;
     assert!(told.contains("Webots did not become ready within") && told.contains("line 11 | "), "{told}");
@@ -80,20 +77,17 @@ async fn signs_of_life_are_passed_on_and_the_pace_is_shown() {
 
 #[actix_rt::test]
 async fn webots_is_given_the_documented_command_line() {
-    let webots = Webots::script("echo \"args: $*\"; exit 1");
-    let server = server_of(webots, 1).start().await;
-    let port = server.port + 1;
-    let rest = format!("--port={port} --heartbeat=5000");
-    let table = [
-        ("x3d", format!("args: --batch --mode=pause --minimize --no-rendering {rest} --stream worlds/a.wbt")),
-        ("w3d", format!("args: --batch --mode=pause --minimize --no-rendering {rest} --stream worlds/a.wbt")),
-        ("mjpeg", format!("args: --batch --mode=pause {rest} --stream=mjpeg worlds/a.wbt")),
-    ];
-    for (mode, words) in table {
+    let server = server_of(Webots::script("echo \"args: $*\"; exit 1"), 1).start().await;
+    let rest = format!("--port={} --heartbeat=5000", server.port + 1);
+    for (mode, hidden, stream) in [
+        ("x3d", "--minimize --no-rendering ", "--stream"),
+        ("w3d", "--minimize --no-rendering ", "--stream"),
+        ("mjpeg", "", "--stream=mjpeg"),
+    ] {
         let mut client = Client::connect(&server.websocket("/client")).await;
         client.send(&serde_json::json!({"start": {"url": arm(), "mode": mode}}).to_string()).await;
         let told = client.until("loading: Error:").await;
-        assert!(told.contains(&words), "{told}");
+        assert!(told.contains(&format!("args: --batch --mode=pause {hidden}{rest} {stream} worlds/a.wbt")), "{told}");
         nothing_left(&server, 1).await;
     }
 }
@@ -109,8 +103,7 @@ async fn webots_gets_the_configured_display_else_the_servers_own_else_the_first(
     ] {
         let builder = simulation_server(&webots.path(), forge.path(), 1).before(environment);
         let builder = if let Some(name) = configured { builder.set("display", name) } else { builder };
-        let told = outcome(&builder.start().await, &arm()).await;
-        assert!(told.contains(&format!("display [{display}]")), "{configured:?}, {environment}: {told}");
+        is_told(&builder.start().await, &arm(), &format!("display [{display}]")).await;
     }
 }
 
@@ -142,46 +135,13 @@ async fn paths_may_have_spaces_and_quotes() {
 
 #[actix_rt::test]
 async fn a_missing_webots_or_xvfb_is_told_with_what_to_do() {
-    let forge = Forge::with_arm();
-    let server = simulation_server(Path::new("/nowhere/webots"), forge.path(), 1).start().await;
+    let server = demo_server(1).set("webots", "/nowhere/webots").start().await;
     let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
     assert!(told.contains("has no Webots that it can run at \"webots\"") && told.contains("webotsHome"), "{told}");
-    let webots = Webots::launcher();
     let git = programs(&["git", "bash", "env", "sh", "rm"]);
-    let builder = simulation_server(&webots.path(), forge.path(), 1).set("xvfb", true);
-    let server = builder.env("PATH", git.path().to_str().unwrap()).start().await;
-    let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
-    assert!(told.contains("(xvfb), but has no Xvfb"), "{told}");
+    let server = demo_server(1).set("xvfb", true).env("PATH", git.path().to_str().unwrap()).start().await;
+    is_told(&server, &arm(), "(xvfb), but has no Xvfb").await;
     nothing_left(&server, 1).await;
-}
-
-#[actix_rt::test]
-async fn each_webots_gets_a_virtual_display_of_its_own() {
-    let _alone = display::alone().await;
-    let forge = Forge::with_arm();
-    let webots = telling_its_display();
-    let builder = simulation_server(&webots.path(), forge.path(), 2).set("xvfb", true);
-    // In a sandbox each has the same number.
-    let server = builder.set("isolation", "none").start().await;
-    let mut clients = Vec::new();
-    let mut displays = Vec::new();
-    for _ in 1..=2 {
-        let client = Client::ready(&server).await;
-        displays.push(display_of(&server, &client).await);
-        clients.push(client);
-    }
-    assert_ne!(displays[0], displays[1]);
-    for client in clients {
-        client.leave().await;
-    }
-    nothing_left(&server, 2).await;
-}
-
-/// A simulator that tells which display it has, and fails without.
-fn telling_its_display() -> Webots {
-    Webots::script(&format!(
-        "test -S /tmp/.X11-unix/X${{DISPLAY#:}} || exit 9\necho \"display $DISPLAY\"\n{DEMO} \"$@\" & wait"
-    ))
 }
 
 /// The display that a simulator has printed.
@@ -195,12 +155,19 @@ async fn display_of(server: &Server, client: &Client) -> String {
 }
 
 #[actix_rt::test]
-async fn the_number_of_a_virtual_display_that_was_killed_is_used_again() {
+async fn each_webots_gets_a_virtual_display_of_its_own_and_the_number_of_one_that_was_killed_is_used_again() {
     let _alone = display::alone().await;
-    let forge = Forge::with_arm();
-    let webots = telling_its_display();
-    let builder = simulation_server(&webots.path(), forge.path(), 1).set("xvfb", true);
-    let server = builder.set("isolation", "none").start().await;
+    // It tells which display it has, and fails without.
+    let webots = Webots::script(&format!(
+        "test -S /tmp/.X11-unix/X${{DISPLAY#:}} || exit 9\necho \"display $DISPLAY\"\n{DEMO} \"$@\" & wait"
+    ));
+    // In a sandbox each has the same number.
+    let server = server_of(webots, 2).set("xvfb", true).set("isolation", "none").start().await;
+    let (one, other) = (Client::ready(&server).await, Client::ready(&server).await);
+    assert_ne!(display_of(&server, &one).await, display_of(&server, &other).await);
+    one.leave().await;
+    other.leave().await;
+    nothing_left(&server, 2).await;
     let mut numbers = BTreeSet::new();
     for _ in 0..12 {
         let client = Client::ready(&server).await;
@@ -208,7 +175,7 @@ async fn the_number_of_a_virtual_display_that_was_killed_is_used_again() {
         let xvfb = instances_below(&server.folder).into_iter().find(|one| one.1.contains("Xvfb -screen")).unwrap().0;
         kill(Pid::from_raw(xvfb), Signal::SIGKILL).unwrap();
         client.leave().await;
-        nothing_left(&server, 1).await;
+        nothing_left(&server, 2).await;
     }
     // Another program of the machine may take and free numbers meanwhile.
     assert!(numbers.len() < 12, "{numbers:?}");
@@ -227,8 +194,7 @@ async fn a_virtual_display_that_does_not_start_is_told() {
     for level in ["none", "sandbox"] {
         let builder = simulation_server(&webots.path(), forge.path(), 1).set("xvfb", true).set("isolation", level);
         let server = builder.env("PATH", &path).start().await;
-        let told = outcome(&server, &arm()).await;
-        assert!(told.contains("The virtual display (Xvfb) can't be started: no screens found"), "{level}: {told}");
+        is_told(&server, &arm(), "The virtual display (Xvfb) can't be started: no screens found").await;
         nothing_left(&server, 1).await;
     }
 }

@@ -7,30 +7,25 @@ use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
-use tokio_tungstenite::tungstenite::client::IntoClientRequest;
+use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 use tokio_tungstenite::tungstenite::protocol::{CloseFrame, WebSocketConfig};
-use tokio_tungstenite::tungstenite::{Error, Message};
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 
 use super::life::quick;
 use super::network::Network;
-use super::scene::{arm, nothing_left};
-use crate::support::client::{Client, Heard};
-use crate::support::git::Forge;
+use super::scene::nothing_left;
+use crate::support::client::Heard;
 use crate::support::http::{PASSWORD, get_as_administrator, get_with_password};
-use crate::support::program::{Builder, Server, simulation_server};
-use crate::support::webots::Webots;
-use crate::support::{SOON, http, skip, until};
+use crate::support::{Builder, Client, SOON, Server, Webots, arm, http, server_of, skip, until};
 
 /// The headers of who asks for a WebSocket.
 const UPGRADE: &str = "Host: localhost\r\nConnection: upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n\
     Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n";
 
-/// A server, and what it needs.
+/// A server.
 struct Stage {
     server: Server,
-    _parts: (Forge, Webots),
 }
 
 impl Stage {
@@ -39,10 +34,10 @@ impl Stage {
     }
 
     async fn with(webots: Webots, change: impl FnOnce(Builder) -> Builder) -> Self {
-        let forge = Forge::with_arm();
-        forge.commit("lab/arm", "main", &[("worlds/textures/a.png", "a picture"), ("plugins/a.html", "<p>a page</p>")]);
-        let builder = quick(simulation_server(&webots.path(), forge.path(), 2)).set("streaming", "relay");
-        Self { server: change(builder).start().await, _parts: (forge, webots) }
+        let files = [("worlds/textures/a.png", "a picture"), ("plugins/a.html", "<p>a page</p>")];
+        let builder = quick(server_of(webots, 2)).set("streaming", "relay");
+        builder.forge().commit("lab/arm", "main", &files);
+        Self { server: change(builder).start().await }
     }
 
     /// A simulation, and the path of its stream.
@@ -65,11 +60,7 @@ impl Stage {
 
     /// The status code that somebody gets who asks for a WebSocket.
     async fn refused(&self, path: &str) -> u16 {
-        match tokio_tungstenite::connect_async(self.server.websocket(path)).await {
-            Err(Error::Http(answer)) => answer.status().as_u16(),
-            Ok(_) => 101,
-            Err(error) => panic!("{path}: {error}"),
-        }
+        Client::with_headers(&self.server.websocket(path), &[]).await.err().unwrap_or(101)
     }
 
     /// Sends these bytes, and returns what comes until the connection ends.
@@ -136,9 +127,7 @@ async fn a_simulation_is_steered_and_its_files_are_had_through_the_server_alone(
     for level in ["none", "sandbox"] {
         let stage = Stage::new(|builder| builder.set("isolation", level)).await;
         let (client, path) = stage.start().await;
-        let mut viewer = stage.viewer(&path).await.with_scene().await;
-        viewer.send("real-time:-1").await;
-        viewer.until("real-time").await;
+        let mut viewer = stage.viewer(&path).await.with_running_scene().await;
         viewer.until("application/json:").await;
         // As Webots' page and as ours write it.
         stage.viewer(&format!("{path}/")).await.send("x3d;broadcast").await;
@@ -191,6 +180,20 @@ async fn all_frames_and_close_codes_pass_in_both_directions() {
     let (viewer, mut webots) = played.connect(&path).await;
     drop(viewer);
     assert_eq!(next(&mut webots).await, None);
+
+    // However its answer begins.
+    let mut client = TcpStream::connect(("127.0.0.1", played.stage.server.port)).await.unwrap();
+    let request = format!("GET {path} HTTP/1.1\r\n{UPGRADE}Expect: 100-continue\r\n\r\n");
+    client.write_all(request.as_bytes()).await.unwrap();
+    let mut webots = tokio_tungstenite::accept_async(played.listener.accept().await.unwrap().0).await.unwrap();
+    webots.send(Message::text("a scene")).await.unwrap();
+    let mut answer = Vec::new();
+    let reads = async {
+        while !answer.ends_with(b"a scene") {
+            assert!(client.read_buf(&mut answer).await.unwrap() > 0, "it has ended");
+        }
+    };
+    actix_rt::time::timeout(SOON, reads).await.expect("what Webots has sent");
     let (mut viewer, webots) = played.connect(&path).await;
     drop(webots);
     assert_eq!(next(&mut viewer).await, None);
@@ -237,15 +240,9 @@ async fn a_viewer_that_has_vanished_is_noticed_though_nothing_is_sent() {
     };
     let played = Played::new(|builder| builder.set("timing.ping", 1).set("timing.silence", 2)).await;
     let (_client, path) = played.stage.start().await;
-    let viewer = async {
-        let tcp = TcpStream::connect(("127.0.0.1", played.stage.server.port)).await.unwrap();
-        let port = tcp.local_addr().unwrap().port();
-        let url = played.stage.server.websocket(&path);
-        (tokio_tungstenite::client_async(url, tcp).await.unwrap().0, port)
-    };
-    let webots = async { tokio_tungstenite::accept_async(played.listener.accept().await.unwrap().0).await.unwrap() };
-    let ((_viewer, port), mut webots) = tokio::join!(viewer, webots);
-    let _lost = network.lose(1.0, &[port.to_string()]);
+    let (viewer, mut webots) = played.connect(&path).await;
+    let MaybeTlsStream::Plain(tcp) = viewer.get_ref() else { panic!("{viewer:?}") };
+    let _lost = network.lose(1.0, &[tcp.local_addr().unwrap().port().to_string()]);
     assert_eq!(next(&mut webots).await, None);
 }
 
@@ -288,73 +285,6 @@ async fn a_webots_that_does_not_read_holds_no_connection_of_a_client_that_has_le
 }
 
 #[actix_rt::test]
-async fn a_websocket_with_a_body_is_refused() {
-    let stage = Stage::new(|builder| builder).await;
-    for body in ["Content-Length: 1\r\n\r\nx", "Transfer-Encoding: chunked\r\n\r\n1\r\nx\r\n0\r\n\r\n"] {
-        let answer = stage.raw(&format!("GET /client HTTP/1.1\r\n{UPGRADE}{body}")).await;
-        assert!(
-            answer.starts_with("HTTP/1.1 400 ") && answer.ends_with("Error: a request for this has no body."),
-            "{answer}"
-        );
-    }
-}
-
-#[actix_rt::test]
-async fn an_answer_without_a_body_ends_with_its_head() {
-    let played = Played::new(|builder| builder).await;
-    let (_client, path) = played.stage.start().await;
-    let headers = "Host: localhost\r\nIf-None-Match: \"x\"\r\nConnection: close\r\n";
-    let request = format!("GET {path}/a.png HTTP/1.1\r\n{headers}\r\n");
-    let webots = played.answer(b"HTTP/1.1 304 Not Modified\r\nETag: \"x\"\r\n\r\n");
-    let (answer, head) = tokio::join!(played.stage.raw(&request), webots);
-    assert!(head.contains("\r\nIf-None-Match: \"x\"\r\n"), "{head}");
-    assert!(answer.starts_with("HTTP/1.1 304 ") && answer.split_once("\r\n\r\n").unwrap().1.is_empty(), "{answer}");
-}
-
-#[actix_rt::test]
-async fn a_stream_is_relayed_however_its_answer_begins() {
-    let played = Played::new(|builder| builder).await;
-    let (_client, path) = played.stage.start().await;
-    let mut client = TcpStream::connect(("127.0.0.1", played.stage.server.port)).await.unwrap();
-    let request = format!("GET {path} HTTP/1.1\r\n{UPGRADE}Expect: 100-continue\r\n\r\n");
-    client.write_all(request.as_bytes()).await.unwrap();
-    let (socket, _) = played.listener.accept().await.unwrap();
-    let mut webots = tokio_tungstenite::accept_async(socket).await.unwrap();
-    webots.send(Message::text("a scene")).await.unwrap();
-    let mut answer = Vec::new();
-    let reads = async {
-        while !answer.ends_with(b"a scene") {
-            assert!(client.read_buf(&mut answer).await.unwrap() > 0, "it has ended");
-        }
-    };
-    actix_rt::time::timeout(SOON, reads).await.expect("what Webots has sent");
-}
-
-#[actix_rt::test]
-async fn only_administrators_read_ports_in_an_output() {
-    for (mode, password, is_shown) in [("relay", false, false), ("relay", true, true), ("direct", false, true)] {
-        let stage = Stage::new(|builder| {
-            let builder = builder.set("streaming", mode);
-            if password { builder.set("adminPassword", PASSWORD) } else { builder }
-        })
-        .await;
-        let client = Client::ready(&stage.server).await;
-        let url = stage.server.url(&format!("/output?id={}", client.id()));
-        client.leave().await;
-        nothing_left(&stage.server, 2).await;
-        let mut text = String::new();
-        until("its events are kept", async || {
-            text = get_as_administrator(&url).await.text();
-            text.contains("ready")
-        })
-        .await;
-        let port = format!("port {}: ready", stage.server.port + 1);
-        assert_eq!(text.contains(&port), is_shown, "{mode} {password}: {text}");
-        assert!(stage.server.log().contains(&port), "the log is the administrator's");
-    }
-}
-
-#[actix_rt::test]
 async fn no_trick_leads_anywhere_else() {
     let played = Played::new(|builder| builder).await;
     let stage = &played.stage;
@@ -364,26 +294,21 @@ async fn no_trick_leads_anywhere_else() {
     let elsewhere = other.local_addr().unwrap();
     let token = path.rsplit('/').next().unwrap();
     let wrong = format!("{}{}", &token[..47], if token.ends_with('0') { '1' } else { '0' });
-    for (path, status) in [
-        (format!("{path}/../status"), 404),
-        (format!("{path}/%2e%2e/a.png"), 404),
-        (format!("{path}/%252e%252e/a.png"), 404),
-        (format!("{path}/a%2f..%2fb"), 404),
-        (format!("{path}/a%5c..%5cb"), 404),
-        (format!("{path}//{elsewhere}/"), 404),
-        (format!("{path}@{elsewhere}/"), 404),
-        (format!("{path}:80/a.png"), 404),
-        (format!("{path}/a%0d%0aHost:%20{elsewhere}"), 404),
-        (format!("/%73tream/{token}/a.png"), 404),
-        (format!("/stream/{wrong}/a.png"), 404),
-        (format!("/stream/{}/a.png", &token[..47]), 404),
-        (format!("/stream/{}/a.png", token.replace(|one: char| one.is_ascii_digit(), "%30")), 404),
-        ("/stream/".to_owned(), 404),
-        ("/stream".to_owned(), 404),
+    for path in [
+        format!("{path}/../status"),
+        format!("{path}/%2e%2e/a.png"),
+        format!("{path}@{elsewhere}/"),
+        format!("{path}:80/a.png"),
+        format!("/%73tream/{token}/a.png"),
+        format!("/stream/{wrong}/a.png"),
+        format!("/stream/{}/a.png", &token[..47]),
+        format!("/stream/{}/a.png", token.replace(|one: char| one.is_ascii_digit(), "%30")),
+        "/stream/".to_owned(),
+        "/stream".to_owned(),
     ] {
         for headers in [headers, UPGRADE] {
             let answer = stage.raw(&format!("GET {path} HTTP/1.1\r\n{headers}\r\n")).await;
-            assert!(answer.starts_with(&format!("HTTP/1.1 {status} ")), "{path}: {answer}");
+            assert!(answer.starts_with("HTTP/1.1 404 "), "{path}: {answer}");
             assert!(!answer.contains(&token[16..]), "{answer}");
         }
     }
@@ -397,10 +322,13 @@ async fn no_trick_leads_anywhere_else() {
         (format!("GET {path} HTTP/1.1\r\n{UPGRADE}Transfer-Encoding: chunked\r\n\r\n1\r\nx\r\n0\r\n\r\n"), 400),
         (format!("GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: upgrade, close\r\nUpgrade: h2c\r\n\r\n"), 400),
         (format!("GET {path}/{} HTTP/1.1\r\n{headers}\r\n", "x".repeat(200_000)), 431),
+        (format!("GET /client HTTP/1.1\r\n{UPGRADE}Content-Length: 1\r\n\r\nx"), 400),
+        (format!("GET /client HTTP/1.1\r\n{UPGRADE}Transfer-Encoding: chunked\r\n\r\n1\r\nx\r\n0\r\n\r\n"), 400),
     ] {
         let answer = stage.raw(&request).await;
         let shown: String = request.chars().take(300).collect();
         assert!(answer.starts_with(&format!("HTTP/1.1 {status} ")), "{shown}: {answer}");
+        assert!(!shown.contains("/client") || answer.ends_with("Error: a request for this has no body."), "{answer}");
     }
     // None of all that has reached Webots, nor what was named.
     let reached = actix_rt::time::timeout(Duration::from_millis(200), async {
@@ -436,6 +364,13 @@ async fn a_webots_that_does_not_answer_costs_its_client_an_error() {
         let (status, _) = tokio::join!(played.stage.refused(&path), played.answer(nonsense.as_bytes()));
         assert_eq!(status, 502, "{nonsense}");
     }
+    // One without a body ends with its head.
+    let headers = "Host: localhost\r\nIf-None-Match: \"x\"\r\nConnection: close\r\n";
+    let request = format!("GET {path}/a.png HTTP/1.1\r\n{headers}\r\n");
+    let webots = played.answer(b"HTTP/1.1 304 Not Modified\r\nETag: \"x\"\r\n\r\n");
+    let (answer, head) = tokio::join!(played.stage.raw(&request), webots);
+    assert!(head.contains("\r\nIf-None-Match: \"x\"\r\n"), "{head}");
+    assert!(answer.starts_with("HTTP/1.1 304 ") && answer.split_once("\r\n\r\n").unwrap().1.is_empty(), "{answer}");
 }
 
 #[actix_rt::test]
@@ -479,7 +414,7 @@ async fn a_stranger_sees_no_port_and_steers_nobody() {
             if has_password { password(builder) } else { builder }
         })
         .await;
-        let _client = Client::ready(&stage.server).await;
+        let client = Client::ready(&stage.server).await;
         let port = stage.server.port + 1;
         let is_shown = (mode, has_password) == ("direct", false);
         let simulation = stage.server.simulations().await.remove(0);
@@ -492,25 +427,32 @@ async fn a_stranger_sees_no_port_and_steers_nobody() {
             let answer = get_with_password(&stage.server.url("/status"), password).await;
             assert_eq!((answer.status.as_u16(), &answer.json()["simulations"][0]["port"]), (200, &shown), "{password}");
         }
+        // An output is for administrators where there is a password.
+        let url = stage.server.url(&format!("/output?id={}", client.id()));
+        client.leave().await;
+        nothing_left(&stage.server, 2).await;
+        let mut text = String::new();
+        until("its events are kept", async || {
+            text = get_as_administrator(&url).await.text();
+            text.contains("ready")
+        })
+        .await;
+        let port = format!("port {port}: ready");
+        assert_eq!(text.contains(&port), has_password || mode == "direct", "{mode} {has_password}: {text}");
+        assert!(stage.server.log().contains(&port), "the log is the administrator's");
     }
 
     // The prank, over the relay: with all that a stranger can learn, also one with a simulation of his own.
     let stage = Stage::new(|builder| builder).await;
     let (_victim, path) = stage.start().await;
     let (_stranger, own) = stage.start().await;
-    let mut victim = stage.viewer(&path).await;
-    victim.send("x3d").await;
-    victim.until("pause: ").await;
-    victim.send("real-time:-1").await;
-    victim.until("real-time").await;
+    let mut victim = stage.viewer(&path).await.with_running_scene().await;
     let (number, secret) = (&path["/stream/".len()..][..16], &own["/stream/".len() + 16..]);
     for guess in [format!("/stream/{number}{secret}"), format!("{own}/../{number}{secret}"), "/stream/2001".to_owned()]
     {
         assert_eq!(stage.refused(&guess).await, 404, "{guess}");
     }
-    let mut stranger = stage.viewer(&own).await;
-    stranger.send("x3d").await;
-    stranger.until("pause: ").await;
+    let mut stranger = stage.viewer(&own).await.with_scene().await;
     stranger.send("pause").await;
     stranger.until("paused by client").await;
     for _ in 0..20 {
@@ -519,14 +461,18 @@ async fn a_stranger_sees_no_port_and_steers_nobody() {
 }
 
 #[actix_rt::test]
-async fn pages_of_other_origins_get_no_stream() {
+async fn pages_of_other_origins_start_nothing_and_get_no_stream() {
     let stage = Stage::new(|builder| builder.set("allowedOrigins", json!(["https://lab.org"]))).await;
     let (_client, path) = stage.start().await;
     // Webots' own viewer runs in a frame without an origin.
-    for (origin, allowed) in [("https://lab.org", true), ("null", true), ("https://evil.org", false)] {
-        let mut request = stage.server.websocket(&path).into_client_request().unwrap();
-        request.headers_mut().insert("origin", origin.parse().unwrap());
-        assert_eq!(tokio_tungstenite::connect_async(request).await.is_ok(), allowed, "{origin}");
+    for (origin, may_start, allowed) in
+        [("https://lab.org", true, true), ("null", false, true), ("https://evil.org", false, false)]
+    {
+        let status = async |path: &str| {
+            Client::with_headers(&stage.server.websocket(path), &[("origin", origin)]).await.err().unwrap_or(101)
+        };
+        assert_eq!(status("/client").await, if may_start { 101 } else { 403 }, "{origin}");
+        assert_eq!(status(&path).await, if allowed { 101 } else { 403 }, "{origin}");
         let file = stage.server.url(&format!("{path}/worlds/textures/a.png"));
         let answer = awc::Client::new().get(file).insert_header(("origin", origin)).send().await.unwrap();
         assert_eq!(answer.status(), if allowed { 200 } else { 403 }, "{origin}");
@@ -550,11 +496,7 @@ async fn an_administrator_watches_and_changes_nothing() {
         let stage = Stage::new(change).await;
         let mut client = Client::start(&stage.server, &arm()).await;
         let address = client.until("webots:").await["webots:".len()..].to_owned();
-        let mut student = Client::connect(&address).await;
-        student.send("x3d").await;
-        student.until("pause: ").await;
-        student.send("real-time:-1").await;
-        student.until("real-time").await;
+        let mut student = Client::connect(&address).await.with_running_scene().await;
 
         let path = watched_by(&stage, &client).await;
         let mut watcher = stage.viewer(&path).await;

@@ -5,15 +5,12 @@ use std::time::{Duration, Instant};
 use futures_util::future::join_all;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-use serde_json::{Value, json};
+use serde_json::json;
 
 use super::life::quick;
-use super::scene::{DEMO, arm, instance_folders, nothing_left};
-use crate::support::client::Client;
-use crate::support::program::{Builder, Server, demo_server};
+use super::scene::{instance_folders, nothing_left};
 use crate::support::relay::{Mood, Relay};
-use crate::support::webots::{Webots, instances_below};
-use crate::support::{http, until};
+use crate::support::{Builder, Client, DEMO, Server, Webots, arm, demo_server, http, instances_below, until};
 
 pub(super) const ENDED: &str = "loading: Error: this simulation has ended";
 const TAKEN_OVER: &str = "loading: Error: this simulation was taken over elsewhere";
@@ -27,23 +24,15 @@ pub(super) async fn refused(server: &Server, token: &str) -> String {
     told
 }
 
-/// The next simulated time that a viewer is told.
-pub(super) async fn time(viewer: &mut Client) -> f64 {
-    let update = viewer.until("application/json:").await;
-    serde_json::from_str::<Value>(&update["application/json:".len()..]).unwrap()["time"].as_f64().unwrap()
-}
-
 #[actix_rt::test]
 async fn who_comes_back_finds_the_simulation_as_it_runs_at_each_level() {
     for level in ["none", "sandbox"] {
         let server = quick(demo_server(2)).set("isolation", level).start().await;
         let (client, first) = Client::resumable(&server).await;
         let stream = format!("ws://127.0.0.1:{}/", server.port + 1);
-        let mut viewer = Client::connect(&stream).await.with_scene().await;
-        viewer.send("real-time:-1").await;
-        viewer.until("real-time").await;
+        let mut viewer = Client::connect(&stream).await.with_running_scene().await;
         let before = server.simulations().await;
-        let left = time(&mut viewer).await;
+        let left = viewer.time().await;
         // Both connections break, as with a reload.
         drop((client, viewer));
         server.until_away(1).await;
@@ -59,10 +48,10 @@ async fn who_comes_back_finds_the_simulation_as_it_runs_at_each_level() {
         assert_ne!(first, second);
         let mut viewer = Client::connect(&stream).await;
         viewer.send("x3d;broadcast").await;
-        let back = time(&mut viewer).await;
+        let back = viewer.time().await;
         assert!(back >= left, "it began anew: {left} {back}");
         viewer.until("real-time").await;
-        while time(&mut viewer).await <= back {}
+        while viewer.time().await <= back {}
         until("it is not away", async || server.simulations().await[0]["awayUntil"].is_null()).await;
         let after = server.simulations().await;
         assert_eq!((&after[0]["pid"], &after[0]["id"]), (&before[0]["pid"], &before[0]["id"]));
@@ -72,7 +61,7 @@ async fn who_comes_back_finds_the_simulation_as_it_runs_at_each_level() {
 }
 
 #[actix_rt::test]
-async fn a_token_works_once_and_the_later_client_keeps_the_simulation() {
+async fn a_token_works_once_and_its_client_alone_is_told_it() {
     let server = quick(demo_server(1)).start().await;
     let (mut first, one) = Client::resumable(&server).await;
     // While the first connection is open: its page was closed in a way that nobody has noticed yet.
@@ -87,12 +76,23 @@ async fn a_token_works_once_and_the_later_client_keeps_the_simulation() {
     }
     // Neither of them has changed anything.
     let mut third = Client::resuming(&server, &two).await;
-    third.token().await;
     assert_eq!(second.until("loading: Error").await, TAKEN_OVER);
     assert_eq!(server.status().await["instances"]["arrivals"], 1);
-    third.close_with(1000).await;
+    let three = third.token().await;
+    drop(third);
+    server.until_away(1).await;
+    // Nobody else is told a token, nor its secret part alone.
+    let mut told = server.log();
+    for path in ["/status", "/monitor", "/metrics"] {
+        told += &http::get(&server.url(path)).await.text();
+    }
+    assert!(told.contains("away") && told.contains("webots_simulation_away 1"), "{told}");
+    assert!([&one, &two, &three].iter().all(|token| !told.contains(&token[16..])), "{told}");
+    let mut last = Client::resuming(&server, &three).await;
+    last.token().await;
+    last.close_with(1000).await;
     nothing_left(&server, 1).await;
-    assert_eq!(refused(&server, &two).await, ENDED);
+    assert_eq!(refused(&server, &three).await, ENDED);
 }
 
 #[actix_rt::test]
@@ -101,31 +101,25 @@ async fn only_who_closes_with_1000_or_has_not_asked_for_more_ends_its_simulation
     for code in [1001, 3000, 1000] {
         let (client, token) = Client::resumable(&server).await;
         client.close_with(code).await;
-        if code == 1000 {
-            nothing_left(&server, 2).await;
-            assert_eq!(refused(&server, &token).await, ENDED);
-        } else {
+        if code != 1000 {
             server.until_away(1).await;
             let mut client = Client::resuming(&server, &token).await;
             client.token().await;
             client.close_with(1000).await;
-            nothing_left(&server, 2).await;
         }
+        nothing_left(&server, 2).await;
+        assert_eq!(refused(&server, &token).await, ENDED);
     }
-    let mut client = Client::ready(&server).await;
-    client.until(".").await;
-    assert!(!client.heard.iter().any(|text| text.starts_with("resume") || text.starts_with("absence")));
-    drop(client);
-    nothing_left(&server, 2).await;
-
-    let server = quick(demo_server(1)).set("timing.absence", 0).start().await;
-    let mut client = Client::connect(&server.websocket("/client")).await;
-    client.send(&json!({"start": {"url": arm(), "resumable": true}}).to_string()).await;
-    client.until("webots:").await;
-    client.until(".").await;
-    assert!(!client.heard.iter().any(|text| text.starts_with("resume") || text.starts_with("absence")));
-    drop(client);
-    nothing_left(&server, 1).await;
+    let never = quick(demo_server(2)).set("timing.absence", 0).start().await;
+    for (server, resumable) in [(&server, false), (&never, true)] {
+        let mut client = Client::connect(&server.websocket("/client")).await;
+        client.send(&json!({"start": {"url": arm(), "resumable": resumable}}).to_string()).await;
+        client.until("webots:").await;
+        client.until(".").await;
+        assert!(!client.heard.iter().any(|text| text.starts_with("resume") || text.starts_with("absence")));
+        drop(client);
+        nothing_left(server, 2).await;
+    }
 }
 
 #[actix_rt::test]
@@ -170,28 +164,30 @@ async fn a_client_behind_a_link_that_stalls_comes_back_another_way_or_is_given_u
 
 #[actix_rt::test]
 async fn who_comes_back_too_late_hears_why_it_has_ended() {
-    let server = quick(demo_server(1)).start().await;
+    // A Webots that says nothing is no lost connection.
+    let server = quick(demo_server(1)).set("timing.heartbeat", 3600).start().await;
     let crash = async || {
         let webots = instances_below(&server.folder).into_iter().find(|one| one.1.contains("demo-simulator"));
         kill(Pid::from_raw(webots.unwrap().0), Signal::SIGKILL).unwrap();
         until("it has crashed", async || server.simulations().await.is_empty()).await;
     };
-    let (client, token) = Client::resumable(&server).await;
-    drop(client);
-    server.until_away(1).await;
-    crash().await;
-    let told = refused(&server, &token).await;
-    assert!(told.starts_with(&format!("{ENDED}: Webots ")), "{told}");
-
-    // The same for one whose connection only seemed to be there.
-    let relay = Relay::to(server.port).await;
-    let (_lost, token) =
-        Client::connect(&format!("ws://127.0.0.1:{}/client", relay.port)).await.start_resumable().await;
-    relay.set(Mood::Silent);
-    crash().await;
-    let told = refused(&server, &token).await;
-    assert!(told.starts_with(&format!("{ENDED}: Webots ")), "{told}");
-    nothing_left(&server, 1).await;
+    for is_silent in [false, true] {
+        let relay = Relay::to(server.port).await;
+        let client = Client::connect(&format!("ws://127.0.0.1:{}/client", relay.port)).await;
+        let (mut client, token) = client.start_resumable().await;
+        client.until("absence: ").await;
+        // One whose connection only seems to be there hears the same.
+        if is_silent {
+            relay.set(Mood::Silent);
+        } else {
+            drop(client);
+            server.until_away(1).await;
+        }
+        crash().await;
+        let told = refused(&server, &token).await;
+        assert!(told.starts_with(&format!("{ENDED}: Webots ")), "{told}");
+        nothing_left(&server, 1).await;
+    }
 }
 
 #[actix_rt::test]
@@ -241,52 +237,31 @@ async fn a_server_that_stops_leaves_nothing_of_who_is_away() {
 }
 
 #[actix_rt::test]
-async fn those_who_are_away_hold_half_of_the_places() {
-    let server = quick(demo_server(4)).start().await;
-    let mut tokens = Vec::new();
-    for away in 1..=2 {
-        let (client, token) = Client::resumable(&server).await;
-        drop(client);
-        server.until_away(away).await;
-        tokens.push(token);
-    }
-    let (client, token) = Client::resumable(&server).await;
-    drop(client);
-    tokens.push(token);
-    until("one has ended", async || server.simulations().await.len() == 2).await;
-    let told = refused(&server, &tokens[0]).await;
-    assert!(told.starts_with(&format!("{ENDED}: Too many simulations waited for their clients")), "{told}");
-    for token in &tokens[1..] {
-        let mut client = Client::resuming(&server, token).await;
-        client.token().await;
-        client.close_with(1000).await;
-    }
-    nothing_left(&server, 4).await;
-}
-
-#[actix_rt::test]
-async fn who_goes_away_more_often_ends_no_simulation_of_others() {
+async fn those_who_are_away_hold_half_of_the_places_and_end_nobody_elses_simulation() {
     let server = quick(demo_server(4)).set("trustedProxies", json!(["127.0.0.1"])).start().await;
-    let at = async |address| Client::try_from_address(&server, address).await.unwrap();
-    let mut tokens = Vec::new();
-    for (away, address) in [(1, "192.0.2.1"), (2, "192.0.2.2"), (2, "192.0.2.2")] {
-        let (client, token) = at(address).await.start_resumable().await;
-        drop(client);
-        server.until_away(away).await;
-        tokens.push(token);
+    let at = async |address| Client::from_address(&server, address).await.unwrap();
+    let words = format!("{ENDED}: Too many simulations waited for their clients");
+    // Who has been away for the longest, or who has more than others.
+    for (addresses, ended) in
+        [(["192.0.2.1", "192.0.2.1", "192.0.2.1"], 0), (["192.0.2.1", "192.0.2.2", "192.0.2.2"], 1)]
+    {
+        let mut tokens = Vec::new();
+        for (away, address) in [1, 2, 2].into_iter().zip(addresses) {
+            let (client, token) = at(address).await.start_resumable().await;
+            drop(client);
+            server.until_away(away).await;
+            tokens.push(token);
+        }
+        until("one has ended", async || server.simulations().await.len() == 2).await;
+        let told = refused(&server, &tokens.remove(ended)).await;
+        assert!(told.starts_with(&words), "{told}");
+        for token in tokens {
+            let mut client = Client::resuming(&server, &token).await;
+            client.token().await;
+            client.close_with(1000).await;
+        }
+        nothing_left(&server, 4).await;
     }
-    until("one has ended", async || server.simulations().await.len() == 2).await;
-    let mut client = at("192.0.2.1").await.resume(&tokens[0]).await;
-    client.token().await;
-    let told = at("192.0.2.2").await.resume(&tokens[1]).await.until("loading: Error:").await;
-    assert!(told.contains("Too many simulations waited for their clients"), "{told}");
-}
-
-#[actix_rt::test]
-async fn a_webots_that_says_nothing_is_no_lost_connection() {
-    let server = quick(demo_server(1)).set("timing.heartbeat", 3600).start().await;
-    let (mut client, _) = Client::resumable(&server).await;
-    client.until("absence: ").await;
 }
 
 #[actix_rt::test]
@@ -296,15 +271,12 @@ async fn who_comes_back_counts_for_the_address_that_has_asked_and_keeps_to_allow
         builder.set("allowedOrigins", json!(["https://fleet.example.org"]))
     };
     let server = change(quick(demo_server(2))).start().await;
-    let at = async |address| Client::try_from_address(&server, address).await.unwrap();
+    let at = async |address| Client::from_address(&server, address).await.unwrap();
     let (client, token) = at("192.0.2.2").await.start_resumable().await;
     drop(client);
     server.until_away(1).await;
-    let forbidden = server.url("/client");
-    let headers = [("origin", "https://evil.example.org"), ("upgrade", "websocket"), ("connection", "upgrade")];
-    let answer = awc::Client::new().get(&forbidden).insert_header(headers[0]).insert_header(headers[1]);
-    let answer = answer.insert_header(headers[2]).send().await.unwrap();
-    assert_eq!(answer.status(), 403);
+    let forbidden = Client::with_headers(&server.websocket("/client"), &[("origin", "https://evil.example.org")]).await;
+    assert_eq!(forbidden.err(), Some(403));
     // From elsewhere it may be had, and counts for the address that has asked for it.
     let mut client = at("192.0.2.3").await.resume(&token).await;
     client.token().await;
@@ -316,37 +288,13 @@ async fn who_comes_back_counts_for_the_address_that_has_asked_and_keeps_to_allow
 }
 
 #[actix_rt::test]
-async fn no_token_is_told_to_anybody_but_its_client() {
-    let server = quick(demo_server(1)).start().await;
-    let (client, first) = Client::resumable(&server).await;
-    drop(client);
-    server.until_away(1).await;
-    let mut client = Client::resuming(&server, &first).await;
-    let second = client.token().await;
-    refused(&server, &first).await;
-    drop(client);
-    server.until_away(1).await;
-    let mut told = server.log();
-    for path in ["/status", "/monitor", "/metrics"] {
-        told += &http::get(&server.url(path)).await.text();
-    }
-    assert!(told.contains("away") && told.contains("webots_simulation_away 1"), "{told}");
-    for token in [&first, &second] {
-        // Nor its secret part alone.
-        assert!(!told.contains(&token[16..]), "{told}");
-    }
-}
-
-#[actix_rt::test]
 async fn a_class_that_vanishes_at_once_comes_back_to_the_same_simulations() {
-    const CLASS: usize = 100;
+    const CLASS: usize = 40;
     let change = |builder: Builder| builder.set("timing.launch", 60).set("timing.heartbeat", 2);
     let server = change(quick(demo_server(2 * u16::try_from(CLASS).unwrap()))).start().await;
     let mut class = Vec::new();
-    for ten in 0..CLASS / 10 {
-        let started = join_all((0..10).map(|_| Client::resumable(&server))).await;
-        class.extend(started);
-        assert_eq!(class.len(), 10 * (ten + 1));
+    for _ in 0..CLASS / 10 {
+        class.extend(join_all((0..10).map(|_| Client::resumable(&server))).await);
     }
     let pids = async || {
         let mut pids: Vec<_> = server.simulations().await.iter().map(|one| one["pid"].as_i64().unwrap()).collect();

@@ -4,112 +4,52 @@ use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use crate::support::client::Client;
-use crate::support::git::Forge;
-pub use crate::support::git::arm;
-use crate::support::program::{Builder, Server, simulation_server};
-use crate::support::until;
-use crate::support::webots::{Webots, instance_folders_in, instances_below};
+use crate::support::{Builder, Client, Server, arm, instance_folders_in, instances_below, server_that_is, until};
 
-pub const DEMO: &str = concat!("'", env!("CARGO_BIN_EXE_demo-simulator"), "'");
-
-/// The states of a simulation.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum State {
-    Connected,
-    Waiting,
-    CheckingOut,
-    Launching,
-    Idle,
-    Running,
-    Stopping,
-}
-
-pub const ALL: [State; 7] = [
-    State::Connected,
-    State::Waiting,
-    State::CheckingOut,
-    State::Launching,
-    State::Idle,
-    State::Running,
-    State::Stopping,
-];
+/// The states of a simulation: one that is only connected, and those that servers show.
+pub const ALL: [&str; 7] = ["connected", "queued", "checkingout", "launching", "idle", "running", "stopping"];
 
 /// Everything of a test in one state. The server ends with it.
 pub struct Scene {
     pub server: Server,
-    /// The client in that state; it has left where the state is `Stopping`.
+    /// The client in that state; it has left where the state is `stopping`.
     pub client: Option<Client>,
-    /// When it began to leave, if it has.
-    pub left: Option<Instant>,
-    /// The one that holds the only place, where the state is `Waiting`.
+    /// The one that holds the only place, where the state is `queued`.
     pub other: Option<Client>,
     pub folder: tempfile::TempDir,
-    _parts: (Forge, Webots, Option<TcpListener>),
+    _hanging: Option<TcpListener>,
 }
 
 impl Scene {
     /// Brings a client into this state.
-    pub async fn new(state: State, change: impl FnOnce(Builder) -> Builder) -> Self {
-        let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
-        let webots = Webots::script(&match state {
-            State::Launching => "sleep 1000 & sleep 1000".to_owned(),
-            State::Running => format!("{DEMO} \"$@\" & echo real-time; wait"),
-            State::Stopping => {
-                format!("trap '' TERM\n(setsid sleep 1000) &\n{DEMO} \"$@\" &\nwhile true; do wait; sleep 0.1; done")
-            }
-            _ => format!("{DEMO} \"$@\" & wait"),
-        });
-        let mut builder = simulation_server(&webots.path(), forge.path(), 1).folder(folder.path());
-        let hanging = (state == State::CheckingOut).then(|| TcpListener::bind("127.0.0.1:0").unwrap());
-        if let Some(hanging) = &hanging {
-            let mirror = format!("https://127.0.0.1:{}/", hanging.local_addr().unwrap().port());
-            builder = builder.set("gitMirrors", serde_json::json!({"https://github.com/": mirror}));
-        }
+    pub async fn new(state: &str, change: impl FnOnce(Builder) -> Builder) -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let (builder, hanging) = server_that_is(state);
+        let builder = builder.folder(folder.path());
         let server = change(builder).start().await;
-        let mut other = None;
-        if state == State::Waiting {
-            let first = Client::ready(&server).await;
-            other = Some(first);
+        let other = if state == "queued" { Some(Client::ready(&server).await) } else { None };
+        let mut client = Client::connect(&server.websocket("/client")).await;
+        if state == "connected" {
+            return Self { server, client: Some(client), other, folder, _hanging: hanging };
         }
-        let client = Client::connect(&server.websocket("/client")).await;
-        let _parts = (forge, webots, hanging);
-        let mut scene = Self { server, client: Some(client), left: None, other, folder, _parts };
-        scene.come_to(state).await;
-        scene
-    }
-
-    async fn come_to(&mut self, state: State) {
-        let client = self.client.as_mut().unwrap();
-        if state != State::Connected {
-            client.send(&serde_json::json!({"start": {"url": arm()}}).to_string()).await;
-        }
-        match state {
-            State::Connected => {}
-            State::Waiting => assert_eq!(client.until("queue:").await, "queue: 0"),
-            State::CheckingOut => {
-                client.until("loading: Step 1/9 : looking for").await;
-                let folder = self.folder.path();
-                until("git runs", async || instances_below(folder).iter().any(|one| one.1.contains("ls-remote"))).await;
-            }
-            State::Launching => drop(client.until("shutdownTimeout").await),
-            State::Idle | State::Running | State::Stopping => drop(client.until("webots:").await),
-        }
-        if state == State::Stopping {
-            self.left = Some(Instant::now());
-            self.client.take().unwrap().leave().await;
-        }
-        let shown = match state {
-            State::Connected => return,
-            State::Waiting => "queued",
-            State::CheckingOut => "checkingout",
-            State::Launching => "launching",
-            State::Idle => "idle",
-            State::Running => "running",
-            State::Stopping => "stopping",
+        client.send(&serde_json::json!({"start": {"url": arm()}}).to_string()).await;
+        let told = match state {
+            "queued" => "queue: 0",
+            "checkingout" => "loading: Step 1/9 : looking for",
+            "launching" => "shutdownTimeout",
+            _ => "webots:",
         };
-        let server = &self.server;
-        until(shown, async || stages(server).await.iter().any(|stage| stage == shown)).await;
+        client.until(told).await;
+        if state == "checkingout" {
+            let runs = || instances_below(folder.path()).iter().any(|one| one.1.contains("ls-remote"));
+            until("git runs", async || runs()).await;
+        }
+        let mut client = Some(client);
+        if state == "stopping" {
+            client.take().unwrap().leave().await;
+        }
+        until(state, async || stages(&server).await.iter().any(|stage| stage == state)).await;
+        Self { server, client, other, folder, _hanging: hanging }
     }
 }
 

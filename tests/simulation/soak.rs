@@ -1,15 +1,12 @@
 //! Many starts and stops in a row leave the server as it was.
 
 use std::path::Path;
+use std::time::Duration;
 
 use procfs::net::TcpState;
 use procfs::process::Process;
 
-use crate::support::client::Client;
-use crate::support::git::{Forge, world};
-use crate::support::program::{Server, simulation_server};
-use crate::support::webots::{Webots, instances_below};
-use crate::support::{holds_soon, until};
+use crate::support::{Client, Forge, Server, Webots, arm, holds_soon, instances_below, simulation_server, until};
 
 /// What a server holds at one moment.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -97,15 +94,19 @@ pub async fn soak(starts: usize, rounds: usize) -> (Holdings, Holdings) {
     }
 }
 
-/// So many visits, some of which end before Webots is ready; waits until all are gone.
+/// So many visits, some of which end before Webots is ready, or at any moment; waits until all are gone.
 async fn visit(server: &Server, visits: usize) {
-    let url = world("lab/arm", "main", "worlds/a.wbt");
+    let url = arm();
     let next = std::cell::Cell::new(0);
     let visitor = async || {
         while next.get() < visits {
             let number = next.replace(next.get() + 1);
             let mut client = Client::start(server, &url).await;
-            client.until(if number % 5 == 4 { "loading: Step 8/9 : checking" } else { "webots:" }).await;
+            match number % 5 {
+                4 => drop(client.until("loading: Step 8/9 : checking").await),
+                3 => actix_rt::time::sleep(Duration::from_millis(number as u64 % 50)).await,
+                _ => drop(client.until("webots:").await),
+            }
             client.leave().await;
         }
     };

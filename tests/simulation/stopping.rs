@@ -6,13 +6,9 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::Signal;
 use serde_json::json;
 
-use super::scene::{arm, stages};
-use crate::support::client::Client;
-use crate::support::git::Forge;
+use super::scene::stages;
 use crate::support::listener::{Request, listen};
-use crate::support::program::{demo_server, simulation_server};
-use crate::support::webots::Webots;
-use crate::support::{http, until};
+use crate::support::{Client, SOON, arm, demo_server, http, until};
 
 #[actix_rt::test]
 async fn a_server_that_drains_keeps_its_clients_takes_no_others_and_ends_with_the_last() {
@@ -64,7 +60,6 @@ async fn drain_is_off_without_a_password_and_ends_an_empty_server() {
 
 #[actix_rt::test]
 async fn a_fault_of_the_configuration_is_one_line_and_exit_code_2() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     for (key, value, words) in [
         (
             "allowedOrigins",
@@ -89,37 +84,29 @@ async fn a_fault_of_the_configuration_is_one_line_and_exit_code_2() {
         ("gitMirrors", json!([["https://a.forge", "file:b"]]), [" gitMirrors: ", ""]),
         ("timing", json!({"silence": 20}), ["timing.silence", "not more than timing.ping"]),
     ] {
-        let said = simulation_server(&webots.path(), forge.path(), 1).set(key, value.clone()).refused(2).await;
+        let said = demo_server(1).set(key, value.clone()).refused(2).await;
         assert!(said.contains("config.json: "), "{said}");
         assert!(words.iter().all(|word| said.contains(word)), "{key}: {value} gives {said}");
     }
 }
 
-/// Answers each request with the next of these codes and contents; returns the requests.
-fn announced_to(answers: &'static [(u16, &'static str)]) -> (String, std::sync::mpsc::Receiver<Request>) {
+#[actix_rt::test]
+async fn the_server_announces_itself_and_waits_for_nobody() {
+    // Each request gets the next answer.
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let url = format!("http://{}/announce", listener.local_addr().unwrap());
     let (sender, requests) = std::sync::mpsc::channel();
-    let mut answers = answers.iter();
+    let mut answers = [(500, ""), (200, r#"{"error": "no room"}"#), (200, r#"{"success": true}"#)].into_iter();
     listen(listener, move |request| {
         let answer = answers.next()?;
         sender.send(request).ok()?;
-        Some(*answer)
+        Some(answer)
     });
-    (url, requests)
-}
-
-#[actix_rt::test]
-async fn the_server_announces_itself_and_waits_for_nobody() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let answers = &[(500, ""), (200, r#"{"error": "no room"}"#), (200, r#"{"success": true}"#)];
-    let (url, requests) = announced_to(answers);
     let hanging = TcpListener::bind("127.0.0.1:0").unwrap();
     let closed = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
-    let notify =
-        serde_json::json!([url, format!("http://{}/", hanging.local_addr().unwrap()), format!("http://{closed}/")]);
-    let allowed = serde_json::json!(["https://github.com/lab", "https://github.com/other/x"]);
-    let builder = simulation_server(&webots.path(), forge.path(), 1).set("notify", notify);
+    let notify = json!([url, format!("http://{}/", hanging.local_addr().unwrap()), format!("http://{closed}/")]);
+    let allowed = json!(["https://github.com/lab", "https://github.com/other/x"]);
+    let builder = demo_server(1).set("notify", notify);
     let begin = Instant::now();
     let server =
         builder.set("timing.announce", 0.05).set("allowedRepositories", allowed).set("shareIdleTime", 25).start().await;
@@ -129,11 +116,10 @@ async fn the_server_announces_itself_and_waits_for_nobody() {
         server.port
     );
     for _ in 0..3 {
-        let request = requests.recv_timeout(crate::support::SOON).unwrap();
-        let head = request.head;
+        let Request { head, content } = requests.recv_timeout(SOON).unwrap();
         assert!(head.starts_with("POST /announce HTTP/1.1\r\n"), "{head}");
         assert!(head.to_lowercase().contains("content-type: application/x-www-form-urlencoded"), "{head}");
-        assert_eq!(String::from_utf8(request.content).unwrap(), body);
+        assert_eq!(String::from_utf8(content).unwrap(), body);
     }
     until("it was told", async || server.log().contains(&format!("announced to {url}"))).await;
     assert!(server.log().contains(&format!("can't announce to {url} (2 of 6): it answered \"no room\"")));

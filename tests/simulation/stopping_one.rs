@@ -5,13 +5,9 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
 use super::ends::line;
-use super::scene::{Scene, State, nothing_left};
-use crate::support::SOON;
-use crate::support::client::Client;
-use crate::support::git::Forge;
+use super::scene::{ALL, Scene, nothing_left};
 use crate::support::http::{self, PASSWORD, post};
-use crate::support::program::{Builder, Server, demo_server, simulation_server};
-use crate::support::webots::Webots;
+use crate::support::{Builder, Client, SOON, Server, demo_server};
 
 const TOLD: &str = "loading: Error: Your teacher has stopped this simulation";
 
@@ -29,7 +25,7 @@ async fn stop(server: &Server, id: &str, body: &str) -> u16 {
 
 #[actix_rt::test]
 async fn a_simulation_is_stopped_in_any_state_and_its_client_hears_why() {
-    for state in [State::Waiting, State::CheckingOut, State::Launching, State::Idle, State::Running] {
+    for state in &ALL[1..6] {
         let mut scene = Scene::new(state, with_password).await;
         let (server, client) = (&scene.server, scene.client.as_mut().unwrap());
         let id = client.id().to_owned();
@@ -54,8 +50,7 @@ async fn a_simulation_is_stopped_in_any_state_and_its_client_hears_why() {
 
 #[actix_rt::test]
 async fn only_the_password_stops_a_simulation_and_no_page_of_another_site_does() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = with_password(simulation_server(&webots.path(), forge.path(), 2)).start().await;
+    let server = with_password(demo_server(2)).start().await;
     let mut client = Client::ready(&server).await;
     let url = path(&server, client.id());
     assert_eq!(post(&url, None, "").await, 401);
@@ -77,7 +72,7 @@ async fn only_the_password_stops_a_simulation_and_no_page_of_another_site_does()
     let told = other.until("loading: Error:").await;
     assert!(told.len() < 400 && told.ends_with("..."), "{told}");
     // Without a password there are no actions.
-    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
+    let server = demo_server(1).start().await;
     let mut client = Client::ready(&server).await;
     assert_eq!(post(&path(&server, client.id()), Some(PASSWORD), "").await, 403);
     client.until(".").await;
@@ -88,9 +83,8 @@ async fn statuses(server: &Server, requests: &[String], count: usize) -> Vec<u16
     let mut socket = TcpStream::connect(server.address()).await.unwrap();
     let mut answers = Vec::new();
     let statuses = |answers: &[u8]| -> Vec<u16> {
-        let text = String::from_utf8_lossy(answers).into_owned();
-        let lines = text.split("HTTP/1.1 ").skip(1).map(|answer| answer[..3].parse().unwrap());
-        lines.collect()
+        let text = String::from_utf8_lossy(answers);
+        text.split("HTTP/1.1 ").skip(1).map(|answer| answer[..3].parse().unwrap()).collect()
     };
     for request in requests {
         socket.write_all(request.as_bytes()).await.unwrap();
@@ -130,9 +124,8 @@ async fn a_body_belongs_to_its_request_and_holds_up_nobody() {
 
 #[actix_rt::test]
 async fn a_stop_ends_no_simulation_that_has_come_in_the_place_of_another() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     let folder = tempfile::tempdir().unwrap();
-    let builder = || with_password(simulation_server(&webots.path(), forge.path(), 1)).folder(folder.path());
+    let builder = || with_password(demo_server(1)).folder(folder.path());
     let server = builder().start().await;
     let mut ids = Vec::new();
     for _ in 0..3 {

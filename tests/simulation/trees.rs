@@ -8,18 +8,14 @@ use nix::sys::signal::Signal;
 use nix::sys::stat::Mode;
 
 use super::git_wrapper::GitWrapper;
-use super::life::{children, guardian, is_there, quick};
-use super::scene::{DEMO, arm, instance_folders, nothing_left, stages};
-use crate::support::client::Client;
-use crate::support::git::Forge;
-use crate::support::program::{demo_server, server_of, simulation_server};
-use crate::support::until;
-use crate::support::webots::{Webots, instances_below};
+use super::life::{is_there, quick};
+use super::scene::{instance_folders, nothing_left, stages};
+use crate::support::{Client, DEMO, Webots, arm, demo_server, instances_below, server_of, until};
 
 #[actix_rt::test]
 async fn without_a_sandbox_the_group_ends_with_its_client_and_the_rest_with_the_server() {
     for reason in ["client", "stop", "kill"] {
-        let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
+        let folder = tempfile::tempdir().unwrap();
         let pids = folder.path().join("pids");
         // One leaves the group and its parent, and keeps its environment. The other drops its environment and stays.
         let tell = |name: &str| format!("echo {name} $$ >> {}; exec sleep 1000", pids.display());
@@ -27,29 +23,24 @@ async fn without_a_sandbox_the_group_ends_with_its_client_and_the_rest_with_the_
         let webots = Webots::script(&format!(
             "(setsid bash -c '{left}' &)\n(env -i bash -c '{stayed}' &)\n{DEMO} \"$@\" & wait"
         ));
-        let builder = quick(simulation_server(&webots.path(), forge.path(), 1)).set("isolation", "none");
-        let mut server = builder.folder(folder.path()).start().await;
+        let mut server = quick(server_of(webots, 1)).set("isolation", "none").folder(folder.path()).start().await;
         let client = Client::ready(&server).await;
         let told = || std::fs::read_to_string(&pids).unwrap_or_default();
         until("both are there", async || told().lines().count() == 2).await;
         let pid = |name| told().lines().find_map(|line| line.strip_prefix(name)?.trim().parse().ok()).unwrap();
         let (left, stayed): (i32, i32) = (pid("left"), pid("stayed"));
         assert!(is_there(left) && is_there(stayed), "{reason}");
-        match reason {
-            "client" => {
-                client.leave().await;
-                until("its group has ended", async || !is_there(stayed)).await;
-                until("its folder is gone", async || instance_folders(folder.path()).is_empty()).await;
-                assert!(is_there(left), "what has left the group ends with the server");
-                server.stops().await;
-            }
-            "stop" => {
-                server.stops().await;
-            }
-            _ => {
-                server.signal(Signal::SIGKILL);
-                server.ended().await;
-            }
+        if reason == "client" {
+            client.leave().await;
+            until("its group has ended", async || !is_there(stayed)).await;
+            until("its folder is gone", async || instance_folders(folder.path()).is_empty()).await;
+            assert!(is_there(left), "what has left the group ends with the server");
+        }
+        if reason == "kill" {
+            server.signal(Signal::SIGKILL);
+            server.ended().await;
+        } else {
+            server.stops().await;
         }
         until(&format!("both have ended: {reason}"), async || !is_there(left) && !is_there(stayed)).await;
         until("its folder is gone", async || instance_folders(folder.path()).is_empty()).await;
@@ -75,7 +66,7 @@ async fn what_git_has_started_ends_with_its_client() {
     until("git asks", async || sleeps()).await;
     client.leave().await;
     until("what git has started is gone", async || !sleeps()).await;
-    until("all is gone", async || children(server.pid()) == [guardian(&server)]).await;
+    until("all is gone", async || server.children() == [server.guardian()]).await;
     nothing_left(&server, 1).await;
 }
 

@@ -3,22 +3,16 @@
 use futures_util::StreamExt;
 use serde_json::json;
 
-use super::scene::arm;
-use crate::support::client::Client;
-use crate::support::git::Forge;
-use crate::support::http::{self, PASSWORD, get_as_administrator};
-use crate::support::program::{Builder, Server, simulation_server};
-use crate::support::until;
-use crate::support::webots::Webots;
+use crate::support::http::{self, PASSWORD, get_as_administrator, get_with_password};
+use crate::support::{Builder, Client, Server, arm, demo_server, until};
 
-fn with_users(webots: &Webots, forge: &Forge, places: u16) -> Builder {
-    let builder = simulation_server(&webots.path(), forge.path(), places).set("adminPassword", PASSWORD);
-    builder.set("userHeader", "X-Forwarded-User")
+fn with_users(places: u16) -> Builder {
+    demo_server(places).set("adminPassword", PASSWORD).set("userHeader", "X-Forwarded-User")
 }
 
 /// A client that a web server names so, and that calls itself so.
 async fn start(server: &Server, headers: &[(&'static str, &str)], name: Option<&str>) -> Client {
-    let mut client = Client::with_headers(server, headers).await;
+    let mut client = Client::with_headers(&server.websocket("/client"), headers).await.unwrap();
     client.send(&json!({"start": {"url": arm(), "name": name}}).to_string()).await;
     client
 }
@@ -40,8 +34,7 @@ async fn event(server: &Server) -> String {
 
 #[actix_rt::test]
 async fn a_name_is_for_administrators_alone_and_never_markup() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = with_users(&webots, &forge, 2).start().await;
+    let server = with_users(2).start().await;
     let (user, label) = ("<b>anna@lab</b>", "\"<script>alert(1)</script>\u{202e}\n=1+1,x");
     let mut client = start(&server, &[("x-forwarded-user", user)], Some(label)).await;
     client.until("webots:").await;
@@ -75,7 +68,7 @@ async fn a_name_is_for_administrators_alone_and_never_markup() {
     let kept = get_as_administrator(&output).await.text();
     assert!(kept.contains("asks for") && !kept.contains("anna") && !kept.contains("alert(1)"), "{kept}");
     // Where there is no password, nobody sees who is there.
-    let server = simulation_server(&webots.path(), forge.path(), 1).set("userHeader", "X-Forwarded-User").start().await;
+    let server = demo_server(1).set("userHeader", "X-Forwarded-User").start().await;
     let mut client = start(&server, &[("x-forwarded-user", user)], Some(label)).await;
     client.until("webots:").await;
     assert!(!page(&server).await.contains("anna"));
@@ -83,7 +76,6 @@ async fn a_name_is_for_administrators_alone_and_never_markup() {
 
 #[actix_rt::test]
 async fn a_user_is_believed_from_a_trusted_web_server_only() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     let anna = ("x-forwarded-user", "anna");
     for (trusted, header, headers, known) in [
         (json!(["127.0.0.1"]), "X-Forwarded-User", vec![anna], true),
@@ -92,8 +84,7 @@ async fn a_user_is_believed_from_a_trusted_web_server_only() {
         (json!(["127.0.0.1"]), "X-Auth-Name", vec![anna], false),
         (json!(["127.0.0.1"]), "X-Forwarded-User", vec![anna, ("x-forwarded-user", "ben")], false),
     ] {
-        let builder = with_users(&webots, &forge, 1).set("trustedProxies", trusted.clone());
-        let server = builder.set("userHeader", header).start().await;
+        let server = with_users(1).set("trustedProxies", trusted.clone()).set("userHeader", header).start().await;
         let mut client = start(&server, &headers, None).await;
         client.until("webots:").await;
         assert_eq!(page(&server).await.contains("<b>anna</b>"), known, "{trusted} {header} {headers:?}");
@@ -103,9 +94,7 @@ async fn a_user_is_believed_from_a_trusted_web_server_only() {
 
 #[actix_rt::test]
 async fn one_user_has_a_share_of_the_places_wherever_it_is() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let builder = with_users(&webots, &forge, 4).set("waitingLine", 4).set("maxPlacesPerUser", 1);
-    let server = builder.start().await;
+    let server = with_users(4).set("waitingLine", 4).set("maxPlacesPerUser", 1).start().await;
     let from = async |user: &str, address: &str| {
         start(&server, &[("x-forwarded-user", user), ("x-forwarded-for", address)], None).await
     };
@@ -127,12 +116,8 @@ async fn one_user_has_a_share_of_the_places_wherever_it_is() {
 
 #[actix_rt::test]
 async fn who_has_sent_too_many_passwords_is_not_taken_for_a_stranger() {
-    let (forge, webots) = (Forge::new(), Webots::launcher());
-    let server = with_users(&webots, &forge, 1).start().await;
-    let ask = async |path: &str, password: &str| {
-        let request = awc::Client::default().get(server.url(path)).basic_auth("admin", password);
-        request.send().await.unwrap().status().as_u16()
-    };
+    let server = with_users(1).start().await;
+    let ask = async |path: &str, password| get_with_password(&server.url(path), password).await.status.as_u16();
     let guesses = futures_util::stream::iter(0..60).then(|_| ask("/monitor", "guess"));
     let answers: Vec<u16> = guesses.collect().await;
     assert!(answers.starts_with(&[200; 30]) && answers.ends_with(&[429; 10]), "{answers:?}");

@@ -21,9 +21,8 @@ use webots_fleet::simulation::state::AppState;
 use webots_fleet::simulation::streams::Watched;
 use webots_fleet::simulation::webots::{LaunchSpec, Stop, Webots, WebotsEvent, WebotsExit};
 
-use crate::inside::{Inside, arm, ask};
-use crate::support::SOON;
-use crate::support::client::Client;
+use crate::inside::{Inside, ask};
+use crate::support::{Client, SOON, arm};
 
 /// Whoever gets this panics.
 #[derive(Message)]

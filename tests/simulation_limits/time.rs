@@ -7,8 +7,8 @@ use webots_fleet::simulation::snapshot::Stage;
 
 use serde_json::json;
 
-use crate::inside::{Inside, arm};
-use crate::support::until;
+use crate::inside::Inside;
+use crate::support::{arm, until};
 
 pub async fn a_simulation_ends_at_its_time_limit_in_any_state() {
     for stage in [Stage::Launching, Stage::Idle, Stage::Running, Stage::Stopping] {

@@ -14,6 +14,7 @@ use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 use super::SOON;
 
 /// A WebSocket, and all texts that came on it.
+#[derive(Debug)]
 pub struct Client {
     socket: WebSocketStream<MaybeTlsStream<TcpStream>>,
     /// Every text that came.
@@ -90,26 +91,27 @@ impl Client {
 
     /// The same as through a web server, which says that the client has this address.
     pub async fn start_from(server: &super::program::Server, address: &str, world: &str) -> Self {
-        let mut client = Self::try_from_address(server, address).await.unwrap_or_else(|error| panic!("{error}"));
+        let mut client = Self::from_address(server, address).await.unwrap();
         client.send(&serde_json::json!({"start": {"url": world}}).to_string()).await;
         client
     }
 
     /// Connects to a simulation server as through a web server.
-    pub async fn try_from_address(server: &super::program::Server, address: &str) -> Result<Self, Box<Error>> {
-        let mut request = server.websocket("/client").into_client_request().unwrap();
-        request.headers_mut().insert("x-forwarded-for", address.parse().unwrap());
-        let connected = tokio_tungstenite::connect_async(request).await;
-        connected.map(|(socket, _)| Self::new(socket)).map_err(Box::new)
+    pub async fn from_address(server: &super::program::Server, address: &str) -> Result<Self, u16> {
+        Self::with_headers(&server.websocket("/client"), &[("x-forwarded-for", address)]).await
     }
 
-    /// Connects to a simulation server with these headers.
-    pub async fn with_headers(server: &super::program::Server, headers: &[(&'static str, &str)]) -> Self {
-        let mut request = server.websocket("/client").into_client_request().unwrap();
+    /// Connects with these headers; where that is refused, the status of the answer.
+    pub async fn with_headers(url: &str, headers: &[(&'static str, &str)]) -> Result<Self, u16> {
+        let mut request = url.into_client_request().unwrap();
         for (name, value) in headers {
             request.headers_mut().append(*name, value.parse().unwrap());
         }
-        Self::new(tokio_tungstenite::connect_async(request).await.unwrap().0)
+        match tokio_tungstenite::connect_async(request).await {
+            Ok((socket, _)) => Ok(Self::new(socket)),
+            Err(Error::Http(answer)) => Err(answer.status().as_u16()),
+            Err(error) => panic!("{url}: {error}"),
+        }
     }
 
     /// A viewer, once it has seen the scene.
@@ -117,6 +119,21 @@ impl Client {
         self.send("x3d").await;
         self.until("scene load completed").await;
         self
+    }
+
+    /// A viewer that has let the simulation run.
+    pub async fn with_running_scene(self) -> Self {
+        let mut viewer = self.with_scene().await;
+        viewer.send("real-time:-1").await;
+        viewer.until("real-time").await;
+        viewer
+    }
+
+    /// The next simulated time that a viewer is told, in milliseconds.
+    pub async fn time(&mut self) -> f64 {
+        let update = self.until("application/json:").await;
+        let update: serde_json::Value = serde_json::from_str(update.trim_start_matches("application/json:")).unwrap();
+        update["time"].as_f64().unwrap()
     }
 
     /// The id of its simulation, once it was told.
@@ -141,6 +158,17 @@ impl Client {
     /// Sends a text over a connection that may be broken.
     pub async fn try_send(&mut self, text: &str) -> Result<(), String> {
         self.socket.send(Message::text(text)).await.map_err(|error| error.to_string())
+    }
+
+    /// Asks for a reset of a controller; returns the answer.
+    pub async fn reset(&mut self, controller: &str) -> String {
+        self.send(&serde_json::json!({ "reset controller": controller }).to_string()).await;
+        loop {
+            let answer = self.until("").await;
+            if answer.starts_with("reset") || answer.starts_with("loading: Error") {
+                return answer;
+            }
+        }
     }
 
     /// Sends a text in so many frames.
@@ -199,8 +227,13 @@ impl Client {
         }
     }
 
+    /// The next text that begins with this, which an image may have to be built for on a busy machine.
+    pub async fn patiently(&mut self, beginning: &str) -> String {
+        self.within(beginning, Duration::from_secs(90)).await
+    }
+
     /// The next text that begins with this, which may take so long.
-    pub async fn patiently(&mut self, beginning: &str, time: Duration) -> String {
+    pub async fn within(&mut self, beginning: &str, time: Duration) -> String {
         let heard = async {
             loop {
                 match self.read().await {
@@ -244,4 +277,20 @@ impl Client {
     pub async fn leave(mut self) {
         self.socket.close(None).await.ok();
     }
+}
+
+/// What a client that asks for a world is told in the end.
+pub async fn outcome(server: &super::program::Server, world: &str) -> String {
+    let mut client = Client::start(server, world).await;
+    let told = client.patiently("loading: Error:").await;
+    // The words and the code agree in whether another server may take the client.
+    let code = if told.contains(". Connect again: the session server") { 1013 } else { 1000 };
+    assert_eq!(client.closed().await, Some(code), "{told}");
+    told
+}
+
+/// Has a client ask for a world, who is told these words in the end.
+pub async fn is_told(server: &super::program::Server, world: &str, words: &str) {
+    let told = outcome(server, world).await;
+    assert!(told.contains(words), "{world}: {words:?} is not in {told}");
 }

@@ -90,6 +90,14 @@ impl Forge {
         git(&work, &["rev-parse", "HEAD"]).trim().to_owned()
     }
 
+    /// Adds a commit to `main` with so many bytes that can't be packed.
+    pub fn commit_noise(&self, repository: &str, bytes: usize) {
+        let mut noise = vec![0; bytes];
+        rand::fill(&mut noise[..]);
+        std::fs::write(self.work_tree(repository, "main").join(format!("noise{bytes}")), noise).unwrap();
+        self.commit_work_tree(repository, "main");
+    }
+
     /// Tags what a branch has.
     pub fn tag(&self, repository: &str, name: &str, branch: &str) {
         git(&self.bare(repository), &["tag", "--annotate", "--message", "test", name, branch]);
@@ -109,7 +117,12 @@ pub fn world(repository: &str, reference: &str, path: &str) -> String {
 
 /// The URL of the world of [`Forge::with_arm`].
 pub fn arm() -> String {
-    world("lab/arm", "main", "worlds/a.wbt")
+    arm_at("main")
+}
+
+/// The URL of that world in a branch, tag or commit.
+pub fn arm_at(reference: &str) -> String {
+    world("lab/arm", reference, "worlds/a.wbt")
 }
 
 /// Runs git in a folder; gives back what it prints.

@@ -2,7 +2,7 @@
 //!
 //! Everything that a test starts ends with it, and a test that fails prints the logs of what it had started.
 
-#![allow(dead_code, reason = "each test crate uses its own part of this")]
+#![allow(dead_code, unused_imports, reason = "each test crate uses its own part of this")]
 
 pub mod authority;
 pub mod client;
@@ -21,6 +21,11 @@ pub mod smtp;
 pub mod stand_in;
 pub mod stopwatch;
 pub mod webots;
+
+pub use client::{Client, is_told, outcome};
+pub use git::{Forge, WORLD, arm, arm_at, world};
+pub use program::{Builder, Server, demo_server, server_of, server_that_is, session_server, simulation_server};
+pub use webots::{DEMO, Webots, instance_folders_in, instances_below};
 
 use std::io::Write;
 use std::os::unix::fs::PermissionsExt;
@@ -43,6 +48,12 @@ pub fn open_folder() -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     std::fs::set_permissions(folder.path(), PermissionsExt::from_mode(0o755)).unwrap();
     folder
+}
+
+/// Makes a program of a script for bash.
+pub fn make_program(path: &std::path::Path, script: &str) {
+    std::fs::write(path, format!("#!/usr/bin/env bash\n{script}\n")).unwrap();
+    std::fs::set_permissions(path, PermissionsExt::from_mode(0o755)).unwrap();
 }
 
 /// A folder with links to these programs alone, for PATH.

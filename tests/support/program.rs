@@ -1,6 +1,7 @@
 //! The built programs as child processes.
 
 use std::fs::File;
+use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
@@ -32,7 +33,6 @@ pub struct Builder {
     port: u16,
     environment: Vec<(String, String)>,
     folder: Option<PathBuf>,
-    files: Option<u32>,
     before: Option<String>,
     parts: Option<(Forge, Webots)>,
 }
@@ -44,7 +44,7 @@ pub fn session_server(simulation_servers: &[String]) -> Builder {
         "server": "localhost", "ssl": false, "portRewrite": false, "bind": "127.0.0.1", "port": port, "debug": true,
         "simulationServers": simulation_servers, "loadRefresh": 0.1,
     });
-    Builder::new(env!("CARGO_BIN_EXE_session-server"), "session-server", config, port)
+    Builder::new(env!("CARGO_BIN_EXE_session-server"), config, port)
 }
 
 /// A simulation server with so many places, which starts this program as Webots and allows worlds of
@@ -59,8 +59,7 @@ pub fn simulation_server(webots: &Path, repositories: &Path, places: u16) -> Bui
         // The stand-in for Webots may be built in somebody's home.
         "environment": ["DEMO_SIMULATOR_BIND"], "sandbox": {"readable": [env!("CARGO_BIN_EXE_demo-simulator")]},
     });
-    Builder::new(env!("CARGO_BIN_EXE_simulation-server"), "simulation-server", config, port)
-        .env("DEMO_SIMULATOR_BIND", "127.0.0.1")
+    Builder::new(env!("CARGO_BIN_EXE_simulation-server"), config, port).env("DEMO_SIMULATOR_BIND", "127.0.0.1")
 }
 
 /// A simulation server with a forge of its own that has `lab/arm`, and with the demo simulator.
@@ -75,19 +74,27 @@ pub fn server_of(webots: Webots, places: u16) -> Builder {
     Builder { parts: Some((forge, webots)), ..builder }
 }
 
+/// One with one place, whose simulation comes to a state, as servers call it, and stays there; in `checkingout` as long as the
+/// listener is there, which never answers.
+pub fn server_that_is(state: &str) -> (Builder, Option<TcpListener>) {
+    let builder = server_of(Webots::that_is(state), 1);
+    if state != "checkingout" {
+        return (builder, None);
+    }
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let mirror = format!("https://127.0.0.1:{}/", listener.local_addr().unwrap().port());
+    (builder.set("gitMirrors", serde_json::json!({"https://github.com/": mirror})), Some(listener))
+}
+
 impl Builder {
-    fn new(program: &'static str, name: &'static str, config: Value, port: u16) -> Self {
-        Self {
-            program,
-            name,
-            config,
-            port,
-            environment: Vec::new(),
-            folder: None,
-            files: None,
-            before: None,
-            parts: None,
-        }
+    fn new(program: &'static str, config: Value, port: u16) -> Self {
+        let (name, environment) = (program.rsplit('/').next().unwrap(), Vec::new());
+        Self { program, name, config, port, environment, folder: None, before: None, parts: None }
+    }
+
+    /// The forge that a server of [`server_of`] has to itself.
+    pub fn forge(&self) -> &Forge {
+        &self.parts.as_ref().unwrap().0
     }
 
     /// Sets a key of the configuration; `a.b` is a key of a part.
@@ -122,9 +129,8 @@ impl Builder {
     }
 
     /// Lets the server open so many files.
-    pub fn files(mut self, most: u32) -> Self {
-        self.files = Some(most);
-        self
+    pub fn files(self, most: u32) -> Self {
+        self.before(&format!("ulimit -n {most}"))
     }
 
     /// Has a shell do this, which then becomes the server.
@@ -133,12 +139,8 @@ impl Builder {
         self
     }
 
-    /// Writes the configuration and starts the program, without waiting for it.
-    pub fn spawn(mut self) -> Server {
-        // Tests with a thousand connections run beside others.
-        raise_file_limit();
-        let temporary = self.folder.is_none().then(|| tempfile::tempdir().unwrap());
-        let folder = self.folder.take().unwrap_or_else(|| temporary.as_ref().unwrap().path().to_owned());
+    /// Writes the configuration into a folder; returns the file.
+    pub fn write(&mut self, folder: &Path) -> PathBuf {
         for (key, name) in [("logDir", "log"), ("cacheDir", "cache")] {
             if self.config.get(key).is_none() && (key == "logDir" || self.name == "simulation-server") {
                 self.config[key] = folder.join(name).to_str().unwrap().into();
@@ -146,20 +148,21 @@ impl Builder {
         }
         let file = folder.join("config.json");
         std::fs::write(&file, serde_json::to_string_pretty(&self.config).unwrap()).unwrap();
+        file
+    }
+
+    /// Writes the configuration and starts the program, without waiting for it.
+    pub fn spawn(mut self) -> Server {
+        // Tests with a thousand connections run beside others.
+        raise_file_limit();
+        let temporary = self.folder.is_none().then(|| tempfile::tempdir().unwrap());
+        let folder = self.folder.take().unwrap_or_else(|| temporary.as_ref().unwrap().path().to_owned());
+        let file = self.write(&folder);
         let log = File::options().create(true).append(true).open(folder.join("output.txt")).unwrap();
-        let mut command = match (self.files, &self.before) {
-            (_, Some(script)) => {
-                let mut command = Command::new("bash");
-                command.args(["-c", &format!("{script}\nexec \"$0\" \"$@\""), self.program]);
-                command
-            }
-            (Some(files), None) => {
-                let mut command = Command::new("prlimit");
-                command.arg(format!("--nofile={files}:{files}")).arg(self.program);
-                command
-            }
-            (None, None) => Command::new(self.program),
-        };
+        let mut command = Command::new(if self.before.is_some() { "bash" } else { self.program });
+        if let Some(script) = &self.before {
+            command.args(["-c", &format!("{script}\nexec \"$0\" \"$@\""), self.program]);
+        }
         let child = command
             .arg(&file)
             .envs(self.environment)
@@ -196,14 +199,14 @@ impl Builder {
 }
 
 impl Server {
+    /// The forge that a server of [`server_of`] has to itself.
+    pub fn forge(&self) -> &Forge {
+        &self._parts.as_ref().unwrap().0
+    }
+
     /// The folder of its cache.
     pub fn cache(&self) -> PathBuf {
         self.folder.join("cache")
-    }
-
-    /// The folder of all that it writes.
-    pub fn folder(&self) -> &Path {
-        &self.folder
     }
 
     /// `HOST:PORT`.
@@ -224,6 +227,18 @@ impl Server {
     /// The process id.
     pub fn pid(&self) -> i32 {
         i32::try_from(self.child.id()).unwrap()
+    }
+
+    /// The processes that it has started, and that are not lost to others.
+    pub fn children(&self) -> Vec<i32> {
+        let all = procfs::process::all_processes().unwrap().flatten();
+        all.filter(|one| one.stat().is_ok_and(|stat| stat.ppid == self.pid())).map(|one| one.pid()).collect()
+    }
+
+    /// The child that ends the simulations when the server is gone.
+    pub fn guardian(&self) -> i32 {
+        let words = |pid: &i32| procfs::process::Process::new(*pid).and_then(|one| one.cmdline()).unwrap_or_default();
+        self.children().into_iter().find(|pid| words(pid).get(1).is_some_and(|word| word == "guard")).unwrap()
     }
 
     /// Sends a signal to the server itself.

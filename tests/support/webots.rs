@@ -1,7 +1,9 @@
 //! Stand-ins for Webots: the demo simulator behind a launcher, as the real one is, and scripts that misbehave.
 
-use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
+
+/// The shell's word for the demo simulator.
+pub const DEMO: &str = concat!("'", env!("CARGO_BIN_EXE_demo-simulator"), "'");
 
 /// A folder with an executable script called `webots`.
 pub struct Webots {
@@ -12,18 +14,27 @@ impl Webots {
     /// A script with this text below `#!/usr/bin/env bash`.
     pub fn script(text: &str) -> Self {
         let folder = super::open_folder();
-        let path = folder.path().join("webots");
-        std::fs::write(&path, format!("#!/usr/bin/env bash\n{text}\n")).unwrap();
-        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o755)).unwrap();
+        super::make_program(&folder.path().join("webots"), text);
         Self { folder }
     }
 
     /// The launcher of the real Webots: it starts the simulator as its child, hands SIGTERM on, and waits.
     pub fn launcher() -> Self {
         Self::script(&format!(
-            "trap 'kill -TERM $child' TERM INT\n'{}' \"$@\" &\nchild=$!\nwait $child\ncode=$?\ntrap - TERM INT\nwait $child 2>/dev/null\nexit $code",
-            env!("CARGO_BIN_EXE_demo-simulator")
+            "trap 'kill -TERM $child' TERM INT\n{DEMO} \"$@\" &\nchild=$!\nwait $child\ncode=$?\ntrap - TERM INT\nwait $child 2>/dev/null\nexit $code"
         ))
+    }
+
+    /// One whose simulation comes to a state, as servers call it, and stays there. One that is to be stopping ignores SIGTERM
+    /// and has a child that hides.
+    pub fn that_is(state: &str) -> Self {
+        let demo = format!("export DEMO_SIMULATOR_BIND=127.0.0.1; {DEMO} \"$@\" &");
+        Self::script(&match state {
+            "launching" => "sleep 1000 & sleep 1000".to_owned(),
+            "running" => format!("{demo} echo real-time; wait"),
+            "stopping" => format!("trap '' TERM\n(setsid sleep 1000) &\n{demo}\nwhile true; do wait; sleep 0.1; done"),
+            _ => format!("{demo} wait"),
+        })
     }
 
     pub fn path(&self) -> PathBuf {
