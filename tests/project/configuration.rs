@@ -91,18 +91,16 @@ fn check(program: &str, file: &Path) -> Output {
 
 #[test]
 fn every_shipped_configuration_is_taken_without_a_warning() {
-    for kind in ["session", "simulation"] {
-        let program = if kind == "session" {
-            env!("CARGO_BIN_EXE_session-server")
-        } else {
-            env!("CARGO_BIN_EXE_simulation-server")
-        };
-        let mut files = walk(&root().join("config").join(kind));
+    for (kind, name) in kinds().iter().zip(["session", "simulation"]) {
+        let mut files = walk(&root().join("config").join(name));
         files.retain(|file| file.extension().is_some_and(|extension| extension == "json"));
         assert!(files.len() >= 2, "{files:?}");
-        for file in files {
-            let output = check(program, &file);
+        let packaged = root().join("deploy/config").join(name).join("main.json");
+        for file in files.iter().chain([&packaged]) {
+            let output = check(kind.program, file);
             assert!(output.status.success() && output.stderr.is_empty(), "{}: {output:?}", file.display());
+            let config: Value = serde_json::from_slice(&output.stdout).unwrap();
+            assert!(*file != packaged || config["bind"] == "127.0.0.1", "the package's is reached from outside");
         }
     }
 }
