@@ -301,6 +301,14 @@ fn count(clients: usize) -> f64 {
 }
 
 #[cfg(test)]
+impl LoadReport {
+    /// That of a server with so many clients present, places and arrivals, which takes clients.
+    pub fn of(load: f64, present: u32, places: u32, arrivals: u64) -> Self {
+        Self { load, instances: Some(ClientCounts { present, places, arrivals, accepting: true }) }
+    }
+}
+
+#[cfg(test)]
 mod tests {
     use super::*;
 
@@ -329,11 +337,10 @@ mod tests {
 
         /// A report with a load and, of the server's clients, those present and the arrivals.
         fn report(&mut self, seconds: f64, load: f64, counts: Option<(u32, u64)>) {
-            let instances =
-                counts.map(|(present, arrivals)| ClientCounts { present, places: 1000, arrivals, accepting: true });
-            let at = self.at(seconds);
+            let full = |(present, arrivals)| LoadReport::of(load, present, 1000, arrivals);
+            let (at, report) = (self.at(seconds), counts.map_or(LoadReport { load, instances: None }, full));
             self.0.expire(at, &PlacementPolicy::default(), &mut self.3);
-            self.0.report(at, LoadReport { load, instances }, &PlacementPolicy::default(), &mut self.2, &mut self.3);
+            self.0.report(at, report, &PlacementPolicy::default(), &mut self.2, &mut self.3);
         }
 
         fn assert_load(&self, expected: f64, tolerance: f64) {

@@ -212,7 +212,7 @@ impl FleetCost {
 
 #[cfg(test)]
 mod tests {
-    use crate::session::placement::{ClientCounts, LoadBalancer, LoadReport, PlacementPolicy};
+    use crate::session::placement::{LoadBalancer, LoadReport, PlacementPolicy};
     use std::time::{Duration, Instant};
 
     /// A fleet of this many servers, and its start.
@@ -223,8 +223,7 @@ mod tests {
     }
 
     fn report(load: f64, present: u32, arrivals: u32) -> LoadReport {
-        let instances = ClientCounts { present, places: 1000, arrivals: arrivals.into(), accepting: true };
-        LoadReport { load, instances: Some(instances) }
+        LoadReport::of(load, present, 1000, arrivals.into())
     }
 
     fn assert_near(value: Option<f64>, expected: f64, tolerance: f64) {

@@ -223,11 +223,6 @@ mod tests {
         LoadReport { load, instances: None }
     }
 
-    fn full_report(load: f64, present: u32, arrivals: u64) -> LoadReport {
-        let instances = ClientCounts { present, places: 1000, arrivals, accepting: true };
-        LoadReport { load, instances: Some(instances) }
-    }
-
     /// Servers 0, 1, ... with these reports.
     fn fleet(client_cost: f64, now: Instant, reports: impl IntoIterator<Item = LoadReport>) -> LoadBalancer<u32> {
         let mut fleet = LoadBalancer::new(PlacementPolicy { client_cost, ..PlacementPolicy::default() });
@@ -264,13 +259,13 @@ mod tests {
     #[test]
     fn placements_without_room_close_no_server_and_are_spread_like_others() {
         let now = Instant::now();
-        for report in [full_report as fn(f64, u32, u64) -> LoadReport, |load, _, _| load_only(load)] {
-            let mut fleet = fleet(2.0, now, [10.0, 20.0, 30.0].map(|load| report(load, 0, 0)));
+        for report in [load_only as fn(f64) -> LoadReport, |load| LoadReport::of(load, 0, 1000, 0)] {
+            let mut fleet = fleet(2.0, now, [10.0, 20.0, 30.0].map(report));
             let mut got = [0; 3];
             for step in 0..1500 {
                 let at = now + Duration::from_millis(10 * step);
                 if step % 100 == 0 {
-                    (0..3).for_each(|id| fleet.report(&id, at, report(10.0 * f64::from(id + 1), 0, 0)));
+                    (0..3).for_each(|id| fleet.report(&id, at, report(10.0 * f64::from(id + 1))));
                 }
                 let id = fleet.pick_unreserved(at, |_| true).unwrap();
                 got[usize::try_from(id).unwrap()] += 1;
@@ -278,7 +273,7 @@ mod tests {
             }
             assert!(got.iter().all(|got| (400..600).contains(got)), "{got:?}");
             let end = now + Duration::from_secs(15);
-            (0..3).for_each(|id| fleet.report(&id, end, report(10.0 * f64::from(id + 1), 0, 0)));
+            (0..3).for_each(|id| fleet.report(&id, end, report(10.0 * f64::from(id + 1))));
             assert_eq!((0..3).map(|id| fleet.effective_load(&id)).collect::<Vec<_>>(), [10.0, 20.0, 30.0].map(Some));
         }
     }
@@ -286,10 +281,10 @@ mod tests {
     #[test]
     fn a_client_without_room_that_has_come_takes_room() {
         let now = Instant::now();
-        let mut fleet = fleet(2.0, now, [full_report(10.0, 0, 0)]);
+        let mut fleet = fleet(2.0, now, [LoadReport::of(10.0, 0, 1000, 0)]);
         fleet.pick_unreserved(now, |_| true);
         assert_eq!((fleet.effective_load(&0), fleet.in_flight(&0)), (Some(10.0), 1));
-        fleet.report(&0, now, full_report(10.0, 1, 1));
+        fleet.report(&0, now, LoadReport::of(10.0, 1, 1000, 1));
         assert_eq!((fleet.effective_load(&0), fleet.in_flight(&0)), (Some(12.0), 0));
     }
 
@@ -306,10 +301,7 @@ mod tests {
     #[test]
     fn session_servers_side_by_side_do_not_each_fill_the_fleet_alone() {
         let now = Instant::now();
-        let report = |clients| {
-            let instances = ClientCounts { present: clients, places: 500, arrivals: clients.into(), accepting: true };
-            LoadReport { load: 1.0, instances: Some(instances) }
-        };
+        let report = |clients: u32| LoadReport::of(1.0, clients, 500, clients.into());
         let mut beside = [(); 2].map(|()| fleet(0.25, now, [report(0)]));
         for client in 0..300_u32 {
             let at = now + Duration::from_secs(client.into());
@@ -326,18 +318,15 @@ mod tests {
     #[test]
     fn a_session_server_that_is_alone_now_fills_the_fleet_all_the_same() {
         let now = Instant::now();
-        let report = |present, arrivals| {
-            let instances = ClientCounts { present, places: 20, arrivals, accepting: true };
-            LoadReport { load: 1.0, instances: Some(instances) }
-        };
-        let mut fleet = fleet(0.25, now, [report(0, 0)]);
+        let report = |arrivals| LoadReport::of(1.0, 0, 20, arrivals);
+        let mut fleet = fleet(0.25, now, [report(0)]);
         // All of them were sent by other session servers.
-        fleet.report(&0, now + Duration::from_secs(1), report(0, 1_000));
+        fleet.report(&0, now + Duration::from_secs(1), report(1_000));
         let mut placed = 0;
         for second in 2..15 {
             let at = now + Duration::from_secs(second);
             placed += std::iter::from_fn(|| fleet.pick(at, |_| true)).count();
-            fleet.report(&0, at, report(0, 1_000));
+            fleet.report(&0, at, report(1_000));
         }
         assert_eq!(placed, 20, "of 20 clients that wait for 20 places");
     }
