@@ -82,5 +82,10 @@ class Page:
         """By how many pixels the page is wider than the window."""
         return self.tab.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
 
+    def look(self, scheme, width):
+        """Shows it in another scheme, in a window of another width."""
+        self.tab.emulate_media(color_scheme=scheme)
+        self.tab.set_viewport_size({"width": width, "height": 900})
+
     def close(self):
         self.context.close()

@@ -74,10 +74,6 @@ class Demo:
             raise AssertionError(f"server.sh {arguments}: {done.returncode}\n{done.stdout}{done.stderr}{self.logs()}")
         return done.stdout
 
-    def kill(self, kind):
-        """Ends a server without a warning, as a power failure would."""
-        os.kill(self.process(kind), signal.SIGKILL)
-
     def process(self, kind):
         return int((self.folder / f"log/{kind}/demo.pid").read_text())
 

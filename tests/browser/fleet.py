@@ -43,14 +43,14 @@ def free_ports(count):
 
 def until(what, condition):
     """Waits until a condition holds; gives back what it gave."""
-    deadline = time.monotonic() + SOON
-    while True:
-        found = condition()
-        if found:
-            return found
-        if time.monotonic() > deadline:
+    begin = time.monotonic()
+    while not (found := condition()):
+        waited = time.monotonic() - begin
+        if waited > SOON:
             raise AssertionError(f"waited in vain until {what}")
-        time.sleep(0.02)
+        # What is waited for long is asked for less often: each question to a page takes milliseconds of three programs.
+        time.sleep(min(max(waited / 10, 0.02), 0.25))
+    return found
 
 
 class Server:

@@ -116,8 +116,6 @@ class Administrator(BrowserTest):
             "document.querySelector('#charts polyline').getAttribute('points') !== line"))
         self.assertTrue(page.tab.evaluate("labels.filter(one => one.textContent === 'now').every(one => one.isConnected)"))
 
-
-class Phone(BrowserTest):
     def test_two_hundred_rows_can_be_filtered_and_sorted_on_a_phone(self):
         def row(number, state):
             name = f"student{number:03}.wbt"

@@ -11,6 +11,7 @@ from fleet import WORLD, until
 
 
 class OfflineForLong(Running):
+    may_complain = True
     # The same as 90 s with what is usual, at a sixth.
     simulation = {"timing": {"absence": 10, "ping": 1, "silence": 3}}
 
@@ -27,9 +28,6 @@ class OfflineForLong(Running):
             r"^This simulation has ended: there was no connection for \d+ s$|^There was no connection for \d+ s: the simulation has ended.$"))
         expect(page.tab.get_by_role("button", name="Connect", exact=True)).to_be_enabled()
         self.assertIsNone(page.tab.evaluate("sessionStorage.getItem('simulation')"))
-
-    def keeps_to_the_rules(self, page):
-        self.assertEqual(page.hosts(), {self.host}, "who was asked")
 
 
 class Idle(Running):

@@ -3,8 +3,6 @@
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
-use webots_fleet::simulation::machine::display::check;
-
 use crate::support::{display, needs};
 
 /// A virtual X server, ended with the test.
@@ -51,34 +49,6 @@ fn authority(folder: &Path) -> std::path::PathBuf {
 }
 
 #[actix_rt::test]
-async fn an_open_display_is_told_from_one_that_refuses_until_it_is_opened_and_one_that_is_gone() {
-    let _alone = display::alone().await;
-    let folder = tempfile::tempdir().unwrap();
-    let open = Xvfb::start(None);
-    assert_eq!(check(&open.display), Ok(()));
-    let gone = open.display.clone();
-    drop(open);
-    let words = check(&gone).unwrap_err();
-    assert!(words.starts_with(&format!("no display answers at {gone}: ")) && words.contains("Xvfb"), "{words}");
-    assert!(words.contains("nvidia-xconfig --allow-empty-initial-configuration"), "{words}");
-
-    let cookies = authority(folder.path());
-    let locked = Xvfb::start(Some(&cookies));
-    let words = check(&locked.display).unwrap_err();
-    let refused = format!("the display {} refuses this user (Authorization required", locked.display);
-    assert!(words.starts_with(&refused), "{words}");
-    // What is told opens it.
-    needs("xhost", "x11-xserver-utils");
-    let told = words.split("run '").nth(1).and_then(|rest| rest.split('\'').next()).unwrap();
-    assert!(told.contains("xhost +si:localuser:"), "{words}");
-    let mut xhost = Command::new("sh");
-    xhost.args(["-c", told]).env("DISPLAY", &locked.display).env("XAUTHORITY", &cookies);
-    let output = xhost.output().unwrap();
-    assert!(output.status.success(), "{told}: {}", String::from_utf8_lossy(&output.stderr));
-    assert_eq!(check(&locked.display), Ok(()));
-}
-
-#[actix_rt::test]
 async fn the_screen_of_each_gpu_is_checked() {
     let _alone = display::alone().await;
     let library = crate::simulation::readings::gpu_driver();
@@ -98,38 +68,49 @@ async fn the_screen_of_each_gpu_is_checked() {
 }
 
 #[actix_rt::test]
-async fn check_tells_which_case_it_is() {
+async fn check_tells_which_case_it_is_and_what_opens_a_display() {
     let _alone = display::alone().await;
+    needs("xhost", "x11-xserver-utils");
     let folder = tempfile::tempdir().unwrap();
-    let open = Xvfb::start(None);
-    let cookies = authority(folder.path());
+    let (open, cookies) = (Xvfb::start(None), authority(folder.path()));
     let locked = Xvfb::start(Some(&cookies));
-    let (open, locked) = (open.display.as_str(), locked.display.as_str());
-    let table = [
-        (Some(open), None, None, format!("display: {open} answers (the environment variable DISPLAY names it)")),
-        (Some("nonsense"), Some(open), None, format!("display: {open} answers (the configuration names it)")),
-        (Some(locked), None, None, format!("warning: display: the display {locked} refuses this user")),
-        (Some(locked), None, Some(cookies.to_str().unwrap()), format!("display: {locked} answers")),
-        (Some(":59000"), None, None, "warning: display: no display answers at :59000: start an X server".to_owned()),
-        (Some("nonsense"), None, None, "warning: display: \"nonsense\" is no display".to_owned()),
-    ];
-    for (display, configured, authority, words) in table {
-        let (_, told) = super::preflight::check(
-            &configured.map(|display| serde_json::json!({"display": display})).unwrap_or(serde_json::json!({})),
-            |command| {
-                command.env_remove("DISPLAY").env("XAUTHORITY", authority.unwrap_or("/nowhere"));
-                if let Some(display) = display {
-                    command.env("DISPLAY", display);
-                }
-            },
-        );
-        assert!(told.lines().any(|line| line.starts_with(&words)), "{words} is not in\n{told}");
+    let told = |display: Option<&str>, configured: Option<&str>, authority: &Path| {
+        let keys = configured.map_or(serde_json::json!({}), |display| serde_json::json!({ "display": display }));
+        let (_, told) = super::preflight::check(&keys, |command| {
+            command
+                .env_remove("DISPLAY")
+                .env("XAUTHORITY", authority)
+                .envs(display.map(|display| ("DISPLAY", display)));
+        });
+        told.lines().find(|line| line.contains("display: ")).unwrap_or_else(|| panic!("{told}")).to_owned()
+    };
+    let (open, locked, unknown) = (open.display.as_str(), locked.display.as_str(), Path::new("/nowhere"));
+    let no_server = "warning: display: no display answers at :59000: start an X server";
+    for (display, configured, authority, words) in [
+        (open, None, unknown, format!("display: {open} answers (the environment variable DISPLAY names it)")),
+        ("nonsense", Some(open), unknown, format!("display: {open} answers (the configuration names it)")),
+        (locked, None, &cookies, format!("display: {locked} answers")),
+        (":59000", None, unknown, no_server.to_owned()),
+        ("nonsense", None, unknown, "warning: display: \"nonsense\" is no display".to_owned()),
+    ] {
+        let told = told(Some(display), configured, authority);
+        assert!(told.starts_with(&words), "{words} is not in {told}");
     }
+    let words = told(Some(":59000"), None, unknown);
+    assert!(words.contains("Xvfb") && words.contains("nvidia-xconfig --allow-empty-initial-configuration"), "{words}");
     // Whether this machine has a display :0 or not.
-    let (_, told) = super::preflight::check(&serde_json::json!({}), |command| {
-        command.env_remove("DISPLAY");
-    });
-    let line = told.lines().find(|line| line.contains("display: ")).unwrap_or_else(|| panic!("{told}"));
+    let line = told(None, None, unknown);
     assert!(line.contains(":0 ") || line.contains(":0:"), "{line}");
     assert!(line.ends_with("(DISPLAY is not set, and the configuration names no display)"), "{line}");
+
+    let refused = told(Some(locked), None, unknown);
+    let words = format!("warning: display: the display {locked} refuses this user (");
+    assert!(refused.starts_with(&words) && refused.contains("Authorization required"), "{refused}");
+    let opens = refused.split("run '").nth(1).and_then(|rest| rest.split('\'').next()).unwrap();
+    assert!(opens.contains("xhost +si:localuser:"), "{refused}");
+    let mut xhost = Command::new("sh");
+    let output = xhost.args(["-c", opens]).env("DISPLAY", locked).env("XAUTHORITY", &cookies).output().unwrap();
+    assert!(output.status.success(), "{opens}: {}", String::from_utf8_lossy(&output.stderr));
+    let told = told(Some(locked), None, unknown);
+    assert!(told.starts_with(&format!("display: {locked} answers")), "{told}");
 }

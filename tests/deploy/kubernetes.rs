@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
+use std::sync::LazyLock;
 
 use serde_json::Value;
 
@@ -16,27 +17,15 @@ fn text(output: Output) -> String {
     String::from_utf8(output.stdout).unwrap()
 }
 
-/// What a folder of kustomize comes to, as text.
-fn kustomize(folder: &Path) -> String {
-    text(Command::new("kubectl").arg("kustomize").arg(folder).output().unwrap())
-}
-
-fn python() -> Command {
-    let python = text(Command::new(project("tests/python.sh")).output().unwrap());
-    Command::new(python.trim())
-}
-
-/// The objects of a text of YAML.
-fn objects(yaml: &str) -> Vec<Value> {
-    let file = tempfile::NamedTempFile::new().unwrap();
-    std::fs::write(file.path(), yaml).unwrap();
-    let program = "import json, sys, yaml; print(json.dumps(list(yaml.safe_load_all(open(sys.argv[1])))))";
-    let output = python().args(["-c", program]).arg(file.path()).output().unwrap();
-    serde_json::from_str(&text(output)).unwrap()
+/// What kustomize makes of a folder, as text and as objects.
+struct Made {
+    name: &'static str,
+    yaml: String,
+    objects: Vec<Value>,
 }
 
 /// The base, the overlays, and the base with all that may be added. Nothing, and a word, where kubectl is too old for them.
-fn all() -> Vec<(&'static str, String)> {
+static ALL: LazyLock<Vec<Made>> = LazyLock::new(|| {
     needs("kubectl", "kubernetes-client");
     let version = text(Command::new("kubectl").args(["version", "--client", "--output=json"]).output().unwrap());
     let version: Value = serde_json::from_str(&version).unwrap();
@@ -45,9 +34,10 @@ fn all() -> Vec<(&'static str, String)> {
         skip("deploy::kubernetes", "kubectl is older than 1.25");
         return Vec::new();
     }
-    let mut all: Vec<(&str, String)> = ["base", "overlays/demo", "overlays/gpu"]
-        .map(|name| (name, kustomize(&project("deploy/kubernetes").join(name))))
-        .into();
+    let make = |name, folder: &Path| {
+        let yaml = text(Command::new("kubectl").arg("kustomize").arg(folder).output().unwrap());
+        Made { name, objects: serde_saphyr::from_multiple(&yaml).unwrap(), yaml }
+    };
     let folder = tempfile::tempdir().unwrap();
     // kustomize follows relative paths alone.
     let up = "../".repeat(folder.path().canonicalize().unwrap().components().count() - 1);
@@ -56,9 +46,10 @@ fn all() -> Vec<(&'static str, String)> {
         "resources: [{files}/base]\ncomponents: [{files}/components/monitoring, {files}/components/autoscaling]\n"
     );
     std::fs::write(folder.path().join("kustomization.yaml"), own).unwrap();
-    all.push(("base with components", kustomize(folder.path())));
-    all
-}
+    let shipped = ["base", "overlays/demo", "overlays/gpu"];
+    let shipped = shipped.map(|name| make(name, &project("deploy/kubernetes").join(name)));
+    shipped.into_iter().chain([make("base with components", folder.path())]).collect()
+});
 
 fn of_kind<'all>(objects: &'all [Value], kind: &str) -> Vec<&'all Value> {
     objects.iter().filter(|object| object["kind"] == kind).collect()
@@ -72,25 +63,26 @@ fn settings<'all>(objects: &'all [Value], name: &str, key: &str) -> &'all str {
 
 #[test]
 fn all_that_kustomize_makes_keeps_to_the_published_schemas() {
-    for (name, yaml) in all() {
+    let python = text(Command::new(project("tests/python.sh")).output().unwrap());
+    for Made { name, yaml, objects } in &*ALL {
         let file = tempfile::Builder::new().suffix(".yaml").tempfile().unwrap();
-        std::fs::write(file.path(), &yaml).unwrap();
-        let output = python().args(["-m", "kubernetes_validate", "--strict"]).arg(file.path()).output().unwrap();
+        std::fs::write(file.path(), yaml).unwrap();
+        let mut validate = Command::new(python.trim());
+        let output = validate.args(["-m", "kubernetes_validate", "--strict"]).arg(file.path()).output().unwrap();
         let told = String::from_utf8_lossy(&output.stdout);
         let passed = told.lines().filter(|line| line.contains(" passed ")).count();
         // Kinds that are not of Kubernetes itself are not known there.
-        let own = objects(&yaml).iter().filter(|object| object["kind"] != "ServiceMonitor").count();
+        let own = objects.iter().filter(|object| object["kind"] != "ServiceMonitor").count();
         assert!(passed == own && own >= 17, "{name}: {passed} of {own}\n{told}");
-        assert!(!told.contains("ERROR") || name == "base with components", "{name}: {told}");
+        assert!(!told.contains("ERROR") || *name == "base with components", "{name}: {told}");
     }
 }
 
 #[test]
 fn pods_pass_the_restricted_standard_but_for_those_that_draw_on_the_nodes_display() {
-    for (name, yaml) in all() {
-        let objects = objects(&yaml);
-        let namespace = &of_kind(&objects, "Namespace")[0]["metadata"]["labels"]["pod-security.kubernetes.io/enforce"];
-        let deployments = of_kind(&objects, "Deployment");
+    for Made { name, objects, .. } in &*ALL {
+        let namespace = &of_kind(objects, "Namespace")[0]["metadata"]["labels"]["pod-security.kubernetes.io/enforce"];
+        let deployments = of_kind(objects, "Deployment");
         assert_eq!(deployments.len(), 3, "{name}");
         let mut restricted = true;
         for deployment in deployments {
@@ -107,7 +99,11 @@ fn pods_pass_the_restricted_standard_but_for_those_that_draw_on_the_nodes_displa
             let volumes = pod["volumes"].as_array().unwrap();
             restricted &= volumes.iter().all(|volume| volume.get("hostPath").is_none());
         }
-        assert_eq!((restricted, namespace == "restricted"), (name != "overlays/gpu", name != "overlays/gpu"), "{name}");
+        assert_eq!(
+            (restricted, namespace == "restricted"),
+            (*name != "overlays/gpu", *name != "overlays/gpu"),
+            "{name}"
+        );
     }
 }
 
@@ -115,7 +111,7 @@ fn pods_pass_the_restricted_standard_but_for_those_that_draw_on_the_nodes_displa
 fn the_images_are_stages_of_the_dockerfile() {
     let dockerfile = std::fs::read_to_string(project("deploy/docker/Dockerfile")).unwrap();
     let version = env!("CARGO_PKG_VERSION");
-    for (name, yaml) in all() {
+    for Made { name, yaml, .. } in &*ALL {
         let lines = yaml.lines().map(|line| line.trim_start_matches([' ', '-']));
         let images: Vec<&str> = lines.filter_map(|line| line.strip_prefix("image: ")).collect();
         assert_eq!(images.len(), 3, "{name}");
@@ -140,23 +136,22 @@ fn the_images_are_stages_of_the_dockerfile() {
 fn the_configurations_are_taken_as_pods_get_them() {
     let programs =
         [("session", env!("CARGO_BIN_EXE_session-server")), ("simulation", env!("CARGO_BIN_EXE_simulation-server"))];
-    for (name, yaml) in all() {
-        let objects = objects(&yaml);
+    for Made { name, objects, .. } in &*ALL {
         for (kind, program) in programs {
             let file = tempfile::NamedTempFile::new().unwrap();
-            std::fs::write(file.path(), settings(&objects, kind, "config.json")).unwrap();
+            std::fs::write(file.path(), settings(objects, kind, "config.json")).unwrap();
             let mut command = Command::new(program);
             command.arg("--check").arg(file.path()).env("FLEET_ADDRESS", "10.1.2.3");
-            let output = command.env("FLEET_URL", settings(&objects, "fleet", "FLEET_URL")).output().unwrap();
+            let output = command.env("FLEET_URL", settings(objects, "fleet", "FLEET_URL")).output().unwrap();
             let told = String::from_utf8_lossy(&output.stderr).into_owned();
             assert!(!told.contains(file.path().to_str().unwrap()), "{name}: {told}");
             let config: Value = serde_json::from_slice(&output.stdout).unwrap_or_else(|_| panic!("{name}: {told}"));
-            let deployment = of_kind(&objects, "Deployment").into_iter().find(|one| one["metadata"]["name"] == kind);
+            let deployment = of_kind(objects, "Deployment").into_iter().find(|one| one["metadata"]["name"] == kind);
             let container = &deployment.unwrap()["spec"]["template"]["spec"]["containers"][0];
             assert_eq!(container["ports"][0]["containerPort"], config["port"], "{name}");
             if kind == "simulation" {
                 let first = config["port"].as_u64().unwrap();
-                let policies = of_kind(&objects, "NetworkPolicy");
+                let policies = of_kind(objects, "NetworkPolicy");
                 let policy = policies.into_iter().find(|one| one["metadata"]["name"] == "simulation").unwrap();
                 let ports = &policy["spec"]["ingress"][1]["ports"][0];
                 // Streams come through the server.

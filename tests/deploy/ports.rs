@@ -62,13 +62,6 @@ fn the_rules_forward_the_ports_of_the_configurations_and_no_others() {
 }
 
 #[test]
-fn the_firewall_lets_the_ports_in_that_the_rules_forward() {
-    let opened = found(r"to any port (\S+) proto tcp", GUIDE);
-    let behind = in_the_guide().remove(1);
-    assert_eq!(opened, [format!("{}:{}", behind.start(), behind.end())]);
-}
-
-#[test]
 fn the_documentation_names_patterns_for_what_they_match() {
     let page = include_str!("../../docs/deployment-web-server.md");
     let row = Regex::new(r"\| ([0-9]+) \| ([0-9]+) \| ([0-9]+) to ([0-9]+) \| `(\S+)` \|").unwrap();

@@ -12,31 +12,21 @@ fn its_servers_and_its_door_are_those_of_the_demo_on_kubernetes() {
         assert_eq!(read(&format!("swarm/{file}")), read(&format!("kubernetes/overlays/demo/{file}")), "{file}");
     }
     assert_eq!(read("swarm/simulation-gpu.json"), read("kubernetes/overlays/gpu/simulation.json"));
-    let [swarm, kubernetes] = ["swarm/door.conf", "kubernetes/base/config/fleet.conf"].map(read);
-    for rule in [
-        "rewrite ",
-        "add_header ",
-        "location ",
-        "if (",
-        "proxy_read_timeout ",
-        "proxy_connect_timeout ",
-        "proxy_pass http://$fleet_address",
-    ] {
-        let rules = |conf: &str| -> Vec<String> {
-            conf.lines().map(str::trim).filter(|line| line.starts_with(rule)).map(str::to_owned).collect()
-        };
-        assert_eq!(rules(&swarm), rules(&kubernetes));
-        assert!(!rules(&swarm).is_empty(), "{rule}");
+    let rules = |file: &str, beginning: &str| -> Vec<String> {
+        read(file).lines().map(str::trim).filter(|line| line.starts_with(beginning)).map(str::to_owned).collect()
+    };
+    let (swarm, kubernetes, door) = ("swarm/door.conf", "kubernetes/base/config/fleet.conf", "nginx-door.conf");
+    let proxy = ["proxy_read_timeout ", "proxy_connect_timeout ", "proxy_pass http://$fleet_address"];
+    for beginning in ["rewrite ", "add_header ", "location ", "if ("].into_iter().chain(proxy) {
+        assert!(!rules(swarm, beginning).is_empty(), "{beginning}");
+        assert_eq!(rules(swarm, beginning), rules(kubernetes, beginning));
     }
     // What keeps secrets from Webots, and forged headers from servers, is that of every door.
-    let door = read("nginx-door.conf");
     for header in ["Authorization", "Cookie", "X-Forwarded-User", "X-Forwarded-For", "Forwarded", "Host", "Upgrade"] {
         let rule = format!("proxy_set_header {header} ");
-        let rules = |conf: &str| -> Vec<String> {
-            conf.lines().map(str::trim).filter(|line| line.starts_with(&rule)).map(str::to_owned).collect()
-        };
-        assert!(!rules(&door).is_empty(), "{header}");
-        assert_eq!([rules(&swarm), rules(&kubernetes)], [rules(&door), rules(&door)]);
+        let wanted = rules(door, &rule);
+        assert!(!wanted.is_empty(), "{header}");
+        assert_eq!([rules(swarm, &rule), rules(kubernetes, &rule)], [wanted.clone(), wanted]);
     }
 }
 

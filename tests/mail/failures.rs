@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use ::log::Level;
 use serde_json::json;
-use webots_fleet::session::mail::NoticeKind;
+use webots_fleet::session::mail::{self, NoticeKind};
 
 use super::log::{logged, wait_for_log};
 use super::{loaded, notice, start, test_mail};
@@ -13,32 +13,17 @@ use crate::support::smtp::Smtp;
 use crate::support::stopwatch::Stopwatch;
 
 #[actix_rt::test]
-async fn what_a_server_refuses_is_named() {
-    for (options, words) in [
+async fn a_test_mail_says_how_it_went() {
+    let refused = [
         (&["--refuse", "recipient"], "550 5.1.1 no such user here"),
         (&["--refuse", "mail"], "451 4.3.0 try again later"),
         (&["--login", "fleet:s3cret"], "530 5.7.0 Authentication required"),
-    ] {
+    ];
+    for (options, words) in refused {
         let smtp = Smtp::start(options).await;
         let error = test_mail(&loaded(smtp.port, &json!({}))).await.unwrap_err();
         assert_eq!(error, format!("127.0.0.1:{}: {words}", smtp.port));
     }
-}
-
-#[actix_rt::test]
-async fn a_test_mail_says_how_it_went() {
-    let mut smtp = Smtp::start(&[]).await;
-    let said = test_mail(&loaded(smtp.port, &json!({}))).await.unwrap();
-    let port = smtp.port;
-    let words = format!("127.0.0.1:{port} took a test: 2.0.0 OK: queued");
-    assert_eq!(said, words);
-    let mail = smtp.mail().await;
-    assert_eq!(mail.subject(), "Test of the session server's notifications");
-    assert!(mail.field("text").contains("Nothing has happened"), "{mail:?}");
-}
-
-#[actix_rt::test]
-async fn a_dead_host_is_named() {
     let (_reserved, dead) = dead_port();
     let error = test_mail(&loaded(dead, &json!({}))).await.unwrap_err();
     assert!(error.starts_with(&format!("127.0.0.1:{dead}: Connection refused")), "{error}");
@@ -46,6 +31,28 @@ async fn a_dead_host_is_named() {
     let nobody = format!("{}.example.org", "a".repeat(64));
     let error = test_mail(&loaded(25, &json!({"mailServer": nobody}))).await.unwrap_err();
     assert!(error.starts_with(&format!("{nobody}:25: failed to lookup address information")), "{error}");
+
+    let mut smtp = Smtp::start(&[]).await;
+    let said = test_mail(&loaded(smtp.port, &json!({}))).await.unwrap();
+    assert_eq!(said, format!("127.0.0.1:{} took a test: 2.0.0 OK: queued", smtp.port));
+    let mail = smtp.mail().await;
+    assert_eq!(mail.subject(), "Test of the session server's notifications");
+    assert!(mail.field("text").contains("Nothing has happened"), "{mail:?}");
+}
+
+#[actix_rt::test]
+async fn without_one_of_the_three_keys_mails_are_off() {
+    for key in ["administrator", "mailServer", "mailSender"] {
+        let mut config = loaded(25, &json!({}));
+        match key {
+            "administrator" => config.administrator = None,
+            "mailServer" => config.mail_server = None,
+            _ => config.mail_sender = None,
+        }
+        assert!(mail::start(&config).all().next().is_none(), "there is a mailer without {key}");
+        let error = test_mail(&config).await.unwrap_err();
+        assert_eq!(error, format!("notifications are off: {key} is not set"));
+    }
 }
 
 #[actix_rt::test]

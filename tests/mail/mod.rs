@@ -4,7 +4,6 @@ mod failures;
 mod log;
 mod login;
 mod notices;
-mod settings;
 
 use std::time::SystemTime;
 

@@ -85,7 +85,7 @@ async fn nothing_from_outside_gets_into_the_headers_or_begins_a_line() {
     assert_eq!(mail.subject(), "Simulation server not responding: sim  Bcc: thief@example.com    body:2000");
     assert!(!mail.field("text").contains("\nRCPT TO"), "{mail:?}");
     assert!(!mail.field("text").contains('\u{1b}'), "{mail:?}");
-    wait_for_log(Level::Info, smtp.port, 1).await;
+    smtp.wait_for("closed").await;
     assert_eq!(smtp.commands(), ["EHLO", "MAIL", "RCPT", "DATA", "QUIT"]);
     nothing_unexpected(smtp.port);
 }

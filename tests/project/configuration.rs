@@ -91,18 +91,16 @@ fn check(program: &str, file: &Path) -> Output {
 
 #[test]
 fn every_shipped_configuration_is_taken_without_a_warning() {
-    for kind in ["session", "simulation"] {
-        let program = if kind == "session" {
-            env!("CARGO_BIN_EXE_session-server")
-        } else {
-            env!("CARGO_BIN_EXE_simulation-server")
-        };
-        let mut files = walk(&root().join("config").join(kind));
+    for (kind, name) in kinds().iter().zip(["session", "simulation"]) {
+        let mut files = walk(&root().join("config").join(name));
         files.retain(|file| file.extension().is_some_and(|extension| extension == "json"));
         assert!(files.len() >= 2, "{files:?}");
-        for file in files {
-            let output = check(program, &file);
+        let packaged = root().join("deploy/config").join(name).join("main.json");
+        for file in files.iter().chain([&packaged]) {
+            let output = check(kind.program, file);
             assert!(output.status.success() && output.stderr.is_empty(), "{}: {output:?}", file.display());
+            let config: Value = serde_json::from_slice(&output.stdout).unwrap();
+            assert!(*file != packaged || config["bind"] == "127.0.0.1", "the package's is reached from outside");
         }
     }
 }
@@ -115,6 +113,9 @@ fn the_page_names_every_key_once_with_its_default_and_no_other() {
         named.sort_unstable();
         let known: Vec<&str> = defaults.keys().map(String::as_str).collect();
         assert_eq!(named, known, "{}", kind.heading);
+        for alias in kind.aliases {
+            assert!(kind.page().contains(&format!("`{alias}`")), "{alias}");
+        }
         for (key, told) in &rows {
             let default = &defaults[key];
             if told == "required" {
@@ -133,15 +134,6 @@ fn the_page_names_every_key_once_with_its_default_and_no_other() {
                 };
                 assert!(same, "{key}: the page says {told}, it is {default}");
             }
-        }
-    }
-}
-
-#[test]
-fn the_page_names_what_else_keys_may_be_called() {
-    for kind in kinds() {
-        for alias in kind.aliases {
-            assert!(kind.page().contains(&format!("`{alias}`")), "{alias}");
         }
     }
 }

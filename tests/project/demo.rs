@@ -21,15 +21,30 @@ async fn simulate(project: &Project) -> (Client, String) {
     (client, url)
 }
 
-/// A viewer that has seen the scene.
-async fn watch(url: &str) -> Client {
-    Client::connect(&format!("{url}/")).await.with_scene().await
-}
-
-/// The simulation time of an update, in milliseconds.
-fn time(update: &str) -> f64 {
-    let json: serde_json::Value = serde_json::from_str(update.trim_start_matches("application/json:")).unwrap();
-    json["time"].as_f64().unwrap()
+/// What the README's client hears of a server, until a line begins so.
+async fn talk(project: &Project, url: &str, message: &str, last: &str) -> Vec<String> {
+    // A shell can't take back that SIGINT is ignored, as it is below `nohup tests/run.sh &`.
+    let mut child = tokio::process::Command::new("env")
+        .arg("--default-signal=INT")
+        .arg(project.path("tests/websocket.sh"))
+        .args([url, message])
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .process_group(0)
+        .spawn()
+        .unwrap();
+    let group = Pid::from_raw(child.id().unwrap().try_into().unwrap());
+    let mut reader = tokio::io::BufReader::new(child.stdout.take().unwrap()).lines();
+    let mut heard: Vec<String> = Vec::new();
+    while !heard.last().is_some_and(|line| line.starts_with(last)) {
+        let line = actix_rt::time::timeout(SOON, reader.next_line()).await;
+        let Ok(Ok(Some(line))) = line else { panic!("only {heard:?} came") };
+        heard.push(line);
+    }
+    // As Ctrl-C does.
+    killpg(group, Signal::SIGINT).unwrap();
+    actix_rt::time::timeout(SOON, child.wait()).await.unwrap().unwrap();
+    heard
 }
 
 #[actix_rt::test]
@@ -47,32 +62,15 @@ async fn the_demo_runs_from_its_start_to_its_stop() {
     }
 
     project.available().await;
-    let mut visitor = Client::connect(&format!("ws://localhost:{session}/session")).await;
-    visitor.until("1").await;
-    let chosen = http::get(&project.session_url(&format!("/session?url={WORLD}"))).await.text();
-    assert_eq!(chosen, format!("ws://localhost:{simulation}"));
+    let answer = talk(&project, &format!("ws://localhost:{session}/session"), WORLD, "ws:").await;
+    assert_eq!(answer, ["1".to_owned(), format!("ws://localhost:{simulation}")]);
     for path in ["/monitor", "/status", "/load", "/metrics", "/health", "/request"] {
         assert_eq!(http::get(&project.session_url(path)).await.status, 200, "{path}");
     }
-
-    let (client, url) = simulate(&project).await;
-    assert!(url.starts_with(&format!("ws://localhost:{simulation}/stream/")), "{url}");
-    let mut viewer = watch(&url).await;
-    assert!(viewer.heard.iter().any(|text| text.starts_with("model:") && text.contains("beetle")));
-    viewer.send("real-time:-1").await;
-    viewer.until("real-time").await;
-    while time(&viewer.until("application/json:").await) < 100.0 {}
-    viewer.send("pause").await;
-    viewer.until("paused by client").await;
-    viewer.send("step").await;
-    let stepped = time(&viewer.until("application/json:").await);
-    assert!(stepped > 100.0, "{stepped}");
-    viewer.until("paused by client").await;
-    viewer.send("reset").await;
-    assert_eq!(time(&viewer.until("application/json:").await), 0.0);
-    viewer.until("reset finished").await;
-
-    client.leave().await;
+    let start = serde_json::json!({"start": {"url": WORLD}}).to_string();
+    let answer = talk(&project, &format!("ws://localhost:{simulation}/client"), &start, "webots:").await;
+    let stream = format!("webots:ws://localhost:{simulation}/stream/");
+    assert!(answer.last().unwrap().starts_with(&stream), "{answer:?}");
     until("neither a process nor a folder of the simulation is left", async || {
         instance_folders_in(&project.path("cache")).is_empty() && processes_in(&project.path("cache")).is_empty()
     })
@@ -120,45 +118,8 @@ async fn a_restart_shows_what_was_changed_in_the_demos_project() {
     through_the_link(&["restart"]).await;
     assert_ne!(before, project.pid("session", "demo"));
     let (_client, url) = simulate(&project).await;
-    let viewer = watch(&url).await;
+    let viewer = Client::connect(&format!("{url}/")).await.with_scene().await;
     assert!(viewer.heard.iter().any(|text| text.contains("ladybird")), "{:?}", viewer.heard);
-}
-
-#[actix_rt::test]
-async fn the_client_of_the_readme_works() {
-    let project = Project::copy();
-    project.done(&["start", "demo"]).await;
-    let talk = async |port: u16, path: &str, message: &str, last: &str| {
-        // A shell can't take back that SIGINT is ignored, as it is below `nohup tests/run.sh &`.
-        let mut child = tokio::process::Command::new("env")
-            .arg("--default-signal=INT")
-            .arg(project.path("tests/websocket.sh"))
-            .args([&format!("ws://localhost:{port}{path}"), message])
-            .stdin(Stdio::null())
-            .stdout(Stdio::piped())
-            .process_group(0)
-            .spawn()
-            .unwrap();
-        let group = Pid::from_raw(child.id().unwrap().try_into().unwrap());
-        let mut reader = tokio::io::BufReader::new(child.stdout.take().unwrap()).lines();
-        let mut heard: Vec<String> = Vec::new();
-        while !heard.last().is_some_and(|line| line.starts_with(last)) {
-            let line = actix_rt::time::timeout(SOON, reader.next_line()).await;
-            let Ok(Ok(Some(line))) = line else { panic!("only {heard:?} came") };
-            heard.push(line);
-        }
-        // As Ctrl-C does.
-        killpg(group, Signal::SIGINT).unwrap();
-        actix_rt::time::timeout(SOON, child.wait()).await.unwrap().unwrap();
-        heard
-    };
-    project.available().await;
-    let answer = talk(project.session, "/session", WORLD, "ws:").await;
-    assert_eq!(answer, ["1".to_owned(), format!("ws://localhost:{}", project.simulation)]);
-    let start = serde_json::json!({"start": {"url": WORLD}}).to_string();
-    let answer = talk(project.simulation, "/client", &start, "webots:").await;
-    let stream = format!("webots:ws://localhost:{}/stream/", project.simulation);
-    assert!(answer.last().unwrap().starts_with(&stream), "{answer:?}");
 }
 
 #[actix_rt::test]

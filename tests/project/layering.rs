@@ -6,82 +6,47 @@ use regex::Regex;
 
 use super::copy::{root, walk};
 
-/// The rooms of the library from the bottom to the top: files and folders. Each may name those before it, and what is in
-/// it. `session` and `simulation` don't see each other.
-const SHARED: [&str; 5] = ["shared::text", "shared::config", "shared::domain", "shared::run", "shared::http"];
-const SESSION: [&str; 8] = [
-    "session::placement",
-    "session::config",
-    "session::announcements",
-    "session::mail",
-    "session::fleet",
-    "session::state",
-    "session::web",
-    "session::app",
-];
-const SIMULATION: [&str; 24] = [
-    "simulation::client_identity",
-    "simulation::simulation_id",
-    "simulation::snapshot",
-    "simulation::ends",
-    "simulation::failed_starts",
-    "simulation::slots",
-    "simulation::sessions",
-    "simulation::streams",
-    "simulation::relay",
-    "simulation::protocol",
-    "simulation::process",
-    "simulation::machine",
-    "simulation::config",
-    "simulation::checkout",
-    "simulation::isolation",
-    "simulation::container",
-    "simulation::preflight",
-    "simulation::announcer",
-    "simulation::webots",
-    "simulation::readiness",
-    "simulation::state",
-    "simulation::client",
-    "simulation::web",
-    "simulation::app",
+/// The rooms of each part of the library from the bottom to the top: files and folders. Each may name those before it, and
+/// what is in it; those of `session` and `simulation` also all of `shared`, and never each other.
+const ROOMS: [(&str, &str); 3] = [
+    ("shared", "text config domain run http"),
+    ("session", "placement config announcements mail fleet state web app"),
+    (
+        "simulation",
+        "client_identity simulation_id snapshot ends failed_starts slots sessions streams relay protocol process machine config \
+         checkout isolation container preflight announcer webots readiness state client web app",
+    ),
 ];
 
-/// A source file.
-struct Source {
-    /// Path below the project's folder.
-    path: String,
-    /// The text as it stands, and without comments and inline tests.
-    text: String,
-    shipped: String,
-}
-
-/// All files below `src`.
-fn sources() -> Vec<Source> {
+/// All files below `src`: the path, the text as it stands, and without comments and inline tests.
+fn sources() -> Vec<(String, String, String)> {
     let tests = Regex::new(r"(?s)#\[cfg\(test\)\]\nmod tests \{.*?\n\}\n|(?m-s:^ *//.*\n)").unwrap();
     let files = walk(&root().join("src")).into_iter().filter(|path| path.extension().is_some_and(|end| end == "rs"));
-    let source = |file: std::path::PathBuf| {
-        let text = std::fs::read_to_string(&file).unwrap();
-        let path = file.strip_prefix(root()).unwrap().to_str().unwrap().to_owned();
-        Source { path, shipped: tests.replace_all(&text, "").into_owned(), text }
-    };
-    files.map(source).collect()
+    files
+        .map(|file| {
+            let text = std::fs::read_to_string(&file).unwrap();
+            let path = file.strip_prefix(root()).unwrap().to_str().unwrap().to_owned();
+            let shipped = tests.replace_all(&text, "").into_owned();
+            (path, text, shipped)
+        })
+        .collect()
 }
 
 /// What each module of the library names: `simulation::webots` and the like, with programs left out.
 fn imports() -> BTreeMap<String, BTreeSet<String>> {
-    let module = |source: &Source| {
-        let inside = source.path.strip_prefix("src/")?.strip_suffix(".rs")?;
+    let module = |path: &str| {
+        let inside = path.strip_prefix("src/")?.strip_suffix(".rs")?;
         let inside = inside.strip_suffix("/mod").unwrap_or(inside);
         (!inside.starts_with("bin/") && inside != "lib").then(|| inside.replace('/', "::"))
     };
-    let all: BTreeMap<String, Source> =
-        sources().into_iter().filter_map(|source| Some((module(&source)?, source))).collect();
+    let all: BTreeMap<String, String> =
+        sources().into_iter().filter_map(|(path, _, shipped)| Some((module(&path)?, shipped))).collect();
     // A path, and the names that it ends in if these are in braces.
     let paths = Regex::new(r"\b(crate|super)((?:::\w+)*)(?:::\{([^{}]*)\})?").unwrap();
-    let named = |(name, source): (&String, &Source)| {
-        assert!(!source.shipped.contains("super::super"), "{name}: longer ways begin with crate");
+    let named = |(name, shipped): (&String, &String)| {
+        assert!(!shipped.contains("super::super"), "{name}: longer ways begin with crate");
         let parent = name.rsplit_once("::").map_or("", |(parent, _)| parent);
-        let named = paths.captures_iter(&source.shipped).flat_map(|found| {
+        let named = paths.captures_iter(shipped).flat_map(|found| {
             let text = |group| found.get(group).map_or("", |text| text.as_str());
             let begin = if text(1) == "super" { parent } else { "" };
             let path = format!("{begin}{}", text(2)).trim_start_matches("::").to_owned();
@@ -99,34 +64,28 @@ fn imports() -> BTreeMap<String, BTreeSet<String>> {
     imports
 }
 
-/// The room of a module, none for `session`, `simulation` and `shared` as a whole.
-fn room(module: &str) -> Option<&'static str> {
-    let mut rooms = SHARED.into_iter().chain(SESSION).chain(SIMULATION);
-    rooms.find(|room| module == *room || module.strip_prefix(room).is_some_and(|rest| rest.starts_with("::")))
+/// The part and the floor of a module's room; none for a part as a whole.
+fn room(module: &str) -> Option<(&'static str, usize)> {
+    let (part, inside) = module.split_once("::")?;
+    let (part, rooms) = ROOMS.iter().find(|(name, _)| *name == part)?;
+    let floor = rooms.split(' ').position(|room| Some(room) == inside.split("::").next())?;
+    Some((part, floor))
 }
 
-/// Whether what is in one room may name what is in another.
-fn may_name(from: &str, to: &str) -> bool {
-    let is_below = |tower: &[&str]| {
-        let floor = |room| tower.iter().position(|one| *one == room);
-        floor(from).zip(floor(to)).is_some_and(|(from, to)| from > to)
-    };
-    let lands_on_shared = !from.starts_with("shared::") && to.starts_with("shared::");
-    from == to || lands_on_shared || is_below(&SHARED) || is_below(&SESSION) || is_below(&SIMULATION)
-}
-
-fn none(what: &str, offenders: Vec<String>) {
-    assert!(offenders.is_empty(), "{what}:\n  {}\n", offenders.join("\n  "));
+fn may_name(from: (&str, usize), to: (&str, usize)) -> bool {
+    if from.0 == to.0 { from.1 >= to.1 } else { to.0 == "shared" }
 }
 
 #[test]
 fn imports_point_down_only() {
     let imports = imports();
-    let homeless = imports.keys().filter(|name| name.contains("::") && room(name).is_none());
-    none("These are in no room", homeless.cloned().collect());
+    let homeless: Vec<_> = imports.keys().filter(|name| name.contains("::") && room(name).is_none()).collect();
+    assert!(homeless.is_empty(), "in no room: {homeless:#?}");
     let edges = imports.iter().flat_map(|(from, all)| all.iter().map(move |to| (from, to)));
-    let bad = edges.filter(|(from, to)| room(from).zip(room(to)).is_some_and(|(from, to)| !may_name(from, to)));
-    none("These name what is above them, or another server", bad.map(|(from, to)| format!("{from} -> {to}")).collect());
+    let is_bad =
+        |(from, to): &(&String, &String)| room(from).zip(room(to)).is_some_and(|(from, to)| !may_name(from, to));
+    let bad: Vec<_> = edges.filter(is_bad).collect();
+    assert!(bad.is_empty(), "these name what is above them, or another server: {bad:#?}");
 }
 
 #[test]
@@ -135,62 +94,34 @@ fn no_modules_name_each_other() {
     // Those that name nothing that is left can be in no circle.
     while let Some(free) = imports.iter().find(|(_, names)| names.is_empty()).map(|(name, _)| name.clone()) {
         imports.remove(&free);
-        for names in imports.values_mut() {
-            names.remove(&free);
-        }
+        imports.values_mut().for_each(|names| names.retain(|name| *name != free));
     }
-    none("These are in a circle, or name one", imports.into_keys().collect());
+    assert!(imports.is_empty(), "these are in a circle, or name one: {:#?}", imports.keys());
 }
 
 #[test]
-fn the_demo_simulator_and_the_servers_know_nothing_of_each_other() {
-    let (mut demo, mut servers) = (Vec::new(), Vec::new());
-    for source in sources() {
-        if source.path.starts_with("src/bin/demo_simulator/") {
-            if source.shipped.contains("webots_fleet") {
-                demo.push(source.path);
-            }
-        } else if source.shipped.to_lowercase().contains("demo") {
-            servers.push(source.path);
+fn no_file_has_what_its_place_forbids() {
+    let impure = r"tokio|std::fs|std::net::Tcp|std::process|Instant::now\(|SystemTime::now\(";
+    // Which files, by their path or by what they say of themselves, and what they never have.
+    let rules = [
+        ("^src/bin/demo_simulator/", "webots_fleet"),
+        ("^src/(bin/[^d]|lib|shared|session|simulation)", "(?i)demo"),
+        ("^//!.*Pure", impure),
+        ("^src/session/placement/", &format!("actix|{impure}")),
+        (r"\.rs$", "(?s)impl Actor for.*impl Actor for"),
+        // A front page, without code.
+        (
+            r"(/mod|^src/lib)\.rs$",
+            r"(?m)\*|^ *(pub(\(crate\))? )?(fn|struct|enum|trait|impl|const|static|type|macro_rules)\b",
+        ),
+    ];
+    for (files, forbidden) in rules {
+        let (files, forbidden) = (Regex::new(files).unwrap(), Regex::new(forbidden).unwrap());
+        for (path, text, shipped) in sources() {
+            let head = text.lines().take_while(|line| line.starts_with("//!"));
+            let is_meant = head.chain([path.as_str()]).any(|line| files.is_match(line));
+            let found = forbidden.find(&shipped).filter(|_| is_meant);
+            assert!(found.is_none(), "{path} has {found:?}");
         }
     }
-    none("These of the demo simulator name the servers", demo);
-    none("These of the servers name the demo", servers);
-}
-
-#[test]
-fn what_is_called_pure_is() {
-    let impure = ["tokio", "std::fs", "std::net::Tcp", "std::process", "Instant::now(", "SystemTime::now("];
-    let mut bad = Vec::new();
-    for source in sources() {
-        let placement = source.path.starts_with("src/session/placement/");
-        let pure = placement || source.text.lines().any(|line| line.starts_with("//!") && line.contains("Pure"));
-        let words = impure.iter().filter(|_| pure).chain(["actix"].iter().filter(|_| placement));
-        for word in words.filter(|word| source.shipped.contains(**word)) {
-            bad.push(format!("{}: {word}", source.path));
-        }
-    }
-    none("These are called pure", bad);
-}
-
-#[test]
-fn a_file_has_one_actor_at_most() {
-    let crowded = sources().into_iter().filter(|source| source.shipped.matches("impl Actor for").count() > 1);
-    none("These have several actors", crowded.map(|source| source.path).collect());
-}
-
-#[test]
-fn a_mod_rs_is_a_front_page_without_code() {
-    let mut bad = Vec::new();
-    for source in sources().iter().filter(|source| source.path.ends_with("/mod.rs") || source.path == "src/lib.rs") {
-        let statements = source.shipped.lines().filter(|line| !line.starts_with("#![")).collect::<String>();
-        for statement in statements.split(';').map(str::trim).filter(|statement| !statement.is_empty()) {
-            let listed =
-                ["mod ", "pub mod ", "pub use ", "pub(crate) mod "].iter().any(|word| statement.starts_with(word));
-            if !listed || statement.contains('*') {
-                bad.push(format!("{}: {statement}", source.path));
-            }
-        }
-    }
-    none("These are more than a list of modules", bad);
 }

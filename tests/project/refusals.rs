@@ -71,20 +71,14 @@ async fn what_is_missing_is_started_beside_what_runs() {
 }
 
 #[actix_rt::test]
-async fn a_port_that_is_taken_is_named() {
-    let project = Project::copy();
-    for port in [project.simulation, project.session] {
-        let listener = TcpListener::bind(("127.0.0.1", port)).unwrap();
-        let told = refused(&project, &["start", "demo"], 1).await;
-        assert!(told.contains(&format!("can't listen on 127.0.0.1:{port}: Address already in use")), "{told}");
-        drop(listener);
-        nothing_is_left(&project).await;
-    }
-}
-
-#[actix_rt::test]
 async fn when_one_server_does_not_start_its_last_words_are_shown_and_the_other_is_stopped() {
     let project = Project::copy();
+    for port in [project.simulation, project.session] {
+        let _listener = TcpListener::bind(("127.0.0.1", port)).unwrap();
+        let told = refused(&project, &["start", "demo"], 1).await;
+        assert!(told.contains(&format!("can't listen on 127.0.0.1:{port}: Address already in use")), "{told}");
+    }
+    nothing_is_left(&project).await;
     project.configure("session/demo", |config| config["logDir"] = "server.sh".into());
     let told = refused(&project, &["start", "demo"], 1).await;
     assert!(told.contains("the session server of demo has not started") && told.contains("can't be written"), "{told}");

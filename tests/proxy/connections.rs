@@ -1,20 +1,15 @@
 //! Long connections: quiet times, and web servers that are told to read their configuration again or are restarted.
 
-use std::io::{Read, Write};
-use std::net::TcpListener;
 use std::time::Duration;
-
-use futures_util::StreamExt;
 
 use super::fleet::{Fleet, IDLE};
 use super::rules::Rules;
-use crate::support::SOON;
 use crate::support::client::{Client, Heard};
 
 /// Longer than the web server's patience.
 const QUIET: Duration = Duration::from_millis(IDLE.as_millis() as u64 * 3 / 2);
 
-async fn quiet_connections_last(rules: Rules) {
+async fn quiet_connections_last_and_live_pages_go_on(rules: Rules) {
     let fleet = Fleet::start(rules).await;
     let browser = &fleet.browser;
     let mut door = browser.connect(&rules.session_path(fleet.session.port, "/session")).await;
@@ -24,7 +19,9 @@ async fn quiet_connections_last(rules: Rules) {
     viewer.send("pause").await;
     viewer.until("paused by client").await;
     // Nothing but pings goes over these connections; over Webots' stream not even these.
-    assert!(idle.is_silent(QUIET).await, "{:?}", idle.heard);
+    let live = super::pages::pages_are_live(&fleet, rules);
+    let (is_silent, ()) = futures_util::join!(idle.is_silent(QUIET), live);
+    assert!(is_silent, "{:?}", idle.heard);
     viewer.send("real-time:-1").await;
     viewer.until("application/json:").await;
     client.until(".").await;
@@ -43,7 +40,7 @@ async fn a_door_still_answers(door: &mut Client) {
     }
 }
 
-through_both!(quiet_connections_last);
+through_both!(quiet_connections_last_and_live_pages_go_on);
 
 #[actix_rt::test]
 async fn the_documents_rules_keep_what_is_pinged_and_cut_what_is_silent() {
@@ -55,37 +52,6 @@ async fn the_documents_rules_keep_what_is_pinged_and_cut_what_is_silent() {
     client.until(".").await;
     a_door_still_answers(&mut door).await;
 }
-
-/// What a live page is told, or the pictures of a Webots that streams a video.
-async fn what_is_sent_in_pieces_comes_in_pieces(rules: Rules) {
-    let fleet = Fleet::start(rules).await;
-    let port = fleet.here.port + 2;
-    let listener = TcpListener::bind(("127.0.0.1", port)).unwrap();
-    let (next, wanted) = std::sync::mpsc::channel::<()>();
-    let sender = std::thread::spawn(move || {
-        let (mut connection, _) = listener.accept().unwrap();
-        assert_ne!(connection.read(&mut [0; 4096]).unwrap(), 0);
-        connection.write_all(b"HTTP/1.1 200 OK\r\nContent-Type: text/event-stream\r\n\r\n").unwrap();
-        for piece in ["one", "two", "three"] {
-            connection.write_all(format!("data: {piece}\n\n").as_bytes()).unwrap();
-            wanted.recv_timeout(SOON).unwrap();
-        }
-    });
-    let url = format!("https://{}/{port}/events", fleet.browser.host);
-    let mut page = fleet.browser.begin(&url, &[]).await;
-    for piece in ["one", "two", "three"] {
-        let mut came = Vec::new();
-        while !came.ends_with(b"\n\n") {
-            let more = actix_rt::time::timeout(SOON, page.next()).await.expect("it is held back");
-            came.extend_from_slice(&more.unwrap().unwrap());
-        }
-        assert_eq!(came, format!("data: {piece}\n\n").as_bytes());
-        next.send(()).unwrap();
-    }
-    sender.join().unwrap();
-}
-
-through_both!(what_is_sent_in_pieces_comes_in_pieces);
 
 async fn a_restart_costs_only_connections_of_its_own(rules: Rules) {
     let mut fleet = Fleet::start(rules).await;

@@ -1,12 +1,16 @@
-//! Paths as they are sent and as they arrive at what a simulation has listening: names of files with blanks and
-//! letters of any language do, and no way leads out of a port.
+//! What is sent and what arrives at what a simulation has listening, and back: names of files with blanks and letters of
+//! any language do, no way leads out of a port, and nothing is held back.
 
+use std::io::{Read, Write};
 use std::net::TcpListener;
 use std::sync::mpsc::{Receiver, channel};
+
+use futures_util::StreamExt;
 
 use super::fleet::Fleet;
 use super::rules::Rules;
 use super::web_server::Kind;
+use crate::support::SOON;
 use crate::support::listener::listen;
 
 /// Stands in for the files of a Webots: tells which path it was asked for.
@@ -38,8 +42,7 @@ const PATHS: [(&str, Option<&str>, Option<&str>); 13] = [
     ("//a.png", Some("/a.png"), Some("/a.png")),
 ];
 
-async fn paths_arrive(rules: Rules) {
-    let fleet = Fleet::start(rules).await;
+pub async fn paths_arrive(fleet: &Fleet, rules: Rules) {
     let port = fleet.here.port + 2;
     let asked = files_of_webots(port);
     for (path, apache, nginx) in PATHS {
@@ -54,4 +57,30 @@ async fn paths_arrive(rules: Rules) {
     }
 }
 
-through_both!(paths_arrive);
+/// What a live page is told, or the pictures of a Webots that streams a video.
+pub async fn what_is_sent_in_pieces_comes_in_pieces(fleet: &Fleet) {
+    let port = fleet.here.port + 3;
+    let listener = TcpListener::bind(("127.0.0.1", port)).unwrap();
+    let (next, wanted) = std::sync::mpsc::channel::<()>();
+    let sender = std::thread::spawn(move || {
+        let (mut connection, _) = listener.accept().unwrap();
+        assert_ne!(connection.read(&mut [0; 4096]).unwrap(), 0);
+        connection.write_all(b"HTTP/1.1 200 OK\r\nContent-Type: text/event-stream\r\n\r\n").unwrap();
+        for piece in ["one", "two", "three"] {
+            connection.write_all(format!("data: {piece}\n\n").as_bytes()).unwrap();
+            wanted.recv_timeout(SOON).unwrap();
+        }
+    });
+    let url = format!("https://{}/{port}/events", fleet.browser.host);
+    let mut page = fleet.browser.begin(&url, &[]).await;
+    for piece in ["one", "two", "three"] {
+        let mut came = Vec::new();
+        while !came.ends_with(b"\n\n") {
+            let more = actix_rt::time::timeout(SOON, page.next()).await.expect("it is held back");
+            came.extend_from_slice(&more.unwrap().unwrap());
+        }
+        assert_eq!(came, format!("data: {piece}\n\n").as_bytes());
+        next.send(()).unwrap();
+    }
+    sender.join().unwrap();
+}

@@ -2,6 +2,7 @@
 
 use std::net::TcpListener;
 
+use super::browser::Browser;
 use super::fleet::Fleet;
 use super::rules::{Place, Rules};
 use super::users::oauth2_proxy;
@@ -19,8 +20,21 @@ pub fn private_service() -> u16 {
     port
 }
 
-async fn only_the_fleet_is_reachable(rules: Rules) {
+/// All that one fleet can show of where requests lead.
+async fn requests_lead_to_the_fleet_and_nowhere_else(rules: Rules) {
     let fleet = Fleet::start(rules).await;
+    only_the_fleet_is_reachable(&fleet).await;
+    an_editor_is_at_the_port_of_its_webots_and_500_more(&fleet).await;
+    pages_are_sent_on_to_https_and_the_bare_name(&fleet.browser).await;
+    super::pages::pages_are_complete(&fleet, rules).await;
+    super::pages::what_webots_sends_has_an_origin_of_its_own(&fleet, rules).await;
+    super::encoded::paths_arrive(&fleet, rules).await;
+    super::encoded::what_is_sent_in_pieces_comes_in_pieces(&fleet).await;
+}
+
+through_both!(requests_lead_to_the_fleet_and_nowhere_else);
+
+async fn only_the_fleet_is_reachable(fleet: &Fleet) {
     let private = private_service();
     let here = fleet.here.port;
     let plain = ["22", "5432", "1", "80", "443"].map(|port| format!("/{port}/"));
@@ -56,10 +70,7 @@ async fn only_the_fleet_is_reachable(rules: Rules) {
     }
 }
 
-through_both!(only_the_fleet_is_reachable);
-
-async fn an_editor_is_at_the_port_of_its_webots_and_500_more(rules: Rules) {
-    let fleet = Fleet::start(rules).await;
+async fn an_editor_is_at_the_port_of_its_webots_and_500_more(fleet: &Fleet) {
     let editor = fleet.here.port + 1 + 500;
     listen(TcpListener::bind(("127.0.0.1", editor)).unwrap(), |request| {
         Some(if request.path() == "/a%20b?c" { (200, "editor") } else { (404, "") })
@@ -71,8 +82,6 @@ async fn an_editor_is_at_the_port_of_its_webots_and_500_more(rules: Rules) {
     // The simulation server itself has no editor.
     assert_eq!(fleet.browser.get(&format!("/{}/", editor - 1)).await.status, 404);
 }
-
-through_both!(an_editor_is_at_the_port_of_its_webots_and_500_more);
 
 /// A browser sends the administrator's password, and the cookie of who has signed in, to every path of their host; the web server
 /// tells simulation servers who that is.
@@ -105,9 +114,7 @@ async fn no_simulation_gets_a_secret_through_nginx() {
     no_simulation_gets_a_secret(Rules::NginxWithUsers(oauth2_proxy())).await;
 }
 
-async fn pages_are_sent_on_to_https_and_the_bare_name(rules: Rules) {
-    let fleet = Fleet::start(rules).await;
-    let browser = &fleet.browser;
+async fn pages_are_sent_on_to_https_and_the_bare_name(browser: &Browser) {
     let plain = format!("http://localhost:{}", browser.plain);
     let secure = format!("https://{}", browser.host);
     let www = ("Host", "www.localhost");
@@ -139,8 +146,6 @@ async fn pages_are_sent_on_to_https_and_the_bare_name(rules: Rules) {
     let question = format!("{plain}/.well-known/acme-challenge/token");
     assert_eq!(browser.ask(&question, &[]).await.status, 404, "certbot's questions are answered here");
 }
-
-through_both!(pages_are_sent_on_to_https_and_the_bare_name);
 
 #[actix_rt::test]
 async fn nginx_takes_names_of_any_length() {

@@ -30,6 +30,5 @@ mod exposure;
 mod one_door;
 mod pages;
 mod relayed;
-mod trust;
 mod users;
 mod whole_way;

@@ -37,7 +37,7 @@ async fn is_told_what_happens(browser: &Browser, path: &str) {
     }
 }
 
-async fn what_webots_sends_has_an_origin_of_its_own(fleet: &Fleet, rules: Rules) {
+pub async fn what_webots_sends_has_an_origin_of_its_own(fleet: &Fleet, rules: Rules) {
     let policy = async |path: String| {
         let url = format!("https://{}{path}", fleet.browser.host);
         let answer = fleet.browser.ask(&url, &[]).await;
@@ -55,18 +55,16 @@ async fn what_webots_sends_has_an_origin_of_its_own(fleet: &Fleet, rules: Rules)
     assert!(door.starts_with("default-src 'none'") && !door.contains("sandbox"), "{door}");
 }
 
-async fn pages_are_complete_and_live(rules: Rules) {
-    let fleet = Fleet::start(rules).await;
-    what_webots_sends_has_an_origin_of_its_own(&fleet, rules).await;
-    let browser = &fleet.browser;
-    let machine = |page: &str| format!("/{}{page}", fleet.here.port);
+/// Each page has all that it loads.
+pub async fn pages_are_complete(fleet: &Fleet, rules: Rules) {
     for page in ["/monitor", "/viewer"] {
-        has_all_that_it_loads(browser, &rules.session_path(fleet.session.port, page)).await;
+        has_all_that_it_loads(&fleet.browser, &rules.session_path(fleet.session.port, page)).await;
     }
-    has_all_that_it_loads(browser, &machine("/monitor")).await;
-    let door = rules.session_path(fleet.session.port, "/events");
-    let here = machine("/events");
-    futures_util::join!(is_told_what_happens(browser, &here), is_told_what_happens(browser, &door));
+    has_all_that_it_loads(&fleet.browser, &format!("/{}/monitor", fleet.here.port)).await;
 }
 
-through_both!(pages_are_complete_and_live);
+/// Live pages are told what happens for longer than the web server waits for a word.
+pub async fn pages_are_live(fleet: &Fleet, rules: Rules) {
+    let (door, here) = (rules.session_path(fleet.session.port, "/events"), format!("/{}/events", fleet.here.port));
+    futures_util::join!(is_told_what_happens(&fleet.browser, &here), is_told_what_happens(&fleet.browser, &door));
+}

@@ -62,6 +62,14 @@ impl Rules {
         let Place { http, https, session, here, there, chain, key } = place;
         let pattern = |ports: &[u16]| ports.iter().map(u16::to_string).collect::<Vec<_>>().join("|");
         let editors = |ports: &[u16]| pattern(&ports[1..].iter().map(|port| port + 500).collect::<Vec<_>>());
+        // Webots and editors of both machines, and the other machine.
+        let machines: [(&str, &str); 5] = [
+            ("200[1-9]|201[0-9]|2020", &pattern(&here[1..])),
+            ("300[1-9]|301[0-9]|3020", &pattern(&there[1..])),
+            ("250[1-9]|251[0-9]|2520", &editors(here)),
+            ("350[1-9]|351[0-9]|3520", &editors(there)),
+            ("192.0.2.3", "127.0.0.2"),
+        ];
         let any_address = |port: &str| format!("listen [::]:{port};\n");
         // What the examples of nginx for a host on the internet have in common.
         let site = |text: &str, own: &[(&str, &str)]| {
@@ -77,9 +85,8 @@ impl Rules {
             adapt(&adapt(text, own), &shared)
         };
         match self {
-            Self::Apache => adapt(
-                include_str!("../../deploy/apache.conf"),
-                &[
+            Self::Apache => {
+                let own: [(&str, &str); 11] = [
                     // First, as other numbers may hold this one.
                     ("1999", &session.to_string()),
                     ("  #Rewrite", "  Rewrite"),
@@ -92,13 +99,9 @@ impl Rules {
                     ("127.0.0.1:2000/", &format!("127.0.0.1:{}/", here[0])),
                     ("^/3000/", &format!("^/{}/", there[0])),
                     ("192.0.2.3:3000/", &format!("192.0.2.3:{}/", there[0])),
-                    ("200[1-9]|201[0-9]|2020", &pattern(&here[1..])),
-                    ("300[1-9]|301[0-9]|3020", &pattern(&there[1..])),
-                    ("250[1-9]|251[0-9]|2520", &editors(here)),
-                    ("350[1-9]|351[0-9]|3520", &editors(there)),
-                    ("192.0.2.3", "127.0.0.2"),
-                ],
-            ),
+                ];
+                adapt(&adapt(include_str!("../../deploy/apache.conf"), &own), &machines)
+            }
             Self::ApacheWithUsers => {
                 let last = "  RequestHeader unset X-Forwarded-User early\n";
                 let user = "  RequestHeader set X-Forwarded-User anna@lab.example\n";
@@ -111,9 +114,8 @@ impl Rules {
                 let last = "\n  proxy_set_header Forwarded \"\";\n";
                 adapt(&Self::Nginx.text(place), &[(last, &format!("{last}{users}"))])
             }
-            Self::Nginx => site(
-                include_str!("../../deploy/nginx.conf"),
-                &[
+            Self::Nginx => {
+                let own: [(&str, &str); 6] = [
                     // First, as other numbers may hold this one.
                     ("1999", &session.to_string()),
                     ("  #location", "  location"),
@@ -121,20 +123,16 @@ impl Rules {
                     ("  #}", "  }"),
                     ("  2000   127.0.0.1:2000;", &format!("  {0} 127.0.0.1:{0};", here[0])),
                     ("  #3000  192.0.2.3:3000;", &format!("  {0} 192.0.2.3:{0};", there[0])),
-                    ("200[1-9]|201[0-9]|2020", &pattern(&here[1..])),
-                    ("300[1-9]|301[0-9]|3020", &pattern(&there[1..])),
-                    ("250[1-9]|251[0-9]|2520", &editors(here)),
-                    ("350[1-9]|351[0-9]|3520", &editors(there)),
-                    ("192.0.2.3", "127.0.0.2"),
-                ],
-            ),
+                ];
+                site(include_str!("../../deploy/nginx.conf"), &[&own[..], &machines].concat())
+            }
             Self::Door => site(
                 include_str!("../../deploy/nginx-door.conf"),
                 &[
                     ("192\\.0\\.2\\.[0-9]+", "127\\.0\\.0\\.[23]"),
                     ("192.0.2.1:1999", &format!("127.0.0.1:{session}")),
                     ("(?<fleet_port>2000)", &format!("(?<fleet_port>{})", here[0])),
-                    ("200[1-9]|201[0-9]|2020", &pattern(&here[1..])),
+                    machines[0],
                 ],
             ),
             Self::KubernetesDoor => adapt(
@@ -151,14 +149,15 @@ impl Rules {
                     ("^10\\.[0-9]+\\.[0-9]+\\.[0-9]+$", "^127\\.0\\.0\\.[23]$"),
                     ("session:1999", &format!("127.0.0.1:{session}")),
                     ("(?<fleet_port>2000)", &format!("(?<fleet_port>{})", here[0])),
-                    ("200[1-9]|201[0-9]|2020", &pattern(&here[1..])),
+                    machines[0],
                 ],
             ),
             Self::Documents => {
                 let rules = DOCUMENTS_HTTPS.replace("1999", &session.to_string());
                 let there = pattern(there);
                 format!(
-                    "<VirtualHost 127.0.0.1:{http}>\nServerName localhost\nServerAlias www.localhost\n{DOCUMENTS_HTTP}</VirtualHost>\n\
+                    "<VirtualHost 127.0.0.1:{http}>\nServerName localhost\nServerAlias www.localhost\n\
+                     Redirect \"/\" \"https://localhost/\"\n</VirtualHost>\n\
                      <VirtualHost 127.0.0.1:{https}>\nServerName localhost\nServerAlias www.localhost\n\
                      SSLEngine on\nSSLCertificateFile {chain}\nSSLCertificateKeyFile {key}\n\
                      RewriteEngine on\n\
@@ -180,10 +179,6 @@ pub fn adapt(text: &str, changes: &[(&str, &str)]) -> String {
         text.replace(from, to)
     })
 }
-
-const DOCUMENTS_HTTP: &str = r#"
-  Redirect "/" "https://localhost/"
-"#;
 
 const DOCUMENTS_HTTPS: &str = r#"
   RewriteCond %{HTTP:Upgrade} websocket [NC]

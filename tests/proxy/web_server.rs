@@ -1,13 +1,14 @@
 //! Apache and nginx as child processes, with configurations of their own.
 
+use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use nix::sys::signal::{Signal, kill};
+use nix::sys::signal::{Signal, kill, killpg};
 use nix::unistd::{Pid, Uid};
 
-use crate::support::{SOON, holds_soon, until};
+use crate::support::{holds_soon, until};
 
 /// The program.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -77,7 +78,8 @@ impl WebServer {
             Kind::Apache => command.arg("-f").arg(&conf).arg("-DFOREGROUND"),
             Kind::Nginx => command.arg("-c").arg(&conf).arg("-e").arg(self.error_log()),
         };
-        let child = command.stdin(Stdio::null()).stdout(output.try_clone().unwrap()).stderr(output).spawn();
+        let child =
+            command.process_group(0).stdin(Stdio::null()).stdout(output.try_clone().unwrap()).stderr(output).spawn();
         let child = child.expect("this test needs setpriv: apt install util-linux");
         self.child = Some(child);
         let listens = holds_soon(async || {
@@ -102,20 +104,6 @@ impl WebServer {
         self.child = None;
     }
 
-    /// Ends the program; nothing else goes on in the test until it has ended.
-    fn end(&mut self) {
-        let Some(mut child) = self.child.take() else { return };
-        kill(Pid::from_raw(i32::try_from(child.id()).unwrap()), Signal::SIGTERM).ok();
-        let deadline = Instant::now() + SOON;
-        while child.try_wait().is_ok_and(|ended| ended.is_none()) {
-            if Instant::now() > deadline {
-                eprintln!("{} does not end", self.program());
-                child.kill().ok();
-            }
-            std::thread::sleep(Duration::from_millis(5));
-        }
-    }
-
     pub fn pid(&self) -> Pid {
         Pid::from_raw(i32::try_from(self.child.as_ref().unwrap().id()).unwrap())
     }
@@ -137,7 +125,11 @@ impl WebServer {
 
 impl Drop for WebServer {
     fn drop(&mut self) {
-        self.end();
+        if let Some(child) = &mut self.child {
+            // With all its processes: in order, Apache takes ten seconds while there are connections.
+            killpg(Pid::from_raw(i32::try_from(child.id()).unwrap()), Signal::SIGKILL).ok();
+            child.wait().ok();
+        }
         if std::thread::panicking() {
             eprintln!("--- {} ---\n{}---", self.program(), self.log());
         }

@@ -2,7 +2,6 @@
 
 use std::time::{Duration, Instant, SystemTime};
 
-use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 
 use crate::support::client::Client;
@@ -14,10 +13,6 @@ const ASKS: &str = "/session?announcements=1";
 
 async fn announce(session: &Server, order: &Value) -> u16 {
     post(&session.url("/announcement"), Some(PASSWORD), &order.to_string()).await
-}
-
-async fn page(session: &Server) -> String {
-    session.monitor().await
 }
 
 /// A time so many milliseconds from now.
@@ -38,17 +33,14 @@ async fn an_announcement_reaches_who_asks_for_it_in_time_and_ends_in_time() {
     let told = viewer.until("announcement:").await;
     assert_eq!(told, "announcement: \u{2039}b\u{203a}Maintenance\u{2039}/b\u{203a} \u{ff06} more at noon");
     let shown = "Maintenance&#60;/b&#62; &#38; more at noon";
-    assert!(
-        page(&session).await.contains(shown) && !page(&session).await.contains("<b>Maint"),
-        "{}",
-        page(&session).await
-    );
+    let page = session.monitor().await;
+    assert!(page.contains(shown) && !page.contains("<b>Maint"), "{page}");
     assert!(asked.elapsed() < Duration::from_secs(2), "{:?}", asked.elapsed());
     // Who comes later hears it too.
     Client::connect(&session.websocket(ASKS)).await.until("announcement: ").await;
     assert_eq!(viewer.until("announcement:").await, "announcement:");
     assert!(asked.elapsed() > Duration::from_millis(2900), "{:?}", asked.elapsed());
-    assert!(!page(&session).await.contains("Maintenance"));
+    assert!(!session.monitor().await.contains("Maintenance"));
     // Another one, without an end, and its end.
     assert_eq!(announce(&session, &json!({"text": "R&D"})).await, 200);
     assert_eq!(viewer.until("announcement:").await, "announcement: R\u{ff06}D");
@@ -74,21 +66,17 @@ async fn an_announcement_in_the_configuration_is_read_again() {
     let session = session.start().await;
     let mut viewer = Client::connect(&session.websocket(ASKS)).await;
     assert_eq!(viewer.until("announcement:").await, "announcement: One");
-    session.rewrite_config(|config| config["announcement"] = json!({"text": "Two", "until": later(60_000)}));
-    session.signal(Signal::SIGHUP);
+    session.reload(json!({"announcement": {"text": "Two", "until": later(60_000)}}));
     assert_eq!(viewer.until("announcement:").await, "announcement: Two");
     // A file that says the same changes nothing of what was posted since.
     assert_eq!(announce(&session, &json!({"text": "Three"})).await, 200);
     assert_eq!(viewer.until("announcement:").await, "announcement: Three");
-    session.rewrite_config(|config| config["loadRefresh"] = json!(0.2));
-    session.signal(Signal::SIGHUP);
+    session.reload(json!({"loadRefresh": 0.2}));
     until("it was read", async || session.log().matches("read ").count() > 1).await;
-    session.rewrite_config(|config| drop(config.as_object_mut().unwrap().remove("announcement")));
-    session.signal(Signal::SIGHUP);
+    session.reload(json!({"announcement": null}));
     assert_eq!(viewer.until("announcement:").await, "announcement:");
     // A wrong one changes nothing.
-    session.rewrite_config(|config| config["announcement"] = json!({"text": "Four", "until": "noon"}));
-    session.signal(Signal::SIGHUP);
+    session.reload(json!({"announcement": {"text": "Four", "until": "noon"}}));
     until("it is told", async || session.log().contains("until is \"noon\"")).await;
 }
 
@@ -110,7 +98,7 @@ async fn only_the_password_announces_something() {
     ] {
         assert_eq!(announce(&session, &wrong).await, 400, "{wrong}");
     }
-    assert!(!page(&session).await.contains("class=\"announcement\""));
+    assert!(!session.monitor().await.contains("class=\"announcement\""));
     let session = session_server(&[]).start().await;
     assert_eq!(post(&session.url("/announcement"), Some(PASSWORD), order).await, 403);
 }

@@ -168,25 +168,17 @@ async fn names_come_and_go_with_the_configuration() {
     let _servers = stand_ins(&loopback([2, 3]), port);
     names.set("fleet.test", &loopback([2, 3]));
     let session = looking_up(&[], &names).start().await;
-    let reload = |entries: Value, drained: Value| {
-        session.rewrite_config(|config| {
-            config["simulationServers"] = entries;
-            config["drainedServers"] = drained;
-        });
-        session.signal(Signal::SIGHUP);
-    };
     let any_host = async || {
         let viewer = http::get(&session.url("/viewer")).await;
         viewer.header("content-security-policy").unwrap().contains(" http: ws:")
     };
     assert!(!any_host().await);
-    let name = json!([format!("dns+fleet.test:{port}")]);
-    reload(name.clone(), json!([]));
+    session.reload(json!({"simulationServers": [format!("dns+fleet.test:{port}")]}));
     until_states(&session, &["up"; 2]).await;
     assert!(any_host().await, "a page that is open can't reach servers that come");
-    reload(name, json!([format!("127.0.0.3:{port}")]));
+    session.reload(json!({"drainedServers": [format!("127.0.0.3:{port}")]}));
     until_states(&session, &["up", "draining"]).await;
-    reload(json!([]), json!([]));
+    session.reload(json!({"simulationServers": [], "drainedServers": []}));
     until_states(&session, &[]).await;
     assert_eq!(session.status().await["names"], json!([]));
 }

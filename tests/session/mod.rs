@@ -12,6 +12,7 @@ mod placement;
 mod pushing;
 mod seeing;
 mod stopping;
+mod trust;
 mod watching;
 mod webhook;
 

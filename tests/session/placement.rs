@@ -60,23 +60,16 @@ async fn availability_ends_when_placements_use_up_the_room_and_comes_back_when_t
 }
 
 #[actix_rt::test]
-async fn a_server_without_a_free_place_gets_nobody() {
-    let servers = [StandIn::start(Manner::status(10.0, 4, 4)), StandIn::start(Manner::status(80.0, 2, 4))];
-    let session = between_reports(&servers, 1.0).start().await;
-    until_states(&session, &["full", "up"]).await;
+async fn a_server_without_a_free_place_or_room_for_one_more_client_gets_nobody() {
+    let servers = [Manner::status(10.0, 4, 4), Manner::status(91.0, 9, 100), Manner::status(60.0, 2, 4)];
+    let servers = servers.map(StandIn::start);
+    let session = between_reports(&servers, 10.0).start().await;
+    until_states(&session, &["full", "full", "up"]).await;
+    assert_eq!(times_logged(&session, "full: load 91.0 % of 90.0 %"), 1);
     for _ in 0..2 {
-        assert_eq!(http::get(&session.url("/session")).await.text(), servers[1].url());
+        assert_eq!(http::get(&session.url("/session")).await.text(), servers[2].url());
     }
     assert_eq!(http::get(&session.url("/request")).await.text(), "0");
-    assert_eq!(http::get(&session.url("/session")).await.text(), NOBODY);
-}
-
-#[actix_rt::test]
-async fn a_server_in_which_one_more_client_does_not_fit_is_called_full() {
-    let server = StandIn::start(Manner::status(91.0, 9, 100));
-    let session = between_reports(std::slice::from_ref(&server), 10.0).start().await;
-    until_states(&session, &["full"]).await;
-    assert_eq!(times_logged(&session, "full: load 91.0 % of 90.0 %"), 1);
     assert_eq!(http::get(&session.url("/session")).await.text(), NOBODY);
 }
 

@@ -16,15 +16,14 @@ async fn clients_of(session: &Server) -> u64 {
     session.status().await["clients"].as_u64().unwrap()
 }
 
+/// A request for a WebSocket.
+const UPGRADE: &[u8] = b"GET /session HTTP/1.1\r\nHost: x\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
+                         Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n";
+
 /// A WebSocket that is opened and then left alone.
 async fn deaf(session: &Server) -> TcpStream {
     let mut stream = TcpStream::connect(session.address()).await.unwrap();
-    let request = format!(
-        "GET /session HTTP/1.1\r\nHost: {}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
-         Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n",
-        session.address()
-    );
-    stream.write_all(request.as_bytes()).await.unwrap();
+    stream.write_all(UPGRADE).await.unwrap();
     stream
 }
 
@@ -68,20 +67,23 @@ async fn no_value_comes_twice_however_a_server_flaps() {
 }
 
 #[actix_rt::test]
-async fn a_client_that_does_not_read_is_sent_away_and_one_that_reads_stays() {
-    let session = session_server(&[]).set("timing", serde_json::json!({"ping": 0.2, "silence": 5})).start().await;
+async fn a_silent_client_is_gone_when_its_time_is_up_and_one_that_reads_stays() {
+    // The pings come at 4 and at 8 seconds.
+    let session = session_server(&[]).set("timing", serde_json::json!({"ping": 4, "silence": 5})).start().await;
     let mut reader = Client::connect(&session.websocket("/session")).await;
-    let mut deaf = deaf(&session).await;
-    until("both are there", async || clients_of(&session).await == 2).await;
-    let closed = until("the deaf one is gone", async || clients_of(&session).await == 1);
-    // Reading is what answers pings.
     reader.until("0").await;
-    let reads = reader.is_silent(Duration::from_secs(8));
-    let ((), silent) = futures_util::future::join(closed, reads).await;
-    assert!(silent, "{:?}", reader.heard);
-    let mut rest = Vec::new();
-    let end = actix_rt::time::timeout(Duration::from_secs(5), deaf.read_to_end(&mut rest)).await;
-    assert!(end.is_ok(), "its connection is still open");
+    let begin = std::time::Instant::now();
+    // It takes everything in, and answers no ping.
+    let (mut silent, mut rest) = (deaf(&session).await, Vec::new());
+    let closed = async {
+        let end = actix_rt::time::timeout(Duration::from_secs(15), silent.read_to_end(&mut rest)).await;
+        assert!(end.is_ok(), "its connection is still open");
+        begin.elapsed().as_secs_f64()
+    };
+    // Reading is what answers pings.
+    let (took, is_silent) = futures_util::future::join(closed, reader.is_silent(Duration::from_secs(8))).await;
+    assert!((5.0..7.9).contains(&took), "closed after {took} s; the silence is 5 s");
+    assert!(is_silent, "{:?}", reader.heard);
     assert_eq!(clients_of(&session).await, 1);
 }
 
@@ -135,10 +137,6 @@ async fn running_out_of_files_is_said_at_the_start_and_costs_only_those_who_are_
     clients.clear();
     until("there is room again", async || connect().await.is_ok()).await;
     assert!(!session.log().contains("open files"), "{}", session.log());
-}
-
-#[actix_rt::test]
-async fn a_limit_of_files_that_allows_no_client_is_refused_in_one_line() {
     let said = session_server(&[]).files(128).refused(1).await;
     assert!(said.starts_with("error: 128 files may be open, which is not enough for one client"), "{said}");
 }
@@ -152,9 +150,7 @@ async fn a_message_without_end_is_cut_off_before_it_fills_the_memory() {
     let address = session.address();
     let sent = actix_rt::task::spawn_blocking(move || {
         let mut socket = std::net::TcpStream::connect(address).unwrap();
-        let head = "GET /session HTTP/1.1\r\nHost: x\r\nConnection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n\
-                    Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n";
-        socket.write_all(head.as_bytes()).unwrap();
+        socket.write_all(UPGRADE).unwrap();
         assert!(socket.read(&mut [0; 1024]).unwrap() > 0);
         // A text frame that says it will have 300 MB.
         let mut frame = vec![0x81, 0xff];
@@ -185,21 +181,6 @@ async fn a_client_that_reads_no_page_is_sent_away_and_holds_up_no_stop() {
     };
     actix_rt::time::timeout(Duration::from_secs(40), flood).await.expect("it may ask for ever");
     assert_eq!(http::get(&session.url("/health")).await.status, 200);
-}
-
-#[actix_rt::test]
-async fn a_silent_client_is_gone_when_its_time_is_up() {
-    // The pings come at 4 and at 8 seconds.
-    let timing = serde_json::json!({"ping": 4, "silence": 5});
-    let session = session_server(&[]).set("timing", timing).start().await;
-    let begin = std::time::Instant::now();
-    let mut silent = deaf(&session).await;
-    let mut rest = Vec::new();
-    // It takes everything in, and answers no ping.
-    let end = actix_rt::time::timeout(Duration::from_secs(15), silent.read_to_end(&mut rest)).await;
-    assert!(end.is_ok(), "its connection is still open");
-    let took = begin.elapsed().as_secs_f64();
-    assert!((5.0..7.9).contains(&took), "closed after {took} s; the silence is 5 s");
 }
 
 /// A connection over which a request was answered, and that stays open.

@@ -26,19 +26,27 @@ async fn a_refusal_carries_a_time_to_come_back_that_is_drawn_at_random() {
 }
 
 #[actix_rt::test]
-async fn pages_of_other_origins_may_ask() {
+async fn pages_of_other_origins_may_ask_and_nothing_is_posted_there() {
+    use awc::http::{Method, StatusCode};
     let session = session_server(&[]).start().await;
+    let ask = async |method: Method, path: &str| {
+        let answer = awc::Client::default().request(method, session.url(path)).send().await.unwrap();
+        let header = |name| answer.headers().get(name).and_then(|value| value.to_str().ok()).unwrap_or_default();
+        assert_eq!(header("access-control-allow-origin"), "*", "{path}");
+        assert_eq!(header("access-control-allow-headers"), "x-requested-with", "{path}");
+        assert_eq!(header("access-control-allow-methods"), "POST, GET, OPTIONS", "{path}");
+        (answer.status(), header("allow").to_owned())
+    };
     for path in ["/", "/request", "/session", "/load", "/status", "/nothing"] {
-        for method in [awc::http::Method::GET, awc::http::Method::OPTIONS] {
-            let answer = awc::Client::default().request(method.clone(), session.url(path)).send().await.unwrap();
-            let header = |name| answer.headers().get(name).and_then(|value| value.to_str().ok());
-            assert_eq!(header("access-control-allow-origin"), Some("*"), "{method} {path}");
-            assert_eq!(header("access-control-allow-headers"), Some("x-requested-with"), "{method} {path}");
-            assert_eq!(header("access-control-allow-methods"), Some("POST, GET, OPTIONS"), "{method} {path}");
-            if method == awc::http::Method::OPTIONS {
-                assert!(answer.status().is_success(), "{method} {path}");
-            }
-        }
+        ask(Method::GET, path).await;
+        assert!(ask(Method::OPTIONS, path).await.0.is_success(), "{path}");
+    }
+    for path in ["/health", "/status", "/monitor"] {
+        assert_eq!(ask(Method::HEAD, path).await.0, 200, "{path}");
+    }
+    for path in ["/session", "/status", "/monitor", "/request"] {
+        let (status, allow) = ask(Method::POST, path).await;
+        assert!(status == StatusCode::METHOD_NOT_ALLOWED && allow.starts_with("GET"), "{path}: {status} {allow}");
     }
     let nothing = http::get(&session.url("/nothing")).await;
     assert_eq!(nothing.status, 404);
@@ -46,13 +54,19 @@ async fn pages_of_other_origins_may_ask() {
 }
 
 #[actix_rt::test]
-async fn the_status_tells_all_of_each_server() {
+async fn the_status_tells_all_of_each_server_and_the_metrics_what_an_alarm_needs() {
     let lab = json!({"load": 20, "version": "9", "docker": false, "allowedRepositories": ["https://github.com/lab"],
         "instances": {"queued": 0, "starting": 1, "idle": 2, "running": 3, "places": 9, "arrivals": 6}});
     let servers = [StandIn::start(Manner::Status(lab)), StandIn::start(Manner::Body(500, Vec::new()))];
     let session = session_server(&addresses(&servers)).set("loadRefresh", 600).set("clientCost", 3).start().await;
     until_states(&session, &["up", "down"]).await;
+    let fresh = session.metrics().await;
+    for outcome in ["placed", "unavailable", "not_accepted", "wrong_url"] {
+        assert!(fresh.contains(&format!("webots_session_requests_total{{outcome=\"{outcome}\"}} 0")), "{fresh}");
+    }
     assert_eq!(http::get(&session.url("/session")).await.text(), servers[0].url());
+    http::get(&session.url("/session?url=nonsense")).await;
+
     let status = session.status().await;
     assert_eq!((&status["version"], &status["available"]), (&json!(env!("CARGO_PKG_VERSION")), &json!(true)));
     assert_eq!((&status["clients"], &status["load"]), (&json!(0), &json!(20.0)));
@@ -71,38 +85,27 @@ async fn the_status_tells_all_of_each_server() {
     for server in &servers {
         assert!(page.text().contains(&server.address()));
     }
-}
 
-#[actix_rt::test]
-async fn the_metrics_tell_what_an_alarm_needs() {
-    let servers = [StandIn::start(Manner::idle(20.0, 9)), StandIn::start(Manner::Reset)];
-    let session = session_server(&addresses(&servers)).set("loadRefresh", 600).set("clientCost", 3).start().await;
-    until_states(&session, &["up", "down"]).await;
-    let fresh = session.metrics().await;
-    for outcome in ["placed", "unavailable", "not_accepted", "wrong_url"] {
-        assert!(fresh.contains(&format!("webots_session_requests_total{{outcome=\"{outcome}\"}} 0")), "{fresh}");
-    }
-    http::get(&session.url("/session")).await;
-    http::get(&session.url("/session?url=nonsense")).await;
     let answer = http::get(&session.url("/metrics")).await;
     assert!(answer.header("content-type").unwrap().starts_with("text/plain"));
     let text = answer.text();
     let (up, down) = (servers[0].address(), servers[1].address());
     for line in [
-        "webots_session_available 1".to_owned(),
-        "webots_session_clients 0".to_owned(),
-        "webots_session_load_percent 20".to_owned(),
-        "webots_session_requests_total{outcome=\"placed\"} 1".to_owned(),
-        "webots_session_requests_total{outcome=\"wrong_url\"} 1".to_owned(),
-        "webots_session_servers{state=\"up\"} 1".to_owned(),
-        "webots_session_servers{state=\"down\"} 1".to_owned(),
-        format!("webots_session_server_up{{server=\"{up}\"}} 1"),
-        format!("webots_session_server_up{{server=\"{down}\"}} 0"),
-        format!("webots_session_server_load_percent{{server=\"{up}\"}} 20"),
-        format!("webots_session_server_effective_load_percent{{server=\"{up}\"}} 23"),
-        format!("webots_session_server_in_flight{{server=\"{up}\"}} 1"),
-        "webots_session_report_seconds_count 2".to_owned(),
+        "available 1".to_owned(),
+        "clients 0".to_owned(),
+        "load_percent 20".to_owned(),
+        "requests_total{outcome=\"placed\"} 1".to_owned(),
+        "requests_total{outcome=\"wrong_url\"} 1".to_owned(),
+        "servers{state=\"up\"} 1".to_owned(),
+        "servers{state=\"down\"} 1".to_owned(),
+        format!("server_up{{server=\"{up}\"}} 1"),
+        format!("server_up{{server=\"{down}\"}} 0"),
+        format!("server_load_percent{{server=\"{up}\"}} 20"),
+        format!("server_effective_load_percent{{server=\"{up}\"}} 23"),
+        format!("server_in_flight{{server=\"{up}\"}} 1"),
+        "report_seconds_count 2".to_owned(),
     ] {
+        let line = format!("webots_session_{line}");
         assert!(text.lines().any(|found| found == line), "no {line:?} in {text}");
     }
     assert!(text.contains(&format!("webots_session_server_latency_seconds{{server=\"{up}\"}}")), "{text}");
@@ -178,21 +181,6 @@ async fn a_fault_of_the_configuration_is_one_line_and_exit_code_2() {
         let said = session_server(&[]).set(key, value.clone()).refused(2).await;
         assert!(said.contains("config.json: "), "{said}");
         assert!(words.iter().all(|word| said.contains(word)), "{key}: {value} gives {said}");
-    }
-}
-
-#[actix_rt::test]
-async fn pages_may_be_asked_for_and_for_their_head_alone_and_nothing_is_posted_there() {
-    let session = session_server(&[]).start().await;
-    for path in ["/health", "/status", "/monitor"] {
-        let answer = awc::Client::new().head(session.url(path)).send().await.unwrap();
-        assert_eq!(answer.status(), 200, "{path}");
-    }
-    for path in ["/session", "/status", "/monitor", "/request"] {
-        let answer = awc::Client::default().post(session.url(path)).send().await.unwrap();
-        let allow = answer.headers().get("allow").and_then(|value| value.to_str().ok()).map(str::to_owned);
-        assert_eq!(answer.status(), 405, "{path}");
-        assert!(allow.is_some_and(|allow| allow.starts_with("GET")), "{path}");
     }
 }
 

@@ -21,6 +21,22 @@ pub struct Certificate {
 }
 
 impl Certificate {
+    /// One for `localhost` that has signed itself, and may sign others or not.
+    pub fn self_signed(folder: &Path, name: &str, signs_others: bool) -> Self {
+        let mut params = CertificateParams::new(["localhost".to_owned()]).unwrap();
+        params.is_ca = if signs_others { IsCa::Ca(BasicConstraints::Unconstrained) } else { IsCa::ExplicitNoCa };
+        let key = KeyPair::generate().unwrap();
+        Self::write(folder, name, &params.self_signed(&key).unwrap(), &key)
+    }
+
+    fn write(folder: &Path, name: &str, certificate: &rcgen::Certificate, key: &KeyPair) -> Self {
+        let file = |part: &str| folder.join(format!("{name}-{part}.pem"));
+        let files = Self { chain: file("chain"), key: file("key") };
+        std::fs::write(&files.chain, certificate.pem()).unwrap();
+        std::fs::write(&files.key, key.serialize_pem()).unwrap();
+        files
+    }
+
     /// How a server encrypts that has it.
     pub fn server(&self) -> Arc<ServerConfig> {
         let chain = vec![CertificateDer::from_pem_file(&self.chain).unwrap()];
@@ -60,11 +76,7 @@ impl Authority {
         let key = KeyPair::generate().unwrap();
         let certificate = params.signed_by(&key, &self.issuer).unwrap();
         let serial = std::fs::read_dir(self.folder.path()).unwrap().count();
-        let file = |name: &str| self.folder.path().join(format!("{serial}-{name}.pem"));
-        let files = Certificate { chain: file("chain"), key: file("key") };
-        std::fs::write(&files.chain, certificate.pem()).unwrap();
-        std::fs::write(&files.key, key.serialize_pem()).unwrap();
-        files
+        Certificate::write(self.folder.path(), &serial.to_string(), &certificate, &key)
     }
 }
 

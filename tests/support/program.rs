@@ -312,7 +312,13 @@ impl Server {
         self.folder.join(format!("log/simulation/instances/{}.log", client.id()))
     }
 
-    /// Writes another configuration into the server's file, for SIGHUP.
+    /// Has a session server take other values of these keys; null takes a key away.
+    pub fn reload(&self, keys: Value) {
+        self.rewrite_config(|config| config.as_object_mut().unwrap().extend(keys.as_object().unwrap().clone()));
+        self.signal(Signal::SIGHUP);
+    }
+
+    /// Writes another configuration into the server's file.
     pub fn rewrite_config(&self, change: impl FnOnce(&mut Value)) {
         let file = self.folder.join("config.json");
         let mut config: Value = serde_json::from_str(&std::fs::read_to_string(&file).unwrap()).unwrap();
