@@ -82,19 +82,6 @@ pub fn require_administrator(auth: Option<&BasicAuth>, request: &HttpRequest, pe
     auth.check(request, peer).err().map(AuthError::answer)
 }
 
-/// Whether a page shows what only administrators may see: the request brings the password. With another one, which may be
-/// meant for a web server in front, the page is as everybody sees it.
-///
-/// # Errors
-/// When `peer` has sent too many passwords: the page must not pass for that of a stranger.
-pub fn is_administrator(auth: Option<&BasicAuth>, request: &HttpRequest, peer: Peer) -> Result<bool, AuthError> {
-    match auth.map(|auth| auth.check(request, peer)) {
-        Some(Ok(())) => Ok(true),
-        Some(Err(AuthError::TooMany)) => Err(AuthError::TooMany),
-        Some(Err(AuthError::NoPassword)) | None => Ok(false),
-    }
-}
-
 /// The password that a request brings, with whatever user name.
 fn password_of(request: &HttpRequest) -> Option<String> {
     let (scheme, credentials) = request.headers().get(header::AUTHORIZATION)?.to_str().ok()?.split_once(' ')?;

@@ -19,7 +19,7 @@ pub mod upgrade;
 pub mod websocket;
 
 pub use address_quota::{AddressQuota, share};
-pub use auth::{AuthError, BasicAuth, is_administrator, refuse_action, require_administrator};
+pub use auth::{AuthError, BasicAuth, refuse_action, require_administrator};
 pub use connections::{ConnectionKind, ConnectionLimiter, ConnectionPermit, STREAMS_PER_CLIENT, TCP_PER_CLIENT};
 pub use live_updates::{LiveUpdates, PageView, TableRow};
 pub use metrics::{CONTENT_TYPE, Gauge, Metrics};

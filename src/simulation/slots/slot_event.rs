@@ -10,8 +10,6 @@ pub enum SlotEvent {
     Queued(usize),
     /// This port may be used until the lease is dropped.
     Granted(u16),
-    /// The slots and the queue are full, or the address or the user has reached its limit: why, in words for the client.
-    Rejected(String),
     /// Too many simulations wait for disconnected clients, and this one has waited longest: it must end.
     AwayTooLong,
     /// The administrator stops the simulation; the words are for its client.

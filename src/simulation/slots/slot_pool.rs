@@ -1,29 +1,29 @@
-//! Actor: leases slots to simulations, keeps the queue, and knows all simulations of this server.
+//! Leases slots to simulations, keeps the queue, and knows all simulations of this server.
 //!
-//! One for the whole server, created at start; it never ends. A slot is a streaming port. A session creates a
-//! [`SlotLease`](super::SlotLease), and receives its position in the queue until a port is granted. Dropping the lease
-//! leaves the queue or frees the port, so that neither leaks in any state or after any panic.
+//! One for the whole server. A slot is a streaming port. A session creates a [`SlotLease`](super::SlotLease), and
+//! receives its position in the queue until a port is granted. Dropping the lease leaves the queue or frees the port, so
+//! that neither leaks in any state or after any panic.
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::io::ErrorKind;
 use std::net::{Ipv4Addr, Ipv6Addr, TcpListener};
 use std::ops::RangeInclusive;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use actix::prelude::*;
-
-use super::messages::{Acquire, GetSnapshot, Release, StopOne, Update};
 use super::party::{Party, Share};
 use super::present::Present;
 use super::slot_event::SlotEvent;
 use crate::shared::domain::Instances;
 use crate::simulation::ends::Ends;
 use crate::simulation::simulation_id::SimulationId;
-use crate::simulation::snapshot::{Snapshot, Stage};
+use crate::simulation::snapshot::{Simulation, Snapshot, Stage};
 
-/// The actor.
-pub struct SlotPool {
+/// The slots of this server, and the simulations that have one or wait for one.
+pub struct SlotPool(Mutex<Slots>);
+
+struct Slots {
     ports: RangeInclusive<u16>,
     queue_capacity: usize,
     per_address: Option<usize>,
@@ -47,10 +47,90 @@ impl SlotPool {
         per_address: Option<usize>,
         per_user: Option<usize>,
         ends: Ends,
-    ) -> Self {
-        Self { ports, queue_capacity, per_address, per_user, arrivals: 0, present: BTreeMap::new(), ends }
+    ) -> Arc<Self> {
+        let present = BTreeMap::new();
+        Arc::new(Self(Mutex::new(Slots { ports, queue_capacity, per_address, per_user, arrivals: 0, present, ends })))
     }
 
+    fn slots(&self) -> MutexGuard<'_, Slots> {
+        // After a panic the server ends: `recheck` notices it.
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Checks again each second which ports other programs have left. Ends once a panic has left the slots in disorder.
+    pub async fn recheck(self: Arc<Self>) {
+        while !self.0.is_poisoned() {
+            actix_rt::time::sleep(RECHECK).await;
+            self.slots().serve();
+        }
+    }
+
+    /// Has a simulation wait for a slot, and grants it one if it is its turn.
+    ///
+    /// # Errors
+    /// Why it may not wait, as text for the client: the slots and the queue are full, or its address or its user has
+    /// reached its limit.
+    pub(super) fn acquire(&self, present: Present) -> Result<(), String> {
+        let mut slots = self.slots();
+        slots.arrivals += 1;
+        let (id, refusal) = (present.shown.id, slots.refusal(&present.parties()));
+        slots.present.insert(id, present);
+        slots.grant();
+        if let Some(refusal) = refusal
+            && slots.queue().any(|one| one.shown.id == id)
+        {
+            slots.present.remove(&id);
+            return Err(refusal);
+        }
+        slots.serve();
+        Ok(())
+    }
+
+    /// Frees the slot of a simulation, or its position in the queue.
+    pub(super) fn release(&self, id: SimulationId) {
+        let mut slots = self.slots();
+        if let Some(present) = slots.present.remove(&id) {
+            slots.ends.record(present.ended());
+        }
+        slots.serve();
+    }
+
+    /// Changes the record of a simulation, if it has not ended.
+    pub(super) fn change(&self, id: SimulationId, change: impl FnOnce(&mut Present)) {
+        let mut slots = self.slots();
+        if let Some(present) = slots.present.get_mut(&id) {
+            change(present);
+            slots.end_longest_away();
+        }
+    }
+
+    /// Changes what pages show of a simulation, if it has not ended.
+    pub fn update(&self, id: SimulationId, change: impl FnOnce(&mut Simulation)) {
+        self.change(id, |present| change(&mut present.shown));
+    }
+
+    /// Stops the simulation that has this id now, and no other one: `why` is for its client. Returns whether there is
+    /// one.
+    pub fn stop(&self, id: &str, why: String) -> bool {
+        let slots = self.slots();
+        let found = slots.present.values().find(|one| one.shown.id.to_string() == id);
+        found.inspect(|one| one.listener.do_send(SlotEvent::Stopped(why))).is_some()
+    }
+
+    /// The numbers of simulations by state.
+    pub fn instances(&self) -> Instances {
+        self.slots().instances()
+    }
+
+    /// All simulations at this moment.
+    pub fn snapshot(&self) -> Snapshot {
+        let slots = self.slots();
+        let simulations = slots.present.values().map(|one| one.shown.clone()).collect();
+        Snapshot { instances: slots.instances(), simulations }
+    }
+}
+
+impl Slots {
     fn queue(&self) -> impl Iterator<Item = &Present> {
         self.present.values().filter(|one| one.shown.port.is_none())
     }
@@ -163,70 +243,4 @@ fn is_free(port: u16) -> bool {
     let is_taken = |error: std::io::Error| error.kind() == ErrorKind::AddrInUse;
     TcpListener::bind((Ipv4Addr::UNSPECIFIED, port)).is_ok()
         && !TcpListener::bind((Ipv6Addr::UNSPECIFIED, port)).is_err_and(is_taken)
-}
-
-impl Actor for SlotPool {
-    type Context = Context<Self>;
-
-    fn started(&mut self, ctx: &mut Self::Context) {
-        ctx.run_interval(RECHECK, |slots, _| slots.serve());
-    }
-}
-
-impl Handler<Acquire> for SlotPool {
-    type Result = ();
-
-    fn handle(&mut self, Acquire(present): Acquire, _: &mut Self::Context) {
-        self.arrivals += 1;
-        let (id, refusal) = (present.shown.id, self.refusal(&present.parties()));
-        self.present.insert(id, *present);
-        self.grant();
-        if let Some(refusal) = refusal
-            && self.present.get(&id).is_some_and(|one| one.shown.port.is_none())
-            && let Some(refused) = self.present.remove(&id)
-        {
-            refused.listener.do_send(SlotEvent::Rejected(refusal));
-        }
-        self.serve();
-    }
-}
-
-impl Handler<Release> for SlotPool {
-    type Result = ();
-
-    fn handle(&mut self, Release(id): Release, _: &mut Self::Context) {
-        if let Some(present) = self.present.remove(&id) {
-            self.ends.record(present.ended());
-        }
-        self.serve();
-    }
-}
-
-impl Handler<Update> for SlotPool {
-    type Result = ();
-
-    fn handle(&mut self, Update(id, change): Update, _: &mut Self::Context) {
-        if let Some(present) = self.present.get_mut(&id) {
-            change(present);
-            self.end_longest_away();
-        }
-    }
-}
-
-impl Handler<StopOne> for SlotPool {
-    type Result = bool;
-
-    fn handle(&mut self, StopOne { id, why }: StopOne, _: &mut Self::Context) -> bool {
-        let found = self.present.values().find(|one| one.shown.id.to_string() == id);
-        found.inspect(|one| one.listener.do_send(SlotEvent::Stopped(why))).is_some()
-    }
-}
-
-impl Handler<GetSnapshot> for SlotPool {
-    type Result = Snapshot;
-
-    fn handle(&mut self, _: GetSnapshot, _: &mut Self::Context) -> Snapshot {
-        let simulations = self.present.values().map(|one| one.shown.clone()).collect();
-        Snapshot { instances: self.instances(), simulations }
-    }
 }

@@ -2,7 +2,7 @@
 
 use actix_web::HttpRequest;
 
-use crate::shared::http::{AuthError, is_administrator};
+use crate::shared::http::AuthError;
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::state::AppState;
 
@@ -21,14 +21,14 @@ impl Visitor {
     /// The sender of a request.
     ///
     /// # Errors
-    /// When its address has sent too many passwords.
+    /// When its address has sent too many passwords: the page must not pass for that of a stranger.
     pub fn of(request: &HttpRequest, server: &AppState) -> Result<Self, AuthError> {
-        let peer = server.config.trusted_proxies.peer(request);
-        Ok(match &server.admin_auth {
-            None => Self::Anybody,
-            auth if is_administrator(auth.as_ref(), request, peer)? => Self::Administrator,
-            Some(_) => Self::Stranger,
-        })
+        let Some(auth) = &server.admin_auth else { return Ok(Self::Anybody) };
+        match auth.check(request, server.config.trusted_proxies.peer(request)) {
+            Ok(()) => Ok(Self::Administrator),
+            Err(AuthError::NoPassword) => Ok(Self::Stranger),
+            Err(AuthError::TooMany) => Err(AuthError::TooMany),
+        }
     }
 
     /// Whether the visitor may see the ports of simulations: a client that reaches one controls its simulation. If no

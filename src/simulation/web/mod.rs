@@ -6,7 +6,6 @@ mod metrics;
 mod origins;
 mod page_routes;
 mod pages;
-mod queries;
 mod routes;
 mod status;
 mod stream_routes;

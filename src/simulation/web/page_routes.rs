@@ -10,7 +10,6 @@ use serde::Deserialize;
 
 use super::administrator::Visitor;
 use super::pages;
-use super::queries::ask;
 use super::webots_viewer;
 use crate::asset;
 use crate::shared::http::assets::{self, Asset};
@@ -19,7 +18,6 @@ use crate::shared::http::{ConnectionKind, ContentSecurityPolicy, html};
 use crate::simulation::container;
 use crate::simulation::ends::{last_lines, output_file};
 use crate::simulation::machine::{Tree, Usages};
-use crate::simulation::slots::GetSnapshot;
 use crate::simulation::snapshot::{Simulation, Snapshot};
 use crate::simulation::state::AppState;
 
@@ -46,7 +44,7 @@ pub fn configure(app: &mut web::ServiceConfig) {
 
 async fn monitor(request: HttpRequest, server: web::Data<AppState>) -> actix_web::Result<HttpResponse> {
     let visitor = Visitor::of(&request, &server)?;
-    let snapshot = ask(&server, GetSnapshot).await?;
+    let snapshot = server.slots.snapshot();
     let usages = usages(&server, &snapshot).await;
     Ok(html(pages::monitor(&server, &snapshot, &usages, visitor), &ContentSecurityPolicy::own()))
 }
@@ -75,14 +73,14 @@ async fn events(request: HttpRequest, server: web::Data<AppState>) -> actix_web:
     let render = move || {
         let server = shown.clone();
         async move {
-            let snapshot = ask(&server, GetSnapshot).await.ok()?;
+            let snapshot = server.slots.snapshot();
             let usages = usages(&server, &snapshot).await;
             let view = pages::view(&server, &snapshot, &usages, visitor);
             view.inspect_err(|error| log::error!("the monitor page can't be rendered: {error}")).ok()
         }
     };
     let live = if visitor == Visitor::Administrator { &server.administrators } else { &server.live };
-    Ok(live.listen(permit, server.phase.clone(), render))
+    Ok(live.listen(permit, server.phase.subscribe(), render))
 }
 
 async fn history(server: web::Data<AppState>) -> HttpResponse {

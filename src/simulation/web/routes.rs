@@ -10,14 +10,12 @@ use super::administrator::Visitor;
 use super::metrics;
 use super::origins::check_origin;
 use super::page_routes;
-use super::queries::ask;
 use super::status::StatusResponse;
 use super::stream_routes;
 use super::watch_routes;
 use crate::shared::http::routing::{self, GET, READ, path};
 use crate::shared::http::{CONTENT_TYPE, ConnectionKind, websocket};
 use crate::simulation::client::WebClient;
-use crate::simulation::slots::GetSnapshot;
 use crate::simulation::state::AppState;
 
 /// Adds all routes to an app.
@@ -57,7 +55,7 @@ async fn load(server: web::Data<AppState>) -> HttpResponse {
 
 async fn status_json(request: HttpRequest, server: web::Data<AppState>) -> actix_web::Result<HttpResponse> {
     let visitor = Visitor::of(&request, &server)?;
-    let mut snapshot = ask(&server, GetSnapshot).await?;
+    let mut snapshot = server.slots.snapshot();
     if !visitor.sees_ports(&server.config) {
         snapshot.simulations.iter_mut().for_each(|one| one.port = None);
     }
@@ -65,7 +63,7 @@ async fn status_json(request: HttpRequest, server: web::Data<AppState>) -> actix
 }
 
 async fn metrics_text(server: web::Data<AppState>) -> actix_web::Result<HttpResponse> {
-    let snapshot = ask(&server, GetSnapshot).await?;
+    let snapshot = server.slots.snapshot();
     let text = server.metrics.render(&metrics::gauges(&server, &snapshot)).map_err(ErrorInternalServerError)?;
     Ok(HttpResponse::Ok().content_type(CONTENT_TYPE).body(text))
 }

@@ -5,12 +5,9 @@ use actix_web::{HttpRequest, HttpResponse, web};
 use askama::Template;
 use serde::Deserialize;
 
-use super::pages::{link, names};
-use super::queries::ask;
 use super::webots_viewer;
 use crate::shared::http::routing::{GET, READ, path};
 use crate::shared::http::{ContentSecurityPolicy, html, own_sources, require_administrator};
-use crate::simulation::slots::GetSnapshot;
 use crate::simulation::snapshot::Simulation;
 use crate::simulation::state::AppState;
 
@@ -18,11 +15,7 @@ use crate::simulation::state::AppState;
 #[derive(Template)]
 #[template(path = "simulation/watch.html")]
 struct Watch<'one> {
-    version: &'static str,
     one: &'one Simulation,
-    link: String,
-    repository: String,
-    world: String,
     /// The path of the stream, with a token for one connection.
     stream: String,
     /// Webots' own viewer, where this server has it.
@@ -60,21 +53,13 @@ async fn watch(
     if let Some(refusal) = require_administrator(server.admin_auth.as_ref(), &request, peer) {
         return Ok(refusal);
     }
-    let snapshot = ask(&server, GetSnapshot).await?;
+    let snapshot = server.slots.snapshot();
     let one = snapshot.simulations.iter().find(|one| one.id.to_string() == which.id);
     let found = one.zip(server.streams.watch(&which.id));
     let (one, token) = found.ok_or_else(|| ErrorNotFound("Error: this simulation does not stream."))?;
     let installed = webots_viewer::folder(&server.config).map(|_| webots_viewer::PATH);
-    let (repository, world) = names(one);
-    let page = Watch {
-        version: env!("CARGO_PKG_VERSION"),
-        one,
-        link: link(&one.world),
-        repository,
-        world,
-        stream: format!("stream/{}", token.reveal()),
-        script: installed.filter(|_| which.viewer != "small"),
-    };
+    let (stream, script) = (format!("stream/{}", token.reveal()), installed.filter(|_| which.viewer != "small"));
+    let page = Watch { one, stream, script };
     Ok(html(page.render(), &ContentSecurityPolicy::viewer(&request, &[])))
 }
 

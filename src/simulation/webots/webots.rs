@@ -258,8 +258,7 @@ impl Webots {
         let (config, port) = (&self.spec.config, self.spec.slot.port);
         let is_shown = config.ports_are_public() || config.admin_password.is_some();
         let line = format!("port {port}: {event}");
-        let shown = if is_shown { line.clone() } else { event.to_owned() };
-        self.spec.slot.lease.log(level, &line, shown);
+        self.spec.slot.lease.log(level, &line, if is_shown { &line } else { event });
     }
 }
 
