@@ -175,7 +175,10 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
         log::warn!("removed what {runs} earlier runs had left, {processes} processes among it");
     }
     let launcher = Launcher::start(&config).map_err(|error| AppError::Unavailable(error.to_string()))?;
-    let containers = open_containers(&config, &run)?;
+    let no_containers = |why| AppError::Unavailable(format!("isolation is \"container\", but {why}"));
+    let in_containers = config.isolation == IsolationSetting::Container;
+    let containers = in_containers.then(|| ContainerService::open(Arc::clone(&config), run.path()));
+    let containers = containers.transpose().map_err(no_containers)?.map(Arc::new);
     let rules = AdmissionRules {
         allowed: config.allowed_repositories.clone(),
         blocked: config.blocked_repositories.clone(),
@@ -188,8 +191,7 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
     let ends = Ends::start(logs, launcher.level().to_string(), &metrics);
     let ends = ends.map_err(|why| AppError::Unavailable(format!("ends of simulations can't be recorded: {why}")))?;
     let (per_address, per_user) = (config.max_places_per_address, config.max_places_per_user);
-    let slots =
-        SlotPool::new(config.streaming_ports(), config.waiting_line, per_address, per_user, ends.clone());
+    let slots = SlotPool::new(config.streaming_ports(), config.waiting_line, per_address, per_user, ends.clone());
     let csv = config.monitor_log_enabled.then(|| config.log_dir.0.join("simulation/monitor.csv"));
     let spread = config.spreads().then(|| Arc::new(Spread::over(config.displays_of_gpus().len())));
     let (load_monitor, readings) = LoadMonitor::new(slots.clone(), run.path(), csv, spread.clone());
@@ -212,7 +214,6 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
         ends,
         slots,
         sessions: Arc::default(),
-        streams: Arc::default(),
         load_monitor,
         readings,
         spread,
@@ -234,15 +235,6 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
         started: Instant::now(),
         config,
     })
-}
-
-/// Opens the container service, if simulations run in containers.
-fn open_containers(config: &Arc<SimulationConfig>, run: &RunDir) -> Result<Option<Arc<ContainerService>>, AppError> {
-    if config.isolation != IsolationSetting::Container {
-        return Ok(None);
-    }
-    let unavailable = |why| AppError::Unavailable(format!("isolation is \"container\", but {why}"));
-    Ok(Some(Arc::new(ContainerService::open(Arc::clone(config), run.path()).map_err(unavailable)?)))
 }
 
 /// Opens the cache of repositories with the limits of the configuration.

@@ -11,7 +11,6 @@ use super::ends::Ends;
 use super::failed_starts::FailedStarts;
 use super::sessions::Sessions;
 use super::slots::SlotPool;
-use super::streams::Streams;
 use crate::shared::domain::{AdmissionRules, Load, ProjectUrl};
 use crate::shared::http::{AddressQuota, BasicAuth, ConnectionLimiter, LiveUpdates, Metrics};
 use crate::shared::run::{Phase, service_manager};
@@ -35,8 +34,6 @@ pub struct AppState {
     pub slots: Arc<SlotPool>,
     /// The sessions that their clients can resume.
     pub sessions: Arc<Sessions>,
-    /// The streams of running simulations.
-    pub streams: Arc<Streams>,
     /// Reads the machine.
     pub load_monitor: Addr<LoadMonitor>,
     /// The newest readings of the machine.

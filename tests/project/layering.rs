@@ -19,15 +19,14 @@ const SESSION: [&str; 8] = [
     "session::web",
     "session::app",
 ];
-const SIMULATION: [&str; 24] = [
+const SIMULATION: [&str; 23] = [
     "simulation::client_identity",
     "simulation::simulation_id",
     "simulation::snapshot",
     "simulation::ends",
     "simulation::failed_starts",
-    "simulation::slots",
     "simulation::sessions",
-    "simulation::streams",
+    "simulation::slots",
     "simulation::relay",
     "simulation::protocol",
     "simulation::process",

@@ -12,7 +12,6 @@ use webots_fleet::shared::http::ConnectionKind;
 use webots_fleet::shared::run::AppError;
 use webots_fleet::simulation::app::{self, Application};
 use webots_fleet::simulation::config::SimulationConfig;
-use webots_fleet::simulation::slots::GetSnapshot;
 use webots_fleet::simulation::snapshot::Stage;
 use webots_fleet::simulation::state::AppState;
 
@@ -68,7 +67,7 @@ impl Inside {
         let mut config = config::load::<SimulationConfig>(&file).unwrap().config;
         change(&mut config);
         let assembly = Application::new(config).unwrap();
-        let server = Arc::clone(assembly.server());
+        let server = Arc::clone(&assembly.server);
         let running = actix_rt::spawn(app::serve(assembly));
         until("the server listens", async || std::net::TcpStream::connect(("127.0.0.1", port)).is_ok()).await;
         Self { server, port, running, folder, _parts: (forge, webots, hanging) }
@@ -93,12 +92,11 @@ impl Inside {
     /// Waits until a simulation is in this state.
     pub async fn until(&self, stage: Stage) {
         let what = format!("a simulation is {stage:?}");
-        until(&what, async || self.stages().await.contains(&stage)).await;
+        until(&what, async || self.stages().contains(&stage)).await;
     }
 
-    pub async fn stages(&self) -> Vec<Stage> {
-        let snapshot = self.server.slots.send(GetSnapshot).await.unwrap();
-        snapshot.simulations.iter().map(|one| one.stage).collect()
+    pub fn stages(&self) -> Vec<Stage> {
+        self.server.slots.snapshot().simulations.iter().map(|one| one.stage).collect()
     }
 
     /// Waits until nothing of any simulation is left: connection, process, place, port and folder.
@@ -106,7 +104,7 @@ impl Inside {
         let runs = self.folder().join("cache/runs");
         let folders = || std::fs::read_dir(self.server.run.path()).unwrap().flatten();
         until("nothing is left", async || {
-            self.stages().await.is_empty()
+            self.stages().is_empty()
                 && self.server.connections.count(ConnectionKind::Client) == 0
                 && instances_below(&runs).is_empty()
                 && !folders().any(|entry| entry.file_name().to_string_lossy().starts_with("instance-"))

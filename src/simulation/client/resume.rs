@@ -1,20 +1,13 @@
 //! How a session waits for its client, and continues with the client's next connection.
 
-use std::time::{Duration, Instant};
-
 use actix::prelude::*;
 use actix_web_actors::ws::CloseCode;
 use futures_util::stream::{self, StreamExt};
 
-use super::session::Session;
+use super::session::{Session, seconds_until};
 use crate::shared::run::seconds_since_1970;
 use crate::simulation::protocol;
 use crate::simulation::sessions::{ClientAction, Connection, Resume, ToClient, Token};
-
-/// How many seconds are left until then, rounded up.
-pub(super) fn seconds_until(then: Instant) -> u64 {
-    (then.saturating_duration_since(Instant::now()) + Duration::from_millis(999)).as_secs()
-}
 
 impl Session {
     /// Waits for a client that may return; ends the session if it can't be resumed.

@@ -11,7 +11,6 @@ use actix::prelude::*;
 use actix_web_actors::ws::CloseCode;
 use futures_util::stream::AbortHandle;
 
-use super::resume::seconds_until;
 use super::state::{State, WebotsHandle};
 use crate::shared::http::Peer;
 use crate::shared::run::closing;
@@ -22,7 +21,6 @@ use crate::simulation::sessions::{ClientAction, Connection, ToClient, Token};
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::slots::{Slot, SlotEvent};
 use crate::simulation::state::AppState;
-use crate::simulation::streams::Watched;
 use crate::simulation::webots::{Keep, ResetController, WebotsEvent, WebotsExit};
 
 /// The actor.
@@ -64,14 +62,14 @@ pub struct Session {
 /// Interval of `absence` messages to a client that may return, which show that the connection works.
 const SIGN_OF_LIFE: Duration = Duration::from_secs(4);
 
+/// How many seconds are left until then, rounded up.
+pub(super) fn seconds_until(then: Instant) -> u64 {
+    (then.saturating_duration_since(Instant::now()) + Duration::from_millis(999)).as_secs()
+}
+
 impl Session {
     /// Opens the session of a client that requests a simulation.
-    pub fn open(
-        server: Arc<AppState>,
-        identity: ClientIdentity,
-        connection: Connection,
-        request: &protocol::Start,
-    ) {
+    pub fn open(server: Arc<AppState>, identity: ClientIdentity, connection: Connection, request: &protocol::Start) {
         Self::create(|ctx| {
             let mut session = Self {
                 resumable: request.resumable.unwrap_or_default() && !server.config.timing.absence.is_zero(),
@@ -225,6 +223,10 @@ impl Handler<SlotEvent> for Session {
                     self.text(text);
                 }
             }
+            (SlotEvent::Watched(is_watched), state) => {
+                (self.state, self.is_watched) = (state, is_watched);
+                self.text(protocol::watched(is_watched));
+            }
             (SlotEvent::AwayTooLong, state @ State::Launched(_)) if self.client.is_none() => {
                 let why = "Too many simulations waited for their clients, and this one had waited longest";
                 log::info!("{}: {why}", self.name());
@@ -238,15 +240,6 @@ impl Handler<SlotEvent> for Session {
             }
             (_, state) => self.state = state,
         }
-    }
-}
-
-impl Handler<Watched> for Session {
-    type Result = ();
-
-    fn handle(&mut self, Watched(is_watched): Watched, _: &mut Self::Context) {
-        self.is_watched = is_watched;
-        self.text(protocol::watched(is_watched));
     }
 }
 

@@ -119,8 +119,6 @@ impl Session {
             mode: self.mode,
             gpu,
             slot,
-            streams: Arc::clone(&self.server.streams),
-            watched: ctx.address().recipient(),
             events: ctx.address().recipient(),
         };
         let webots = Webots::start_in_arbiter(self.server.webots_thread(spec.slot.port), |_| Webots::new(spec));

@@ -45,7 +45,7 @@ impl WebClient {
         Self { server, peer, user, session: None, liveness, reader, _permit: permit }
     }
 
-    fn finish(&mut self, last_words: String, code: CloseCode, ctx: &mut Context) {
+    fn finish(last_words: String, code: CloseCode, ctx: &mut Context) {
         ctx.text(last_words);
         ctx.close(Some(CloseReason { code, description: None }));
         ctx.stop();
@@ -71,7 +71,7 @@ impl WebClient {
         let found = Token::parse(token).and_then(|token| Some((token, self.server.sessions.find(&token)?)));
         let Some((token, session)) = found else {
             log::info!("client {}: comes back to a simulation that has ended", self.peer);
-            return self.finish(protocol::ended(None), CloseCode::Normal, ctx);
+            return Self::finish(protocol::ended(None), CloseCode::Normal, ctx);
         };
         let resumed = session.send(Resume { token, connection: self.attach(ctx) });
         resumed
@@ -79,7 +79,7 @@ impl WebClient {
             .map(|answer, this, ctx| {
                 if let Err(refusal) = answer.unwrap_or_else(|_| Err(protocol::ended(None))) {
                     log::info!("client {}: does not come back: {refusal}", this.peer);
-                    this.finish(refusal, CloseCode::Normal, ctx);
+                    Self::finish(refusal, CloseCode::Normal, ctx);
                 }
             })
             .spawn(ctx);
@@ -91,7 +91,7 @@ impl WebClient {
             Err(wrong) => {
                 log::info!("client {}: {wrong}", self.peer);
                 self.send(ClientAction::Leave);
-                return self.finish(protocol::error(&wrong.to_string()), CloseCode::Normal, ctx);
+                return Self::finish(protocol::error(&wrong.to_string()), CloseCode::Normal, ctx);
             }
         };
         match (request, &self.session) {
@@ -126,7 +126,7 @@ impl Actor for WebClient {
             .map(|(), this, ctx| {
                 // A client with a session is notified by its session.
                 if this.session.is_none() {
-                    this.finish(protocol::stopping(), CloseCode::Away, ctx);
+                    Self::finish(protocol::stopping(), CloseCode::Away, ctx);
                 }
             })
             .spawn(ctx);
@@ -155,12 +155,12 @@ impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
             Ok(Some(ClientMessage::Text(_) | ClientMessage::Ping(_))) => {
                 log::warn!("client {}: asks too much between two pings", self.peer);
                 self.send(ClientAction::Leave);
-                self.finish(protocol::error("Too many requests on one connection"), CloseCode::Policy, ctx);
+                Self::finish(protocol::error("Too many requests on one connection"), CloseCode::Policy, ctx);
             }
             Err(error) => {
                 log::info!("client {}: {error}", self.peer);
                 self.send(ClientAction::Leave);
-                self.finish(protocol::error(&error.to_string()), error.code(), ctx);
+                Self::finish(protocol::error(&error.to_string()), error.code(), ctx);
             }
         }
     }
@@ -172,7 +172,7 @@ impl Handler<ToClient> for WebClient {
     fn handle(&mut self, message: ToClient, ctx: &mut Self::Context) {
         match message {
             ToClient::Text(text) => ctx.text(text),
-            ToClient::End(last_words, code) => self.finish(last_words, code, ctx),
+            ToClient::End(last_words, code) => Self::finish(last_words, code, ctx),
         }
     }
 }

@@ -50,6 +50,10 @@ impl SlotLease {
         self.id
     }
 
+    pub(super) fn change(&self, change: impl FnOnce(&mut Present)) {
+        self.slots.change(self.id, change);
+    }
+
     /// Changes what pages show of the simulation.
     pub fn update(&self, change: impl FnOnce(&mut Simulation)) {
         self.slots.update(self.id, change);
@@ -58,12 +62,13 @@ impl SlotLease {
     /// Logs an event of the simulation under its id, and records what everybody may read of it.
     pub fn log(&self, level: log::Level, event: &str, shown: &str) {
         log::log!(target: "simulation", level, "{}: {event}", self.id);
-        self.slots.change(self.id, |present| present.note(shown));
+        self.change(|present| present.note(shown));
     }
 
-    /// Reports how the simulation ends, before the lease is dropped. Only the first report counts.
+    /// Reports how the simulation ends, before the lease is dropped. Only the first report counts. Its stream is closed.
     pub fn end(&self, reason: EndReason, why: &str, taken: Taken) {
-        self.slots.change(self.id, |present| {
+        self.change(|present| {
+            present.accesses.clear();
             present.how.get_or_insert(End { reason, why: why.to_owned(), taken });
         });
     }

@@ -12,7 +12,7 @@ use std::ops::RangeInclusive;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use super::party::{Party, Share};
+use super::party::Party;
 use super::present::Present;
 use super::slot_event::SlotEvent;
 use crate::shared::domain::Instances;
@@ -23,7 +23,7 @@ use crate::simulation::snapshot::{Simulation, Snapshot, Stage};
 /// The slots of this server, and the simulations that have one or wait for one.
 pub struct SlotPool(Mutex<Slots>);
 
-struct Slots {
+pub(super) struct Slots {
     ports: RangeInclusive<u16>,
     queue_capacity: usize,
     per_address: Option<usize>,
@@ -31,7 +31,7 @@ struct Slots {
     /// Number of leases that were requested, including those of clients that were refused.
     arrivals: u64,
     /// All simulations in the order in which they were requested. Those without a port are the queue.
-    present: BTreeMap<SimulationId, Present>,
+    pub(super) present: BTreeMap<SimulationId, Present>,
     ends: Ends,
 }
 
@@ -52,7 +52,7 @@ impl SlotPool {
         Arc::new(Self(Mutex::new(Slots { ports, queue_capacity, per_address, per_user, arrivals: 0, present, ends })))
     }
 
-    fn slots(&self) -> MutexGuard<'_, Slots> {
+    pub(super) fn slots(&self) -> MutexGuard<'_, Slots> {
         // After a panic the server ends: `recheck` notices it.
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -141,33 +141,36 @@ impl Slots {
         for party in self.present.values().filter(|one| one.shown.port.is_some()).flat_map(Present::parties) {
             *lent.entry(party).or_default() += 1;
         }
-        let may_have_one = |party: &Party| lent.get(party).is_none_or(|slots| *slots < self.limit(party).slots);
+        let may_have_one = |party: &Party| {
+            let slots = lent.get(party).copied().unwrap_or_default();
+            self.limit(party).is_none_or(|most| slots < most)
+        };
         self.queue().find(|waiting| waiting.parties().iter().all(may_have_one)).map(|waiting| waiting.shown.id)
     }
 
-    /// What the clients of a party may have.
-    fn limit(&self, party: &Party) -> Share {
-        let slots = match party {
+    /// How many slots the clients of a party may have; `None` for all of them.
+    fn limit(&self, party: &Party) -> Option<usize> {
+        match party {
             Party::Address(_) => self.per_address,
             Party::User(_) => self.per_user,
-        };
-        let Some(slots) = slots else { return Share { slots: usize::MAX, waiting: usize::MAX } };
-        let all = self.ports.len();
-        Share { slots, waiting: (self.queue_capacity * slots.min(all)).div_ceil(all) }
+        }
     }
 
-    /// What the clients of a party have.
-    fn share_of(&self, party: &Party) -> Share {
+    /// Why another client of this party may not wait, if so: the party has its slots, or its clients wait for them, and as
+    /// many wait as in its share of the queue.
+    fn refusal_of(&self, party: &Party) -> Option<String> {
+        let (most, all) = (self.limit(party)?, self.ports.len());
         let present = self.present.values().filter(|one| one.parties().contains(party));
         let (lent, waiting): (Vec<_>, Vec<_>) = present.partition(|one| one.shown.port.is_some());
-        Share { slots: lent.len(), waiting: waiting.len() }
+        let (lent, waiting) = (lent.len(), waiting.len());
+        let is_used_up = waiting >= (self.queue_capacity * most.min(all)).div_ceil(all);
+        (is_used_up && (lent >= most || waiting > 0)).then(|| party.refusal(lent, waiting))
     }
 
     /// Why another client of these parties may not wait, if so, as text for it.
     fn refusal(&self, parties: &[Party]) -> Option<String> {
-        let mut shares = parties.iter().map(|party| (party, self.limit(party), self.share_of(party)));
-        if let Some((party, _, has)) = shares.find(|(_, may, has)| may.is_used_up(*has)) {
-            return Some(party.refusal(has));
+        if let Some(refusal) = parties.iter().find_map(|party| self.refusal_of(party)) {
+            return Some(refusal);
         }
         let (places, waiting) = (self.ports.len(), self.queue().count());
         let full = || {

@@ -14,7 +14,7 @@ use super::webots_viewer;
 use crate::asset;
 use crate::shared::http::assets::{self, Asset};
 use crate::shared::http::routing::{GET, READ, path};
-use crate::shared::http::{ConnectionKind, ContentSecurityPolicy, html};
+use crate::shared::http::{ConnectionKind, ContentSecurityPolicy, PageView, html};
 use crate::simulation::container;
 use crate::simulation::ends::{last_lines, output_file};
 use crate::simulation::machine::{Tree, Usages};
@@ -44,9 +44,14 @@ pub fn configure(app: &mut web::ServiceConfig) {
 
 async fn monitor(request: HttpRequest, server: web::Data<AppState>) -> actix_web::Result<HttpResponse> {
     let visitor = Visitor::of(&request, &server)?;
+    let page = view(&server, visitor).await.and_then(|view| pages::monitor(&server, &view, visitor));
+    Ok(html(page, &ContentSecurityPolicy::own()))
+}
+
+async fn view(server: &AppState, visitor: Visitor) -> Result<PageView, askama::Error> {
     let snapshot = server.slots.snapshot();
-    let usages = usages(&server, &snapshot).await;
-    Ok(html(pages::monitor(&server, &snapshot, &usages, visitor), &ContentSecurityPolicy::own()))
+    let usages = usages(server, &snapshot).await;
+    pages::view(server, &snapshot, &usages, visitor)
 }
 
 async fn usages(server: &AppState, snapshot: &Snapshot) -> Usages {
@@ -73,9 +78,7 @@ async fn events(request: HttpRequest, server: web::Data<AppState>) -> actix_web:
     let render = move || {
         let server = shown.clone();
         async move {
-            let snapshot = server.slots.snapshot();
-            let usages = usages(&server, &snapshot).await;
-            let view = pages::view(&server, &snapshot, &usages, visitor);
+            let view = view(&server, visitor).await;
             view.inspect_err(|error| log::error!("the monitor page can't be rendered: {error}")).ok()
         }
     };

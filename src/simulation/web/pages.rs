@@ -89,18 +89,12 @@ pub fn view(
     Ok(PageView { parts: [("glance", glance)].into(), tables: [("simulations", rows), ("ends", ends)].into(), sample })
 }
 
-/// The whole of `/monitor`.
+/// The whole of `/monitor`, with these parts.
 ///
 /// # Errors
 /// When a template can't be rendered.
-pub fn monitor(
-    server: &AppState,
-    snapshot: &Snapshot,
-    usages: &Usages,
-    visitor: Visitor,
-) -> Result<String, askama::Error> {
-    let view = view(server, snapshot, usages, visitor)?;
-    Monitor { server, readings: &server.readings.borrow().clone(), visitor, view: &view }.render()
+pub fn monitor(server: &AppState, view: &PageView, visitor: Visitor) -> Result<String, askama::Error> {
+    Monitor { server, readings: &server.readings.borrow().clone(), visitor, view }.render()
 }
 
 impl Monitor<'_> {
@@ -203,7 +197,9 @@ mod tests {
         for (visitor, has_names) in
             [(Visitor::Anybody, false), (Visitor::Stranger, false), (Visitor::Administrator, true)]
         {
-            let html = SimulationRow { visitor, shows_port: true, one: &one, usage: Usage::default(), ends: 0 }.render().unwrap();
+            let html = SimulationRow { visitor, shows_port: true, one: &one, usage: Usage::default(), ends: 0 }
+                .render()
+                .unwrap();
             assert!(!html.contains("<script>") && !html.contains("<i>"), "{html}");
             assert_eq!(html.contains("root"), has_names, "{html}");
         }

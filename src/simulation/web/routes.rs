@@ -10,7 +10,7 @@ use super::administrator::Visitor;
 use super::metrics;
 use super::origins::check_origin;
 use super::page_routes;
-use super::status::StatusResponse;
+use super::status::status_page;
 use super::stream_routes;
 use super::watch_routes;
 use crate::shared::http::routing::{self, GET, READ, path};
@@ -59,7 +59,7 @@ async fn status_json(request: HttpRequest, server: web::Data<AppState>) -> actix
     if !visitor.sees_ports(&server.config) {
         snapshot.simulations.iter_mut().for_each(|one| one.port = None);
     }
-    Ok(HttpResponse::Ok().json(StatusResponse::new(&server, snapshot)))
+    Ok(HttpResponse::Ok().json(status_page(&server, &snapshot)))
 }
 
 async fn metrics_text(server: web::Data<AppState>) -> actix_web::Result<HttpResponse> {

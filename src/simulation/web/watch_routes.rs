@@ -55,7 +55,7 @@ async fn watch(
     }
     let snapshot = server.slots.snapshot();
     let one = snapshot.simulations.iter().find(|one| one.id.to_string() == which.id);
-    let found = one.zip(server.streams.watch(&which.id));
+    let found = one.and_then(|one| Some((one, server.slots.watch(one.id)?)));
     let (one, token) = found.ok_or_else(|| ErrorNotFound("Error: this simulation does not stream."))?;
     let installed = webots_viewer::folder(&server.config).map(|_| webots_viewer::PATH);
     let (stream, script) = (format!("stream/{}", token.reveal()), installed.filter(|_| which.viewer != "small"));

@@ -21,7 +21,6 @@ use crate::simulation::machine::sensors::Gpu;
 use crate::simulation::process::{SpawnSpec, until_answering};
 use crate::simulation::protocol::Mode;
 use crate::simulation::slots::Slot;
-use crate::simulation::streams::{StreamRegistration, Streams, Watched};
 
 /// A port that does not even refuse a connection for so long has a program that does not take it.
 const SILENCE: Duration = Duration::from_millis(100);
@@ -48,10 +47,6 @@ pub struct LaunchSpec {
     pub gpu: Option<Gpu>,
     /// The slot, with its port.
     pub slot: Slot,
-    /// Where its stream is found while it runs.
-    pub streams: Arc<Streams>,
-    /// Is notified whether it is watched.
-    pub watched: Recipient<Watched>,
     /// Receives the events.
     pub events: Recipient<WebotsEvent>,
 }
@@ -61,11 +56,6 @@ impl LaunchSpec {
     pub fn log_file(&self) -> PathBuf {
         let folder = self.config.log_dir.0.join("simulation").join(FOLDER_OF_RUNNING);
         folder.join(format!("{}.log", self.slot.lease.id()))
-    }
-
-    /// Registers its stream.
-    pub fn register(&self) -> StreamRegistration {
-        self.streams.register(self.slot.lease.id(), self.slot.port, self.watched.clone())
     }
 
     /// The request for its containers.

@@ -22,7 +22,6 @@ use crate::simulation::container::StartError;
 use crate::simulation::ends::{EndReason, Taken};
 use crate::simulation::process::ProcessGroup;
 use crate::simulation::snapshot::Stage;
-use crate::simulation::streams::StreamRegistration;
 
 /// Requests Webots' end, because its client has left or for another reason.
 #[derive(Message)]
@@ -36,8 +35,6 @@ pub struct ResetController(pub String);
 
 /// The actor.
 pub struct Webots {
-    /// Its stream, which is not found any more before another simulation may have its port.
-    stream: Option<StreamRegistration>,
     pub(super) spec: LaunchSpec,
     events: EventSender,
     /// The preparation of its target, while it runs.
@@ -73,7 +70,6 @@ impl Webots {
     /// Creates the actor; Webots starts with it.
     pub fn new(spec: LaunchSpec) -> Self {
         Self {
-            stream: None,
             events: EventSender::new(spec.events.clone()),
             spec,
             preparing: None,
@@ -166,7 +162,7 @@ impl Webots {
         self.listening = true;
         self.last_heartbeat = Instant::now();
         self.show_pace();
-        let stream = self.stream.insert(self.spec.register()).token();
+        let stream = self.spec.slot.lease.open_stream();
         self.send(WebotsEvent::Listening(self.spec.slot.port, stream));
         self.used(ctx);
     }
@@ -212,7 +208,6 @@ impl Webots {
     }
 
     fn ended(&mut self, end: &End, ctx: &mut Context<Self>) {
-        self.stream = None;
         self.log(Level::Info, &format!("Webots {}", end.reason));
         let (kind, why) = verdict(self.stopped_for.take(), end, self.listening);
         self.spec.slot.lease.end(kind, &why, end.taken);
