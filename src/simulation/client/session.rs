@@ -27,8 +27,6 @@ use crate::simulation::webots::{Keep, ResetController, WebotsEvent, WebotsExit};
 pub struct Session {
     pub(super) server: Arc<AppState>,
     pub(super) peer: Peer,
-    /// Who has asked for it.
-    pub(super) identity: ClientIdentity,
     /// The id of the simulation, once there is one.
     pub(super) id: Option<SimulationId>,
     /// The connection of its client, until it has ended.
@@ -75,7 +73,6 @@ impl Session {
                 resumable: request.resumable.unwrap_or_default() && !server.config.timing.absence.is_zero(),
                 server,
                 peer: connection.peer,
-                identity,
                 id: None,
                 client: None,
                 attachment: None,
@@ -92,7 +89,7 @@ impl Session {
                 resetting: None,
             };
             session.attach(connection, ctx);
-            session.request_slot(&request.url, ctx);
+            session.request_slot(&request.url, identity, ctx);
             session
         });
     }

@@ -10,6 +10,7 @@ use super::session::Session;
 use super::state::{State, WebotsHandle};
 use crate::shared::domain::ProjectUrl;
 use crate::simulation::checkout::Project;
+use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::ends::EndReason;
 use crate::simulation::machine::sensors::Gpu;
 use crate::simulation::protocol;
@@ -43,7 +44,7 @@ impl Session {
         self.refer(why, ctx);
     }
 
-    pub(super) fn request_slot(&mut self, url: &str, ctx: &mut Context<Self>) {
+    pub(super) fn request_slot(&mut self, url: &str, identity: ClientIdentity, ctx: &mut Context<Self>) {
         let admitted = if self.server.start_quota.take(self.peer.rate_limit_key()) {
             self.server.admit(url)
         } else {
@@ -59,8 +60,8 @@ impl Session {
         let id = SimulationId::next();
         self.id = Some(id);
         self.text(protocol::session(id));
-        log::info!("{}: asks for {world}{}", self.name(), self.identity);
-        let (me, client) = (ctx.address().recipient(), (self.peer, self.identity.clone()));
+        log::info!("{}: asks for {world}{identity}", self.name());
+        let (me, client) = (ctx.address().recipient(), (self.peer, identity));
         match SlotLease::acquire(&self.server.slots, id, me, &world, client) {
             Ok(lease) => self.state = State::Waiting { world, lease },
             Err(why) => {
