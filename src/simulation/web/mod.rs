@@ -9,7 +9,6 @@ mod pages;
 mod routes;
 mod status;
 mod stream_routes;
-mod watch_routes;
 mod webots_viewer;
 
 pub use routes::configure;

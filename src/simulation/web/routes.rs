@@ -12,7 +12,6 @@ use super::origins::check_origin;
 use super::page_routes;
 use super::status::status_page;
 use super::stream_routes;
-use super::watch_routes;
 use crate::shared::http::routing::{self, GET, READ, path};
 use crate::shared::http::{CONTENT_TYPE, ConnectionKind, websocket};
 use crate::simulation::client::WebClient;
@@ -28,7 +27,6 @@ fn add(app: &mut web::ServiceConfig) {
         .service(path("/load", READ, load))
         .configure(page_routes::configure)
         .configure(stream_routes::configure)
-        .configure(watch_routes::configure)
         .service(path("/status", READ, status_json))
         .service(path("/metrics", READ, metrics_text))
         .service(path("/health", READ, health))
