@@ -23,9 +23,8 @@
 //! | [`simulation::ends`] | how simulations have ended: counter, table, their logs (`kept_output`) |
 //! | [`simulation::webots`] | one running Webots: command line, its GPU (`launch_spec`), what it prints and its log (`output`), end |
 //! | [`simulation::client`] | one web client, the session of its simulation |
-//! | [`simulation::slots`] | the slots that clients wait for: leases, the queue (`slot_pool`), shares (`party`) |
 //! | [`simulation::sessions`] | how a connection is attached to its session, and how a client resumes it |
-//! | [`simulation::streams`] | the streams of running simulations, and the tokens that lead to them |
+//! | [`simulation::slots`] | the slots that clients wait for: leases, the queue (`slot_pool`), shares (`party`), the streams of simulations and the tokens that lead to them (`stream`) |
 //! | `simulation::relay` | a stream between a client and the port of its Webots |
 //! | `simulation::web` | routes, pages, `/status` and Prometheus metrics of the simulation server |
 //!
@@ -54,8 +53,8 @@
 //!
 //! simulation server
 //!
-//!   routes - GetSnapshot -> SlotPool <- GetSnapshot - LoadMonitor --> monitor.csv
-//!     | one per WebSocket   ^  |                      '-- Readings (watch channel) --> routes
+//!   routes -- snapshot --> SlotPool <-- instances -- LoadMonitor --> monitor.csv
+//!     | one per WebSocket   ^  |                     '-- Readings (watch channel) --> routes
 //!   WebClient               |  |
 //!     | one per simulation  |  |
 //!   Session --- SlotLease -----'  |
@@ -76,13 +75,14 @@
 //!
 //! | actor | ends by itself | after a panic |
 //! |---|---|---|
-//! | Registry, `SlotPool`, `LoadMonitor` | never | the server logs it and exits with code 1: the service manager restarts it |
+//! | Registry, `LoadMonitor` | never | the server logs it and exits with code 1: the service manager restarts it |
 //! | `ServerMonitor` | when its server leaves the configuration, or its name no longer resolves to it and it does not answer | its supervisor starts a new one |
 //! | Mailer | never | its supervisor starts a new one; unsent notices are lost |
 //! | `WebClient` | with its connection | its connection closes, and its session is notified |
 //! | `Session` | with its simulation, or its client | its lease is released, and its client is notified |
 //! | Webots | with its process tree; it is never restarted, its client is notified | its process tree is killed at once, its directory removed, its slot released |
 //!
+//! The `SlotPool` is no actor: a mutex holds it, and a panic meanwhile ends the server with exit code 1, too.
 //! The registry runs the supervisors ([`shared::run::Supervisor`], one for each kind). More than five panics of a kind
 //! within a minute end the server with exit code 1, too.
 //!

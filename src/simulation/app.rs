@@ -4,16 +4,15 @@ use std::net::{SocketAddr, TcpListener};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use actix::prelude::*;
+use actix::{Actor, Arbiter};
 use actix_web::{App, web};
-use tokio::sync::mpsc::Receiver;
 use tokio::sync::watch;
 
 use super::announcer;
 use super::config::{IsolationSetting, SimulationConfig};
 use super::ends::Ends;
 use super::readiness;
-use super::slots::{GetSnapshot, SlotPool};
+use super::slots::SlotPool;
 use super::state::AppState;
 use crate::shared::domain::AdmissionRules;
 use crate::shared::http::server::{self, HttpServerOptions};
@@ -50,11 +49,10 @@ pub async fn run(config: SimulationConfig) -> Result<(), AppError> {
 
 /// A server that is ready to serve: its port is bound, and its actors run.
 pub struct Application {
-    server: Arc<AppState>,
+    /// The state that routes and web clients share.
+    pub server: Arc<AppState>,
     socket: TcpListener,
     signals: Signals,
-    phase: watch::Sender<Phase>,
-    commands: Receiver<ServerCommand>,
 }
 
 impl Application {
@@ -65,17 +63,9 @@ impl Application {
     pub fn new(mut config: SimulationConfig) -> Result<Self, AppError> {
         let signals = Signals::catch()?;
         config.max_clients = bound_clients(&config)?;
-        let (phase_sender, phase) = watch::channel(Phase::Open);
-        let (requests, commands) = tokio::sync::mpsc::channel(4);
         let address = SocketAddr::new(config.bind, config.port);
         let socket = server::listen(address).map_err(|error| format!("can't listen on {address}: {error}"))?;
-        let server = Arc::new(assemble(Arc::new(config), phase, requests)?);
-        Ok(Self { server, socket, signals, phase: phase_sender, commands })
-    }
-
-    /// Returns the state that routes and web clients share.
-    pub fn server(&self) -> &Arc<AppState> {
-        &self.server
+        Ok(Self { server: Arc::new(assemble(Arc::new(config))?), socket, signals })
     }
 }
 
@@ -97,7 +87,7 @@ fn bound_clients(config: &SimulationConfig) -> Result<usize, String> {
 /// # Errors
 /// When an actor that must live has stopped, or the system refuses what the server needs.
 pub async fn serve(assembly: Application) -> Result<(), AppError> {
-    let Application { server, socket, mut signals, phase: phase_sender, mut commands } = assembly;
+    let Application { server, socket, mut signals } = assembly;
     let owner = server.containers.as_ref().map(|containers| containers.run.0.as_str());
     let _guardian = Guardian::start(server.run.path(), owner)?;
     let shared = web::Data::from(Arc::clone(&server));
@@ -119,18 +109,20 @@ pub async fn serve(assembly: Application) -> Result<(), AppError> {
     let serving = actix_rt::spawn(http);
     let (config, port) = (&server.config, server.config.port);
     start::announce("simulation server", &config.http_url(), &format!("{}/client", config.websocket_url(port)), port);
-    let slots = server.slots.clone();
-    let watched = slots.clone();
-    actix_rt::spawn(service_manager::feed_watchdog(async move || watched.send(GetSnapshot).await.is_ok()));
+    let slots = Arc::clone(&server.slots);
+    // It is answered unless this thread is blocked, or another one keeps the slots.
+    actix_rt::spawn(service_manager::feed_watchdog(async move || slots.instances().places > 0));
     let why = tokio::select! {
-        why = handle_commands(&mut signals, &mut commands, &server, &phase_sender) => why,
-        fault = permanent::stopped("SlotPool", slots.clone()) => return Err(fault.into()),
+        why = handle_signals(&mut signals, &server) => why,
+        _ = actix_rt::spawn(Arc::clone(&server.slots).recheck()) => {
+            return Err("a panic has left the slots in disorder".to_owned().into());
+        }
         fault = permanent::stopped("LoadMonitor", server.load_monitor.clone()) => return Err(fault.into()),
     };
     log::info!("stopping");
     service_manager::stopping(why);
-    phase_sender.send_replace(Phase::Closing);
-    if actix_rt::time::timeout(server.config.timing.stop, empty(&slots)).await.is_err() {
+    server.phase.send_replace(Phase::Closing);
+    if actix_rt::time::timeout(server.config.timing.stop, empty(&server)).await.is_err() {
         log::error!("some simulations have not ended in time: they are killed");
     }
     server.ends.flush().await;
@@ -141,27 +133,17 @@ pub async fn serve(assembly: Application) -> Result<(), AppError> {
     Ok(())
 }
 
-/// Handles signals and requests of administrators, until the server must stop. Returns the reason: `webots-fleet-renew`
-/// decides by this text whether a server was drained or stopped.
-async fn handle_commands(
-    signals: &mut Signals,
-    commands: &mut Receiver<ServerCommand>,
-    server: &AppState,
-    phase: &watch::Sender<Phase>,
-) -> &'static str {
+/// Handles signals until the server must stop. Returns the reason: `webots-fleet-renew` decides by this text whether a
+/// server was drained or stopped.
+async fn handle_signals(signals: &mut Signals, server: &AppState) -> &'static str {
     loop {
         let command = tokio::select! {
             command = signals.next() => command,
-            Some(command) = commands.recv() => command,
             () = drained(server) => return "drained: its last simulation has ended",
         };
         match command {
             ServerCommand::Stop => return "stopping",
-            ServerCommand::Drain => {
-                log::info!("draining: no new clients, the server ends when the last has gone");
-                phase.send_replace(Phase::Draining);
-                service_manager::status("draining: it ends when the last simulation has ended");
-            }
+            ServerCommand::Drain => server.drain(),
             ServerCommand::Reload => log::info!("SIGHUP changes nothing here: the configuration is read at start"),
         }
     }
@@ -177,17 +159,16 @@ fn streams_per_client(config: &SimulationConfig) -> usize {
 }
 
 /// Creates the server's state, and starts its actors.
-fn assemble(
-    config: Arc<SimulationConfig>,
-    phase: watch::Receiver<Phase>,
-    requests: tokio::sync::mpsc::Sender<ServerCommand>,
-) -> Result<AppState, AppError> {
+fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
     let folder = config.cache_dir.0.clone();
     let cache_fault = |error| format!("the folder {} (cacheDir) can't be used: {error}", folder.display());
     let cache_dir = CacheDir::claim(&folder).map_err(cache_fault)?;
     let run = RunDir::open(&folder).map_err(cache_fault)?;
     let launcher = Launcher::start(&config)?;
-    let containers = open_containers(&config, &run)?;
+    let no_containers = |why| format!("isolation is \"container\", but {why}");
+    let in_containers = config.isolation == IsolationSetting::Container;
+    let containers = in_containers.then(|| ContainerService::open(Arc::clone(&config), run.path()));
+    let containers = containers.transpose().map_err(no_containers)?.map(Arc::new);
     let rules = AdmissionRules {
         allowed: config.allowed_repositories.clone(),
         blocked: config.blocked_repositories.clone(),
@@ -201,8 +182,7 @@ fn assemble(
     let ends = Ends::start(logs, launcher.level.to_string(), &metrics);
     let ends = ends.map_err(|why| format!("ends of simulations can't be recorded: {why}"))?;
     let (per_address, per_user) = (config.max_places_per_address, config.max_places_per_user);
-    let slots =
-        SlotPool::new(config.streaming_ports(), config.waiting_line, per_address, per_user, ends.clone()).start();
+    let slots = SlotPool::new(config.streaming_ports(), config.waiting_line, per_address, per_user, ends.clone());
     let csv = config.monitor_log_enabled.then(|| config.log_dir.0.join("simulation/monitor.csv"));
     let spread = config.spreads().then(|| Arc::new(Spread::over(config.displays_of_gpus().len())));
     let (load_monitor, readings) = LoadMonitor::new(slots.clone(), run.path(), csv, spread.clone());
@@ -225,7 +205,6 @@ fn assemble(
         ends,
         slots,
         sessions: Arc::default(),
-        streams: Arc::default(),
         load_monitor,
         readings,
         spread,
@@ -233,8 +212,7 @@ fn assemble(
         launcher: Arc::new(launcher),
         containers,
         run: Arc::new(run),
-        phase,
-        requests,
+        phase: watch::Sender::new(Phase::Open),
         webots_threads: std::array::from_fn(|_| Arbiter::new().handle()),
         admin_auth: config.admin_password.clone().map(BasicAuth::new),
         connections: ConnectionLimiter::new(max_tcp(&config), config.max_clients, config.max_clients_per_address),
@@ -250,25 +228,15 @@ fn assemble(
     })
 }
 
-/// Opens the container service, if simulations run in containers.
-fn open_containers(config: &Arc<SimulationConfig>, run: &RunDir) -> Result<Option<Arc<ContainerService>>, String> {
-    if config.isolation != IsolationSetting::Container {
-        return Ok(None);
-    }
-    let unavailable = |why| format!("isolation is \"container\", but {why}");
-    Ok(Some(Arc::new(ContainerService::open(Arc::clone(config), run.path()).map_err(unavailable)?)))
-}
-
 /// Waits until the server is draining and has no simulation left.
 async fn drained(server: &AppState) {
-    let mut phase = server.phase.clone();
-    phase.wait_for(|phase| *phase == Phase::Draining).await.ok();
-    empty(&server.slots).await;
+    server.phase.subscribe().wait_for(|phase| *phase == Phase::Draining).await.ok();
+    empty(server).await;
 }
 
 /// Waits until there is no simulation, and the queue is empty.
-async fn empty(slots: &Addr<SlotPool>) {
-    while slots.send(GetSnapshot).await.is_ok_and(|snapshot| !snapshot.simulations.is_empty()) {
+async fn empty(server: &AppState) {
+    while !server.slots.snapshot().simulations.is_empty() {
         actix_rt::time::sleep(POLL_INTERVAL).await;
     }
 }

@@ -21,6 +21,5 @@ pub mod simulation_id;
 pub mod slots;
 pub mod snapshot;
 pub mod state;
-pub mod streams;
 mod web;
 pub mod webots;

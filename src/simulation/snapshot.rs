@@ -2,7 +2,6 @@
 
 use std::path::PathBuf;
 
-use actix::prelude::*;
 use serde::Serialize;
 
 use crate::shared::domain::{Instances, ProjectUrl};
@@ -29,7 +28,7 @@ pub enum Stage {
 }
 
 /// All simulations at one moment.
-#[derive(Debug, Clone, Default, MessageResponse)]
+#[derive(Debug, Clone, Default)]
 pub struct Snapshot {
     /// The numbers by state.
     pub instances: Instances,

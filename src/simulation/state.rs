@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use actix::prelude::*;
+use actix::{Addr, ArbiterHandle};
 use tokio::sync::watch;
 
 use super::config::SimulationConfig;
@@ -11,10 +11,9 @@ use super::ends::Ends;
 use super::failed_starts::FailedStarts;
 use super::sessions::Sessions;
 use super::slots::SlotPool;
-use super::streams::Streams;
 use crate::shared::domain::{AdmissionRules, Load, ProjectUrl};
 use crate::shared::http::{AddressQuota, BasicAuth, ConnectionLimiter, LiveUpdates, Metrics};
-use crate::shared::run::{Phase, ServerCommand};
+use crate::shared::run::{Phase, service_manager};
 use crate::simulation::checkout::CheckoutService;
 use crate::simulation::container::ContainerService;
 use crate::simulation::isolation::{Launcher, Watcher};
@@ -32,11 +31,9 @@ pub struct AppState {
     /// Which worlds may run.
     pub rules: AdmissionRules,
     /// Leases slots.
-    pub slots: Addr<SlotPool>,
+    pub slots: Arc<SlotPool>,
     /// The sessions that their clients can resume.
     pub sessions: Arc<Sessions>,
-    /// The streams of running simulations.
-    pub streams: Arc<Streams>,
     /// Reads the machine.
     pub load_monitor: Addr<LoadMonitor>,
     /// The newest readings of the machine.
@@ -54,15 +51,13 @@ pub struct AppState {
     /// The directory of this run, with the directories of simulations in it.
     pub run: Arc<RunDir>,
     /// Whether the server accepts clients.
-    pub phase: watch::Receiver<Phase>,
+    pub phase: watch::Sender<Phase>,
     /// Why the server can't start simulations; `None` if it can.
     pub problem: watch::Receiver<Option<String>>,
     /// Counts starts that failed for a reason of this server's own.
     pub failed_starts: Arc<FailedStarts>,
     /// Records the ends of simulations.
     pub ends: Ends,
-    /// Sends requests to drain.
-    pub requests: tokio::sync::mpsc::Sender<ServerCommand>,
     /// The threads on which the actors of Webots run.
     pub webots_threads: [ArbiterHandle; WEBOTS_THREADS],
     /// Checks the administrator's password, if one is configured.
@@ -88,13 +83,8 @@ pub struct AppState {
 impl AppState {
     /// Returns the thread for the Webots with this port.
     pub fn webots_thread(&self, port: u16) -> &ArbiterHandle {
-        let [first, second, third, fourth] = &self.webots_threads;
-        match port % 4 {
-            0 => first,
-            1 => second,
-            2 => third,
-            _ => fourth,
-        }
+        let [first, others @ ..] = &self.webots_threads;
+        others.get(usize::from(port) % WEBOTS_THREADS).unwrap_or(first)
     }
 
     /// Returns the load to report: 100 % while the server is draining or can't start simulations.
@@ -105,6 +95,19 @@ impl AppState {
     /// Whether the server accepts no client, regardless of its world.
     pub fn takes_nobody(&self) -> bool {
         self.is_draining() || self.problem.borrow().is_some()
+    }
+
+    /// Accepts no new clients from now on; the server ends when the last one has gone.
+    pub fn drain(&self) {
+        let is_new = self.phase.send_if_modified(|phase| {
+            let is_open = *phase == Phase::Open;
+            *phase = if is_open { Phase::Draining } else { *phase };
+            is_open
+        });
+        if is_new {
+            log::info!("draining: no new clients, the server ends when the last has gone");
+            service_manager::status("draining: it ends when the last simulation has ended");
+        }
     }
 
     /// Whether new clients are refused.

@@ -11,7 +11,6 @@ use webots_fleet::shared::http::ConnectionKind;
 use webots_fleet::shared::run::AppError;
 use webots_fleet::simulation::app::{self, Application};
 use webots_fleet::simulation::config::SimulationConfig;
-use webots_fleet::simulation::slots::GetSnapshot;
 use webots_fleet::simulation::snapshot::Stage;
 use webots_fleet::simulation::state::AppState;
 
@@ -36,7 +35,7 @@ impl Inside {
         change(&mut config);
         let port = config.port;
         let assembly = Application::new(config).unwrap();
-        let server = Arc::clone(assembly.server());
+        let server = Arc::clone(&assembly.server);
         let running = actix_rt::spawn(app::serve(assembly));
         until("the server listens", async || std::net::TcpStream::connect(("127.0.0.1", port)).is_ok()).await;
         Self { server, port, running, folder, _parts: (builder, hanging) }
@@ -57,19 +56,18 @@ impl Inside {
     /// Waits until a simulation is in this state.
     pub async fn until(&self, stage: Stage) {
         let what = format!("a simulation is {stage:?}");
-        until(&what, async || self.stages().await.contains(&stage)).await;
+        until(&what, async || self.stages().contains(&stage)).await;
     }
 
-    pub async fn stages(&self) -> Vec<Stage> {
-        let snapshot = self.server.slots.send(GetSnapshot).await.unwrap();
-        snapshot.simulations.iter().map(|one| one.stage).collect()
+    pub fn stages(&self) -> Vec<Stage> {
+        self.server.slots.snapshot().simulations.iter().map(|one| one.stage).collect()
     }
 
     /// Waits until nothing of any simulation is left: connection, process, place, port and folder.
     pub async fn until_nothing_is_left(&self) {
         let cache = self.folder.path().join("cache");
         until("nothing is left", async || {
-            self.stages().await.is_empty()
+            self.stages().is_empty()
                 && self.server.connections.count(ConnectionKind::Client) == 0
                 && instances_below(&cache).is_empty()
                 && instance_folders_in(&cache).is_empty()

@@ -15,10 +15,10 @@ use webots_fleet::simulation::ends::EndReason;
 use webots_fleet::simulation::machine::LoadMonitor;
 use webots_fleet::simulation::protocol::Mode;
 use webots_fleet::simulation::readiness;
-use webots_fleet::simulation::slots::{Slot, SlotEvent, SlotLease, SlotPool};
+use webots_fleet::simulation::simulation_id::SimulationId;
+use webots_fleet::simulation::slots::{Slot, SlotEvent, SlotLease};
 use webots_fleet::simulation::snapshot::Stage;
 use webots_fleet::simulation::state::AppState;
-use webots_fleet::simulation::streams::Watched;
 use webots_fleet::simulation::webots::{LaunchSpec, Stop, Webots, WebotsEvent, WebotsExit};
 
 use crate::inside::{Inside, ask};
@@ -43,7 +43,7 @@ macro_rules! panics {
     };
 }
 
-panics!(WebClient, Webots, SlotPool, LoadMonitor);
+panics!(WebClient, Webots, LoadMonitor);
 
 /// Opens a WebSocket as the server does, and gives away its actor's address.
 async fn gate(
@@ -91,7 +91,7 @@ pub async fn a_client_leaves_nothing_in_any_state() {
         client.closed().await;
         assert!(!address.connected(), "{stage:?}: it lives on");
         if let Some(first) = first {
-            crate::support::until("the line is empty", async || inside.stages().await == [Stage::Idle]).await;
+            crate::support::until("the line is empty", async || inside.stages() == [Stage::Idle]).await;
             first.leave().await;
         }
         inside.until_nothing_is_left().await;
@@ -130,10 +130,10 @@ impl Handler<WebotsEvent> for Listener {
     }
 }
 
-impl Handler<Watched> for Listener {
-    type Result = ();
-
-    fn handle(&mut self, _: Watched, _: &mut Self::Context) {}
+/// Asks for a place as a session does.
+fn lease(server: &AppState, listener: &Addr<Listener>, world: &ProjectUrl) -> SlotLease {
+    let client = (Peer::Unknown, ClientIdentity::default());
+    SlotLease::acquire(&server.slots, SimulationId::next(), listener.clone().recipient(), world, client).unwrap()
 }
 
 /// Starts a Webots as a web client does.
@@ -142,8 +142,7 @@ async fn launch(server: &AppState) -> (Addr<Webots>, UnboundedReceiver<WebotsExi
     let (exits, ended) = unbounded_channel();
     let listener = Listener { places, exits }.start();
     let world = ProjectUrl::parse(&arm()).unwrap();
-    let lease =
-        SlotLease::new(&server.slots, listener.clone().recipient(), &world, (Peer::Unknown, ClientIdentity::default()));
+    let lease = lease(server, &listener, &world);
     let port = granted.recv().await.unwrap();
     let project = server.checkouts.start(world, server.run.instance().unwrap(), |_| ()).await.unwrap().unwrap();
     let spec = LaunchSpec {
@@ -157,8 +156,6 @@ async fn launch(server: &AppState) -> (Addr<Webots>, UnboundedReceiver<WebotsExi
         mode: Mode::X3d,
         slot: Slot { lease, port },
         gpu: None,
-        streams: Arc::clone(&server.streams),
-        watched: listener.clone().recipient(),
         events: listener.recipient(),
     };
     (Webots::new(spec).start(), ended)
@@ -185,14 +182,18 @@ pub async fn a_webots_leaves_nothing_in_any_state() {
 }
 
 pub async fn an_actor_that_must_live_ends_the_server() {
-    for name in ["SlotPool", "LoadMonitor"] {
-        let inside = Inside::new(Stage::Idle, |_| ()).await;
-        match name {
-            "SlotPool" => inside.server.slots.do_send(Panic),
-            _ => inside.server.load_monitor.do_send(Panic),
-        }
-        // The program ends with exit code 1 for whatever is told here.
-        let fault = inside.ended().await.unwrap_err();
-        assert_eq!(fault.to_string(), format!("the actor {name} is gone"));
-    }
+    let inside = Inside::new(Stage::Idle, |_| ()).await;
+    inside.server.load_monitor.do_send(Panic);
+    // The program ends with exit code 1 for whatever is told here.
+    assert_eq!(inside.ended().await.unwrap_err().to_string(), "the actor LoadMonitor is gone");
+}
+
+pub async fn slots_in_disorder_end_the_server() {
+    let inside = Inside::new(Stage::Idle, |_| ()).await;
+    let (places, _granted) = unbounded_channel();
+    let listener = Listener { places, exits: unbounded_channel().0 }.start();
+    let lease = lease(&inside.server, &listener, &ProjectUrl::parse(&arm()).unwrap());
+    let panic = || lease.update(|_| std::panic::resume_unwind(Box::new("a test has asked for it")));
+    std::panic::catch_unwind(std::panic::AssertUnwindSafe(panic)).unwrap_err();
+    assert_eq!(inside.ended().await.unwrap_err().to_string(), "a panic has left the slots in disorder");
 }

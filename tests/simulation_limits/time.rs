@@ -42,7 +42,7 @@ pub async fn who_is_away_at_the_time_limit_hears_it() {
     let begin = Instant::now();
     let token = client.until("resume: ").await.trim_start_matches("resume: ").to_owned();
     drop(client);
-    until("it has ended", async || inside.stages().await.is_empty()).await;
+    until("it has ended", async || inside.stages().is_empty()).await;
     assert!(begin.elapsed() >= Duration::from_secs(5), "{:?}", begin.elapsed());
     let mut client = inside.connect().await;
     client.send(&json!({ "resume": token }).to_string()).await;

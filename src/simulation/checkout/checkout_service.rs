@@ -7,7 +7,6 @@ use std::io;
 use std::path::Path;
 use std::sync::Arc;
 
-use actix::prelude::*;
 use tokio::runtime::Handle;
 use tokio::sync::Semaphore;
 use tokio_util::task::AbortOnDropHandle;
@@ -43,11 +42,6 @@ pub struct CheckoutService {
 
 /// Projects that are copied at a time: git may hold files in memory while it writes them.
 const COPIES: usize = 16;
-
-/// A step of a checkout, as text for the client.
-#[derive(Message)]
-#[rtype(result = "()")]
-pub struct Progress(pub String);
 
 impl CheckoutService {
     /// Prepares checkouts, which are led on the thread of the current runtime. `run` is the directory of this run of the

@@ -23,7 +23,7 @@ mod world_file;
 
 pub use cache_dir::CacheDir;
 pub use checkout_error::CheckoutError;
-pub use checkout_service::{CheckoutService, Progress};
+pub use checkout_service::CheckoutService;
 pub use disk::outgrown;
 pub use project::Project;
 pub use single_flight::{OnProgress, SingleFlight};

@@ -2,7 +2,6 @@
 
 pub mod quota;
 mod resume;
-mod resumption;
 mod session;
 mod start;
 mod state;

@@ -2,29 +2,28 @@
 
 use actix::prelude::*;
 use actix_web_actors::ws::CloseCode;
+use futures_util::stream::{self, StreamExt};
 
-use super::session::Session;
-use crate::shared::http::Peer;
+use super::session::{Session, seconds_until};
 use crate::shared::run::seconds_since_1970;
 use crate::simulation::protocol;
-use crate::simulation::sessions::{Attachment, Resume, ToClient};
-use crate::simulation::slots;
+use crate::simulation::sessions::{ClientAction, Connection, Resume, ToClient, Token};
 
 impl Session {
     /// Waits for a client that may return; ends the session if it can't be resumed.
     pub(super) fn await_client(&mut self, ctx: &mut Context<Self>) {
         let absence = self.server.config.timing.absence;
-        if self.resumption.token.is_none() {
+        if self.token.is_none() {
             return ctx.stop();
         }
-        if self.resumption.deadline.is_some() {
+        if self.deadline.is_some() {
             return;
         }
-        if self.resumption.ended.is_none() {
+        if self.ended.is_none() {
             log::info!("{}: away; it may come back within {} s", self.name(), absence.as_secs());
             self.show_away(Some(seconds_since_1970() + absence.as_secs()));
         }
-        self.resumption.deadline = Some(ctx.run_later(absence, move |this, ctx| {
+        self.deadline = Some(ctx.run_later(absence, move |this, ctx| {
             log::info!("{}: has not come back within {} s", this.name(), absence.as_secs());
             ctx.stop();
         }));
@@ -32,28 +31,43 @@ impl Session {
 
     fn show_away(&self, until: Option<u64>) {
         if let Some(id) = self.id {
-            slots::update(&self.server.slots, id, move |one| one.away_until = until);
+            self.server.slots.update(id, |one| one.away_until = until);
         }
     }
 
-    /// Continues with another connection of its client, and closes the one before.
-    fn continue_with(&mut self, client: Recipient<ToClient>, peer: Peer, ctx: &mut Context<Self>) {
-        log::info!("{}: goes on as client {peer}", self.name());
+    /// Sends to this connection from now on, and obeys no earlier one any more.
+    pub(super) fn attach(&mut self, Connection { peer, client, mut actions }: Connection, ctx: &mut Context<Self>) {
+        let actions = stream::poll_fn(move |context| actions.poll_recv(context));
+        let (actions, attachment) = stream::abortable(actions.chain(stream::iter([ClientAction::Disconnect])));
+        ctx.add_stream(actions);
         self.peer = peer;
-        self.attachment += 1;
-        client.do_send(ToClient::Attached(Attachment::new(ctx.address().recipient(), self.attachment)));
+        if let Some(before) = self.attachment.replace(attachment) {
+            before.abort();
+        }
         if let Some(before) = self.client.replace(client) {
             before.do_send(ToClient::End(protocol::taken_over(), CloseCode::Normal));
         }
-        self.resumption.deadline.take().map(|deadline| ctx.cancel_future(deadline));
-        self.show_away(None);
-        let mut texts = Vec::from_iter(self.id.map(protocol::session));
-        texts.extend(self.resumption.texts(self.server.config.timeout, self.server.config.timing.absence));
-        if self.is_watched {
-            texts.push(protocol::watched(true));
+    }
+
+    /// Sends the client the URL of Webots, and what it can come back with.
+    pub(super) fn offer(&mut self, ctx: &mut Context<Self>) {
+        let Some(url) = &self.url else { return };
+        self.text(protocol::webots(url));
+        if self.resumable {
+            let registered = self.token.map(|token| token.number());
+            let number = registered.unwrap_or_else(|| self.server.sessions.register(ctx.address().recipient()));
+            let token = *self.token.insert(Token::new(number));
+            self.text(protocol::absence(self.server.config.timing.absence.as_secs()));
+            self.text(protocol::resume(&token));
         }
-        for text in texts {
-            self.text(text);
+    }
+
+    /// Why a client with this token may not return, as text for it; `None` if it may.
+    fn refusal(&self, token: &Token) -> Option<String> {
+        match &self.token {
+            None => Some(protocol::ended(None)),
+            Some(own) if own != token => Some(protocol::taken_over()),
+            Some(_) => self.ended.as_ref().map(|why| protocol::ended(Some(why))),
         }
     }
 }
@@ -61,11 +75,25 @@ impl Session {
 impl Handler<Resume> for Session {
     type Result = Result<(), String>;
 
-    fn handle(&mut self, Resume { token, client, peer }: Resume, ctx: &mut Self::Context) -> Self::Result {
-        if let Some(refusal) = self.resumption.refusal(&token) {
+    fn handle(&mut self, Resume { token, connection }: Resume, ctx: &mut Self::Context) -> Self::Result {
+        if let Some(refusal) = self.refusal(&token) {
             return Err(refusal);
         }
-        self.continue_with(client, peer, ctx);
+        log::info!("{}: goes on as client {}", self.name(), connection.peer);
+        self.attach(connection, ctx);
+        self.deadline.take().map(|deadline| ctx.cancel_future(deadline));
+        self.show_away(None);
+        self.id.into_iter().for_each(|id| self.text(protocol::session(id)));
+        let passed = self.launched.map_or(0, |launched| launched.elapsed().as_secs());
+        self.text(protocol::shutdown_timeout(self.server.config.timeout.saturating_sub(passed)));
+        self.texts.iter().for_each(|text| self.text(text.clone()));
+        self.offer(ctx);
+        if let Some(end) = self.idle_end {
+            self.text(protocol::idle(Some(seconds_until(end))));
+        }
+        if self.is_watched {
+            self.text(protocol::watched(true));
+        }
         Ok(())
     }
 }

@@ -9,43 +9,50 @@ use std::time::{Duration, Instant};
 
 use actix::prelude::*;
 use actix_web_actors::ws::CloseCode;
+use futures_util::stream::AbortHandle;
 
-use super::resumption::{Resumption, seconds_until};
 use super::state::{State, WebotsHandle};
 use crate::shared::http::Peer;
 use crate::shared::run::closing;
-use crate::simulation::checkout::Progress;
 use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::ends::EndReason;
 use crate::simulation::protocol::{self, Mode};
-use crate::simulation::sessions::{Attachment, ClientAction, FromClient, ToClient};
+use crate::simulation::sessions::{ClientAction, Connection, ToClient, Token};
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::slots::{Slot, SlotEvent};
 use crate::simulation::state::AppState;
-use crate::simulation::streams::Watched;
 use crate::simulation::webots::{Keep, ResetController, WebotsEvent, WebotsExit};
 
 /// The actor.
 pub struct Session {
     pub(super) server: Arc<AppState>,
     pub(super) peer: Peer,
-    /// Who has asked for it.
-    pub(super) identity: ClientIdentity,
     /// The id of the simulation, once there is one.
     pub(super) id: Option<SimulationId>,
     /// The connection of its client, until it has ended.
     pub(super) client: Option<Recipient<ToClient>>,
-    pub(super) attachment: u64,
+    /// Ends the attachment of that connection.
+    pub(super) attachment: Option<AbortHandle>,
     pub(super) state: State,
     /// How it is shown.
     pub(super) mode: Mode,
     /// Whether its client may resume it.
     pub(super) resumable: bool,
-    /// Whether Webots was ready.
-    pub(super) is_ready: bool,
-    /// What it keeps for a client that returns.
-    pub(super) resumption: Resumption,
+    /// The last token that the client got; `None` before it can return.
+    pub(super) token: Option<Token>,
+    /// When Webots was started: the time limit starts then.
+    pub(super) launched: Option<Instant>,
+    /// The texts that its project requests.
+    pub(super) texts: Vec<String>,
+    /// The URL of Webots, once it is ready.
+    pub(super) url: Option<String>,
+    /// When the simulation ends because it is paused, if it does.
+    pub(super) idle_end: Option<Instant>,
     pub(super) is_watched: bool,
+    /// The timer that ends the wait for the client, if there is one.
+    pub(super) deadline: Option<SpawnHandle>,
+    /// Why the simulation has ended, if it has.
+    pub(super) ended: Option<String>,
     /// The reset of a controller, while it runs.
     resetting: Option<SpawnHandle>,
 }
@@ -53,34 +60,38 @@ pub struct Session {
 /// Interval of `absence` messages to a client that may return, which show that the connection works.
 const SIGN_OF_LIFE: Duration = Duration::from_secs(4);
 
+/// How many seconds are left until then, rounded up.
+pub(super) fn seconds_until(then: Instant) -> u64 {
+    (then.saturating_duration_since(Instant::now()) + Duration::from_millis(999)).as_secs()
+}
+
 impl Session {
     /// Opens the session of a client that requests a simulation.
-    pub fn open(
-        server: Arc<AppState>,
-        (peer, identity): (Peer, ClientIdentity),
-        client: Recipient<ToClient>,
-        request: &protocol::Start,
-    ) -> Attachment {
-        let session = Self::create(|ctx| {
+    pub fn open(server: Arc<AppState>, identity: ClientIdentity, connection: Connection, request: &protocol::Start) {
+        Self::create(|ctx| {
             let mut session = Self {
+                resumable: request.resumable.unwrap_or_default() && !server.config.timing.absence.is_zero(),
                 server,
-                peer,
-                identity,
+                peer: connection.peer,
                 id: None,
-                client: Some(client),
-                attachment: 0,
+                client: None,
+                attachment: None,
                 state: State::Over,
                 mode: request.mode.unwrap_or_default(),
-                resumable: request.resumable.unwrap_or_default(),
-                is_ready: false,
-                resumption: Resumption::default(),
+                token: None,
+                launched: None,
+                texts: Vec::new(),
+                url: None,
+                idle_end: None,
                 is_watched: false,
+                deadline: None,
+                ended: None,
                 resetting: None,
             };
-            session.request_slot(&request.url, ctx);
+            session.attach(connection, ctx);
+            session.request_slot(&request.url, identity, ctx);
             session
         });
-        Attachment::new(session.recipient(), 0)
     }
 
     pub(super) fn name(&self) -> String {
@@ -110,7 +121,7 @@ impl Session {
         if let Some(client) = self.client.take() {
             client.do_send(ToClient::End(last_words, code));
         }
-        self.resumption.ended.get_or_insert_with(|| why.to_owned());
+        self.ended.get_or_insert_with(|| why.to_owned());
         self.await_client(ctx);
     }
 
@@ -135,7 +146,7 @@ impl Session {
 
     fn exited(&mut self, WebotsExit { clean, own, why }: &WebotsExit, ctx: &mut Context<Self>) {
         if *own {
-            return if self.is_ready { self.refer(why, ctx) } else { self.fail_own(why, ctx) };
+            return if self.url.is_some() { self.refer(why, ctx) } else { self.fail_own(why, ctx) };
         }
         let words = if *clean { protocol::loading(why) } else { protocol::error(why) };
         self.finish(words, why, CloseCode::Normal, ctx);
@@ -146,11 +157,11 @@ impl Actor for Session {
     type Context = Context<Self>;
 
     fn started(&mut self, ctx: &mut Self::Context) {
-        closing(self.server.phase.clone())
+        closing(self.server.phase.subscribe())
             .into_actor(self)
             .map(|(), this, ctx| {
                 this.state.end(EndReason::Stopped, "The server was stopped");
-                this.resumption = Resumption::default();
+                this.token = None;
                 this.finish(protocol::stopping(), "", CloseCode::Away, ctx);
             })
             .spawn(ctx);
@@ -172,13 +183,8 @@ impl Drop for Session {
     }
 }
 
-impl Handler<FromClient> for Session {
-    type Result = ();
-
-    fn handle(&mut self, FromClient { attachment, action }: FromClient, ctx: &mut Self::Context) {
-        if attachment != self.attachment {
-            return;
-        }
+impl StreamHandler<ClientAction> for Session {
+    fn handle(&mut self, action: ClientAction, ctx: &mut Self::Context) {
         match action {
             ClientAction::ResetController(file) => self.reset_controller(file, ctx),
             ClientAction::Keep => {
@@ -196,6 +202,8 @@ impl Handler<FromClient> for Session {
             }
         }
     }
+
+    fn finished(&mut self, _: &mut Self::Context) {}
 }
 
 impl Handler<SlotEvent> for Session {
@@ -206,15 +214,15 @@ impl Handler<SlotEvent> for Session {
             (SlotEvent::Granted(port), State::Waiting { world, lease }) => {
                 self.check_out(world, Slot { lease, port }, ctx);
             }
-            (SlotEvent::Rejected(why), State::Waiting { .. }) => {
-                self.count("full");
-                self.give_up(&why, ctx);
-            }
             (SlotEvent::Queued(ahead), state @ State::Waiting { .. }) => {
                 self.state = state;
                 for text in protocol::queue(ahead) {
                     self.text(text);
                 }
+            }
+            (SlotEvent::Watched(is_watched), state) => {
+                (self.state, self.is_watched) = (state, is_watched);
+                self.text(protocol::watched(is_watched));
             }
             (SlotEvent::AwayTooLong, state @ State::Launched(_)) if self.client.is_none() => {
                 let why = "Too many simulations waited for their clients, and this one had waited longest";
@@ -232,25 +240,6 @@ impl Handler<SlotEvent> for Session {
     }
 }
 
-impl Handler<Progress> for Session {
-    type Result = ();
-
-    fn handle(&mut self, Progress(text): Progress, _: &mut Self::Context) {
-        if matches!(self.state, State::CheckingOut(_)) {
-            self.hint(protocol::loading(&text));
-        }
-    }
-}
-
-impl Handler<Watched> for Session {
-    type Result = ();
-
-    fn handle(&mut self, Watched(is_watched): Watched, _: &mut Self::Context) {
-        self.is_watched = is_watched;
-        self.text(protocol::watched(is_watched));
-    }
-}
-
 impl Handler<WebotsEvent> for Session {
     type Result = ();
 
@@ -259,32 +248,28 @@ impl Handler<WebotsEvent> for Session {
             WebotsEvent::Progress(text) => self.hint(protocol::loading(&text)),
             WebotsEvent::Text(text) => {
                 let text = protocol::of_project(&text);
-                self.resumption.texts.push(text.clone());
+                self.texts.push(text.clone());
                 self.text(text);
             }
             WebotsEvent::Started => {
-                self.resumption.launched = Some(Instant::now());
+                self.launched = Some(Instant::now());
                 self.text(protocol::shutdown_timeout(self.server.config.timeout));
             }
             WebotsEvent::Listening(port, stream) => {
-                self.is_ready = true;
                 self.count("ready");
                 self.server.failed_starts.reset();
-                let url = self.server.config.stream_url(port, &stream.reveal());
-                self.text(protocol::webots(&url));
-                let absence = self.server.config.timing.absence;
-                if let Some(offer) = self.resumption.offer(url, absence) {
-                    for text in offer {
-                        self.text(text);
-                    }
+                self.url = Some(self.server.config.stream_url(port, &stream.reveal()));
+                self.offer(ctx);
+                if self.resumable {
+                    let absence = self.server.config.timing.absence.as_secs();
                     // A busy Webots sends nothing for a while, and its client would assume a lost connection.
-                    ctx.run_interval(SIGN_OF_LIFE, move |this, _| this.hint(protocol::absence(absence.as_secs())));
+                    ctx.run_interval(SIGN_OF_LIFE, move |this, _| this.hint(protocol::absence(absence)));
                 }
             }
             WebotsEvent::Heartbeat => self.hint(protocol::HEARTBEAT.to_owned()),
             WebotsEvent::Hanging(seconds) => self.hint(protocol::hanging(seconds)),
             WebotsEvent::IdleEnd(end) => {
-                self.resumption.idle_end = end;
+                self.idle_end = end;
                 self.text(protocol::idle(end.map(seconds_until)));
             }
             WebotsEvent::Exited(exit) => self.exited(&exit, ctx),

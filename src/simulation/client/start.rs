@@ -9,13 +9,15 @@ use actix_web_actors::ws::CloseCode;
 use super::session::Session;
 use super::state::{State, WebotsHandle};
 use crate::shared::domain::ProjectUrl;
-use crate::simulation::checkout::{Progress, Project};
+use crate::simulation::checkout::Project;
+use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::ends::EndReason;
 use crate::simulation::machine::sensors::Gpu;
 use crate::simulation::protocol;
 use crate::simulation::readiness;
+use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::slots::{Slot, SlotLease};
-use crate::simulation::webots::{LaunchSpec, Webots};
+use crate::simulation::webots::{LaunchSpec, Webots, WebotsEvent};
 
 impl Session {
     /// Counts a request for a simulation, for `/metrics`.
@@ -42,7 +44,7 @@ impl Session {
         self.refer(why, ctx);
     }
 
-    pub(super) fn request_slot(&mut self, url: &str, ctx: &mut Context<Self>) {
+    pub(super) fn request_slot(&mut self, url: &str, identity: ClientIdentity, ctx: &mut Context<Self>) {
         let admitted = if self.server.start_quota.take(self.peer.rate_limit_key()) {
             self.server.admit(url)
         } else {
@@ -55,12 +57,18 @@ impl Session {
                 return if self.server.takes_nobody() { self.refer(&why, ctx) } else { self.give_up(&why, ctx) };
             }
         };
-        let lease =
-            SlotLease::new(&self.server.slots, ctx.address().recipient(), &world, (self.peer, self.identity.clone()));
-        self.id = Some(lease.id());
-        self.text(protocol::session(lease.id()));
-        log::info!("{}: asks for {world}{}", self.name(), self.identity);
-        self.state = State::Waiting { world, lease };
+        let id = SimulationId::next();
+        self.id = Some(id);
+        self.text(protocol::session(id));
+        log::info!("{}: asks for {world}{identity}", self.name());
+        let (me, client) = (ctx.address().recipient(), (self.peer, identity));
+        match SlotLease::acquire(&self.server.slots, id, me, &world, client) {
+            Ok(lease) => self.state = State::Waiting { world, lease },
+            Err(why) => {
+                self.count("full");
+                self.give_up(&why, ctx);
+            }
+        }
     }
 
     pub(super) fn check_out(&mut self, world: ProjectUrl, slot: Slot, ctx: &mut Context<Self>) {
@@ -71,7 +79,7 @@ impl Session {
         };
         let me = ctx.address();
         // A full mailbox drops this line of progress.
-        let progress = move |text: String| drop(me.try_send(Progress(text)));
+        let progress = move |text: String| drop(me.try_send(WebotsEvent::Progress(text)));
         let job = self.server.checkouts.start(world, instance, progress);
         job.into_actor(self)
             .map(|result, this, ctx| match result {
@@ -100,9 +108,6 @@ impl Session {
             self.text(protocol::loading(warning));
         }
         self.text(protocol::loading("webots is starting"));
-        if self.resumable && !self.server.config.timing.absence.is_zero() {
-            self.resumption.number = Some(self.server.sessions.register(ctx.address().recipient()));
-        }
         let gpu = self.take_gpu(&slot.lease);
         let spec = LaunchSpec {
             config: Arc::clone(&self.server.config),
@@ -115,8 +120,6 @@ impl Session {
             mode: self.mode,
             gpu,
             slot,
-            streams: Arc::clone(&self.server.streams),
-            watched: ctx.address().recipient(),
             events: ctx.address().recipient(),
         };
         let webots = Webots::start_in_arbiter(self.server.webots_thread(spec.slot.port), |_| Webots::new(spec));
@@ -127,9 +130,9 @@ impl Session {
     fn take_gpu(&self, lease: &SlotLease) -> Option<Gpu> {
         let spread = self.server.spread.as_ref()?;
         let gpu = spread.take(&self.server.readings.borrow().gpus, Instant::now())?;
-        let (index, event) = (gpu.index, format!("it gets GPU {}, {}", gpu.index, gpu.name));
-        lease.update(move |one| one.gpu = Some(index));
-        lease.log(log::Level::Info, &event, event.clone());
+        let event = format!("it gets GPU {}, {}", gpu.index, gpu.name);
+        lease.update(|one| one.gpu = Some(gpu.index));
+        lease.log(log::Level::Info, &event, &event);
         Some(gpu)
     }
 }

@@ -8,6 +8,7 @@ use std::sync::Arc;
 
 use actix::prelude::*;
 use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
+use tokio::sync::mpsc::{UnboundedSender, unbounded_channel};
 
 use super::session::Session;
 use crate::shared::http::liveness::{self, Liveness};
@@ -16,7 +17,7 @@ use crate::shared::http::{ConnectionPermit, Peer};
 use crate::shared::run::closing;
 use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::protocol::{self, ClientRequest};
-use crate::simulation::sessions::{Attachment, ClientAction, Resume, ToClient, Token};
+use crate::simulation::sessions::{ClientAction, Connection, Resume, ToClient, Token};
 use crate::simulation::state::AppState;
 
 /// The actor.
@@ -25,21 +26,10 @@ pub struct WebClient {
     peer: Peer,
     /// The user name that a trusted reverse proxy sends.
     user: Option<String>,
-    session: Attached,
+    /// What its session obeys, once it has requested one.
+    session: Option<UnboundedSender<ClientAction>>,
     liveness: Liveness,
     _permit: ConnectionPermit,
-}
-
-/// Whether the client has a session.
-enum Attached {
-    /// It has not requested one yet.
-    No,
-    /// It has requested to resume one, and waits for the answer.
-    Resuming,
-    /// It has one.
-    To(Attachment),
-    /// It got its last text.
-    Over,
 }
 
 /// Limit of texts that wait for a slow client, from which on optional texts are dropped.
@@ -50,21 +40,28 @@ type Context = WebsocketContext<WebClient>;
 impl WebClient {
     /// A client that has just connected; `permit` counts it.
     pub fn new(server: Arc<AppState>, (peer, user): (Peer, Option<String>), permit: ConnectionPermit) -> Self {
-        Self { server, peer, user, session: Attached::No, liveness: Liveness::default(), _permit: permit }
+        Self { server, peer, user, session: None, liveness: Liveness::default(), _permit: permit }
     }
 
-    fn finish(&mut self, last_words: String, code: CloseCode, ctx: &mut Context) {
-        self.session = Attached::Over;
+    fn finish(last_words: String, code: CloseCode, ctx: &mut Context) {
         ctx.text(last_words);
         ctx.close(Some(CloseReason { code, description: None }));
         ctx.stop();
     }
 
-    /// Ends the simulation of a client that closes its connection regularly, or violates the protocol.
-    fn leave(&self) {
-        if let Attached::To(session) = &self.session {
-            session.send(ClientAction::Leave);
+    /// Has the client's session do this, if there is one.
+    fn send(&self, action: ClientAction) {
+        if let Some(session) = &self.session {
+            // A session that has ended has notified its client.
+            session.send(action).ok();
         }
+    }
+
+    /// The connection, for a session that this client requests.
+    fn attach(&mut self, ctx: &Context) -> Connection {
+        let (session, actions) = unbounded_channel();
+        self.session = Some(session);
+        Connection { peer: self.peer, client: ctx.address().recipient(), actions }
     }
 
     /// Requests from the session of a token to continue with this connection.
@@ -72,19 +69,16 @@ impl WebClient {
         let found = Token::parse(token).and_then(|token| Some((token, self.server.sessions.find(&token)?)));
         let Some((token, session)) = found else {
             log::info!("client {}: comes back to a simulation that has ended", self.peer);
-            return self.finish(protocol::ended(None), CloseCode::Normal, ctx);
+            return Self::finish(protocol::ended(None), CloseCode::Normal, ctx);
         };
-        self.session = Attached::Resuming;
-        let resumed = session.send(Resume { token, client: ctx.address().recipient(), peer: self.peer });
+        let resumed = session.send(Resume { token, connection: self.attach(ctx) });
         resumed
             .into_actor(self)
-            .map(|answer, this, ctx| match answer {
-                Ok(Ok(())) => {}
-                Ok(Err(refusal)) => {
+            .map(|answer, this, ctx| {
+                if let Err(refusal) = answer.unwrap_or_else(|_| Err(protocol::ended(None))) {
                     log::info!("client {}: does not come back: {refusal}", this.peer);
-                    this.finish(refusal, CloseCode::Normal, ctx);
+                    Self::finish(refusal, CloseCode::Normal, ctx);
                 }
-                Err(_) => this.finish(protocol::ended(None), CloseCode::Normal, ctx),
             })
             .spawn(ctx);
     }
@@ -94,21 +88,20 @@ impl WebClient {
             Ok(request) => request,
             Err(wrong) => {
                 log::info!("client {}: {wrong}", self.peer);
-                self.leave();
-                return self.finish(protocol::error(&wrong.to_string()), CloseCode::Normal, ctx);
+                self.send(ClientAction::Leave);
+                return Self::finish(protocol::error(&wrong.to_string()), CloseCode::Normal, ctx);
             }
         };
         match (request, &self.session) {
-            (ClientRequest { reset_controller: Some(file), .. }, Attached::To(session)) => {
-                session.send(ClientAction::ResetController(file));
+            (ClientRequest { reset_controller: Some(file), .. }, Some(_)) => {
+                self.send(ClientAction::ResetController(file));
             }
             (ClientRequest { reset_controller: Some(_), .. }, _) => ctx.text(protocol::nothing_to_reset()),
-            (ClientRequest { resume: Some(token), .. }, Attached::No) => self.resume(&token, ctx),
-            (ClientRequest { keep: true, .. }, Attached::To(session)) => session.send(ClientAction::Keep),
-            (ClientRequest { start: Some(start), .. }, Attached::No) => {
+            (ClientRequest { resume: Some(token), .. }, None) => self.resume(&token, ctx),
+            (ClientRequest { keep: true, .. }, Some(_)) => self.send(ClientAction::Keep),
+            (ClientRequest { start: Some(start), .. }, None) => {
                 let identity = ClientIdentity::new(self.user.as_deref(), start.name.as_deref());
-                let (server, client) = (Arc::clone(&self.server), ctx.address().recipient());
-                self.session = Attached::To(Session::open(server, (self.peer, identity), client, &start));
+                Session::open(Arc::clone(&self.server), identity, self.attach(ctx), &start);
             }
             _ => log::info!(
                 "client {}: a message that asks for nothing, or for a second simulation on one connection; ignored",
@@ -126,12 +119,12 @@ impl Actor for WebClient {
         ctx.set_mailbox_capacity(MAILBOX);
         let timing = &self.server.config.timing;
         liveness::watch(ctx, timing.ping, timing.silence, |client| &mut client.liveness);
-        closing(self.server.phase.clone())
+        closing(self.server.phase.subscribe())
             .into_actor(self)
             .map(|(), this, ctx| {
                 // A client with a session is notified by its session.
-                if matches!(this.session, Attached::No | Attached::Resuming) {
-                    this.finish(protocol::stopping(), CloseCode::Away, ctx);
+                if this.session.is_none() {
+                    Self::finish(protocol::stopping(), CloseCode::Away, ctx);
                 }
             })
             .spawn(ctx);
@@ -151,21 +144,21 @@ impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
             Ok(Message::Close(reason)) => {
                 // After any other close code, or none, the client may return.
                 if reason.as_ref().is_some_and(|reason| reason.code == CloseCode::Normal) {
-                    self.leave();
+                    self.send(ClientAction::Leave);
                 }
                 ctx.close(reason);
                 ctx.stop();
             }
             Ok(Message::Text(_) | Message::Ping(_)) => {
                 log::warn!("client {}: asks too much between two pings", self.peer);
-                self.leave();
-                self.finish(protocol::error("Too many requests on one connection"), CloseCode::Policy, ctx);
+                self.send(ClientAction::Leave);
+                Self::finish(protocol::error("Too many requests on one connection"), CloseCode::Policy, ctx);
             }
             other => {
                 let (problem, code) = wrong_message(other);
                 log::info!("client {}: {problem}", self.peer);
-                self.leave();
-                self.finish(protocol::error(&problem), code, ctx);
+                self.send(ClientAction::Leave);
+                Self::finish(protocol::error(&problem), code, ctx);
             }
         }
     }
@@ -176,9 +169,8 @@ impl Handler<ToClient> for WebClient {
 
     fn handle(&mut self, message: ToClient, ctx: &mut Self::Context) {
         match message {
-            ToClient::Attached(session) => self.session = Attached::To(session),
             ToClient::Text(text) => ctx.text(text),
-            ToClient::End(last_words, code) => self.finish(last_words, code, ctx),
+            ToClient::End(last_words, code) => Self::finish(last_words, code, ctx),
         }
     }
 }

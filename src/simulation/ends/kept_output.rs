@@ -82,9 +82,7 @@ fn files(folder: &Path) -> Vec<(SystemTime, PathBuf)> {
 
 /// The rotated file of an output.
 fn older(log: &Path) -> PathBuf {
-    let mut name = log.as_os_str().to_owned();
-    name.push(".1");
-    name.into()
+    log.with_extension("log.1")
 }
 
 /// The last lines of an output, from its rotated file and the newest one.

@@ -17,7 +17,7 @@ use super::gpus::Gpus;
 use super::sensors::{self, Gpu, GpuReading, GpuSensor, Host, Machine, MachineSensor};
 use super::spread::Spread;
 use crate::shared::domain::Load;
-use crate::simulation::slots::{GetSnapshot, SlotPool};
+use crate::simulation::slots::SlotPool;
 
 /// Interval between two samples.
 const PERIOD: Duration = Duration::from_secs(1);
@@ -98,7 +98,7 @@ struct GpusRead(GpuReading);
 
 /// The actor.
 pub struct LoadMonitor {
-    slots: Addr<SlotPool>,
+    slots: Arc<SlotPool>,
     published: watch::Sender<Arc<Readings>>,
     csv: Option<PathBuf>,
     csv_lines: usize,
@@ -112,7 +112,7 @@ impl LoadMonitor {
     /// Creates the actor. `disk` is a folder on the disk that is watched, `csv` the file that samples are written to,
     /// `spread` chooses the GPU of the next simulation; without it the least busy one counts for the load.
     pub fn new(
-        slots: Addr<SlotPool>,
+        slots: Arc<SlotPool>,
         disk: &Path,
         csv: Option<PathBuf>,
         spread: Option<Arc<Spread>>,
@@ -120,17 +120,6 @@ impl LoadMonitor {
         let (published, readings) = watch::channel(Arc::default());
         let (machine, disk, gpus) = (Machine::default(), disk.to_owned(), Gpus::default());
         (Self { slots, published, csv, csv_lines: 0, disk, machine, gpus, spread }, readings)
-    }
-
-    fn sample(&mut self, ctx: &mut Context<Self>) {
-        let snapshot = self.slots.send(GetSnapshot).timeout(PERIOD);
-        snapshot
-            .into_actor(self)
-            .map(|snapshot, this, _| {
-                let instances = snapshot.map(|snapshot| snapshot.instances).unwrap_or_default();
-                this.publish(instances.running, instances.idle);
-            })
-            .spawn(ctx);
     }
 
     fn publish(&mut self, running: u32, idle: u32) {
@@ -270,9 +259,10 @@ fn read_until_missing(actor: &Recipient<GpusRead>, sensor: &GpuSensor, most: &mu
 impl Handler<MachineRead> for LoadMonitor {
     type Result = ();
 
-    fn handle(&mut self, MachineRead(machine): MachineRead, ctx: &mut Self::Context) {
+    fn handle(&mut self, MachineRead(machine): MachineRead, _: &mut Self::Context) {
         self.machine = machine;
-        self.sample(ctx);
+        let instances = self.slots.instances();
+        self.publish(instances.running, instances.idle);
     }
 }
 
@@ -290,9 +280,9 @@ mod tests {
     use crate::shared::http::Metrics;
     use crate::simulation::ends::Ends;
 
-    fn slots() -> Addr<SlotPool> {
+    fn slots() -> Arc<SlotPool> {
         let ends = Ends::start(PathBuf::from("/nonexistent"), String::new(), &Metrics::default()).unwrap();
-        SlotPool::new(2001..=2001, 1, None, None, ends).start()
+        SlotPool::new(2001..=2001, 1, None, None, ends)
     }
 
     #[actix_rt::test]

@@ -15,7 +15,7 @@ const FORWARDED_HEADERS: [HeaderName; 4] =
 pub async fn fetch(upstream: &Upstream, url: &str, request: &HttpRequest, held: impl std::any::Any) -> HttpResponse {
     // A connection that is kept could lead to another simulation on the same port later.
     // Webots compares the names of headers letter by letter (WbTcpServer.cpp of R2025a).
-    let mut query = upstream.client().get(url).no_decompress().force_close().camel_case();
+    let mut query = upstream.client.get(url).no_decompress().force_close().camel_case();
     if let Some(tag) = request.headers().get(header::IF_NONE_MATCH) {
         query = query.insert_header((header::IF_NONE_MATCH, tag));
     }

@@ -8,7 +8,6 @@ use crate::simulation::sessions::Token;
 const PREFIX: &str = "/stream/";
 
 /// Splits a path, as the client has sent it, into the token and the path for Webots. `None` if either is invalid.
-#[must_use]
 pub fn parse_path(path: &str) -> Option<(Token, &str)> {
     let rest = path.strip_prefix(PREFIX)?;
     let (token, path) = rest.split_at(rest.find('/').unwrap_or(rest.len()));

@@ -23,17 +23,6 @@ pub enum End {
     Webots,
 }
 
-/// What a stream waits for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Progress {
-    /// For its ends.
-    Waiting,
-    /// For other streams to have their turn.
-    Interrupted,
-    /// For nothing: both directions have ended.
-    Ended,
-}
-
 /// A stream.
 pub struct Stream {
     client: TcpStream,
@@ -47,8 +36,6 @@ pub struct Stream {
 }
 
 struct Direction {
-    /// What was read before the stream began.
-    first: Bytes,
     /// What was read and is not yet written.
     pending: Bytes,
     source: Source,
@@ -70,15 +57,21 @@ pub enum Source {
 
 impl Stream {
     /// A stream between these. A client that is `read_only` can only request a kind of stream. `held` is dropped with it.
-    pub fn new(client: Connection, webots: Connection, read_only: bool, held: Box<dyn Send>) -> Self {
-        Self {
-            client: client.0,
-            webots: webots.0,
-            up: Direction::new(client.1),
-            down: Direction::new(webots.1),
-            view_requests: read_only.then(ViewRequests::default),
-            _held: held,
+    ///
+    /// # Errors
+    /// When such a client has closed its end already, or violates the protocol.
+    pub fn new(
+        (client, mut sent): Connection,
+        (webots, answered): Connection,
+        read_only: bool,
+        held: Box<dyn Send>,
+    ) -> io::Result<Self> {
+        let mut view_requests = read_only.then(ViewRequests::default);
+        if let Some(requests) = &mut view_requests {
+            sent = requests.filter(&sent, !answered.is_empty())?;
         }
+        let (up, down) = (Direction::new(sent), Direction::new(answered));
+        Ok(Self { client, webots, up, down, view_requests, _held: held })
     }
 
     /// The connection of an end.
@@ -98,28 +91,29 @@ impl Stream {
         direction.source = direction.source.max(source);
     }
 
-    /// Copies what can be copied in both directions.
-    pub fn copy(&mut self, buffer: &mut [u8]) -> Progress {
+    /// Copies what can be copied in both directions. Returns whether it was interrupted for other streams to have their turn.
+    pub fn copy(&mut self, buffer: &mut [u8]) -> bool {
         let down = self.down.copy(&self.webots, &self.client, None, buffer);
         let requests = self.view_requests.as_mut().map(|requests| (requests, self.down.has_begun));
         let up = self.up.copy(&self.client, &self.webots, requests, buffer);
-        match (up, down) {
-            (Progress::Ended, Progress::Ended) => Progress::Ended,
-            (Progress::Interrupted, _) | (_, Progress::Interrupted) => Progress::Interrupted,
-            _ => Progress::Waiting,
-        }
+        up || down
     }
 
     /// Whether a direction has ended.
     pub fn is_closing(&self) -> bool {
         self.up.has_ended || self.down.has_ended
     }
+
+    /// Whether both directions have ended.
+    pub fn has_ended(&self) -> bool {
+        self.up.has_ended && self.down.has_ended
+    }
 }
 
 impl Direction {
-    fn new(first: Bytes) -> Self {
-        let pending = Bytes::new();
-        Self { first, pending, source: Source::Readable, has_begun: false, has_ended: false }
+    /// A direction of which this was read before the stream began.
+    fn new(pending: Bytes) -> Self {
+        Self { source: Source::Readable, has_begun: !pending.is_empty(), has_ended: false, pending }
     }
 
     fn copy(
@@ -128,15 +122,15 @@ impl Direction {
         to: &TcpStream,
         requests: Option<(&mut ViewRequests, bool)>,
         buffer: &mut [u8],
-    ) -> Progress {
+    ) -> bool {
         if self.has_ended {
-            return Progress::Ended;
+            return false;
         }
         self.try_copy(from, to, requests, buffer).unwrap_or_else(|_| {
             self.has_ended = true;
             // An error: it has closed, too.
             to.shutdown(Shutdown::Write).ok();
-            Progress::Ended
+            false
         })
     }
 
@@ -147,12 +141,12 @@ impl Direction {
         to: &TcpStream,
         mut requests: Option<(&mut ViewRequests, bool)>,
         buffer: &mut [u8],
-    ) -> io::Result<Progress> {
+    ) -> io::Result<bool> {
         for _ in 0..MAX_READS {
             let written = write(to, &self.pending)?;
             drop(self.pending.split_to(written));
             if !self.pending.is_empty() || self.source == Source::Empty {
-                return Ok(Progress::Waiting);
+                return Ok(false);
             }
             let length = self.read(from, buffer)?;
             let read = buffer.get(..length).unwrap_or_default();
@@ -165,17 +159,11 @@ impl Direction {
                 self.pending = Bytes::copy_from_slice(rest);
             }
         }
-        Ok(Progress::Interrupted)
+        Ok(true)
     }
 
     /// Returns how much was read: nothing if the source has to be waited for.
     fn read(&mut self, mut from: &TcpStream, buffer: &mut [u8]) -> io::Result<usize> {
-        if !self.first.is_empty() {
-            let length = self.first.as_ref().read(buffer)?;
-            drop(self.first.split_to(length));
-            self.has_begun = true;
-            return Ok(length);
-        }
         match from.read(buffer) {
             Ok(0) => Err(ErrorKind::UnexpectedEof.into()),
             Ok(length) => {

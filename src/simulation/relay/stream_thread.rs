@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use nix::sys::epoll::{Epoll, EpollCreateFlags, EpollEvent, EpollFlags, EpollTimeout};
 use parking_lot::Mutex;
 
-use super::stream::{End, Progress, Source, Stream};
+use super::stream::{End, Source, Stream};
 
 /// Size of the buffer that all streams share, in bytes. What one end does not take at once of it is kept for that stream.
 const BUFFER: usize = 64 * 1024;
@@ -104,14 +104,14 @@ impl Copier {
             stream.note(end, source);
         }
         let was_closing = stream.is_closing();
-        let progress = stream.copy(&mut self.buffer);
+        let is_interrupted = stream.copy(&mut self.buffer);
         if !was_closing && stream.is_closing() {
             self.closing.push_back((Instant::now() + CLOSE_TIMEOUT, number));
         }
-        match progress {
-            Progress::Ended => drop(streams.remove(&number)),
-            Progress::Interrupted => drop(self.interrupted.insert(number)),
-            Progress::Waiting => {}
+        if stream.has_ended() {
+            streams.remove(&number);
+        } else if is_interrupted {
+            self.interrupted.insert(number);
         }
     }
 

@@ -26,16 +26,17 @@ pub const ANSWER_TIMEOUT: Duration = Duration::from_secs(10);
 /// Reaches simulations on this machine.
 #[derive(Clone)]
 pub struct Upstream {
-    client: awc::Client,
+    /// Fetches what it serves.
+    pub(super) client: awc::Client,
     address: IpAddr,
-    stream_thread: StreamThread,
+    /// Copies all streams.
+    pub(super) stream_thread: StreamThread,
     silence: Duration,
 }
 
 impl Upstream {
     /// Reaches them at this address. Streams are copied on this thread. A simulation has `silence` to read what was sent to
     /// it: until then nobody notices that its client has left.
-    #[must_use]
     pub fn new(address: IpAddr, stream_thread: StreamThread, silence: Duration) -> Self {
         let connector = awc::Connector::new().limit(0);
         // Redirects are not followed, and an answer may take as long as the simulation.
@@ -43,20 +44,7 @@ impl Upstream {
         Self { client: client.no_default_headers().finish(), address, stream_thread, silence }
     }
 
-    /// The client.
-    #[must_use]
-    pub fn client(&self) -> &awc::Client {
-        &self.client
-    }
-
-    /// The thread of all streams.
-    #[must_use]
-    pub fn stream_thread(&self) -> &StreamThread {
-        &self.stream_thread
-    }
-
     /// The URL of a path and a query at the port of a simulation.
-    #[must_use]
     pub fn url(&self, port: u16, path: &str, query: Option<&str>) -> String {
         let (mark, query) = query.map_or(("", ""), |query| ("?", query));
         format!("http://{}{path}{mark}{query}", SocketAddr::from((self.address, port)))

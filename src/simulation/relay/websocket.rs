@@ -27,14 +27,14 @@ pub async fn connect(
         Err(_) => return HttpResponse::GatewayTimeout().body("Error: the simulation does not answer."),
     };
     let upgraded = upgrade::on(request);
-    let stream_thread = upstream.stream_thread().clone();
+    let stream_thread = upstream.stream_thread.clone();
     actix_rt::spawn(async move {
         // An error: the client has left before the answer.
         let Ok(client) = upgraded.await else { return };
         let (Ok(to_client), Ok(to_webots)) = (client.tcp.into_std(), webots.into_std()) else { return };
         let client_end = (to_client, client.read_buffer.into());
         let stream = Stream::new(client_end, (to_webots, from_webots), read_only, Box::new((held, client.permit)));
-        if let Err(error) = stream_thread.add(stream) {
+        if let Err(error) = stream.and_then(|stream| stream_thread.add(stream)) {
             log::warn!("a stream is not relayed: {error}");
         }
     });

@@ -4,6 +4,6 @@ mod attachment;
 mod sessions;
 mod token;
 
-pub use attachment::{Attachment, ClientAction, FromClient, ToClient};
+pub use attachment::{ClientAction, Connection, ToClient};
 pub use sessions::{Resume, Sessions};
 pub use token::Token;

@@ -5,9 +5,8 @@ use std::collections::HashMap;
 use actix::prelude::*;
 use parking_lot::Mutex;
 
-use super::attachment::ToClient;
+use super::attachment::Connection;
 use super::token::Token;
-use crate::shared::http::Peer;
 
 /// Asks a session to continue with another connection, which is then attached to it. The answer is the reason of a
 /// refusal, as text for the client.
@@ -17,9 +16,7 @@ pub struct Resume {
     /// The token that proves that the session belongs to the client.
     pub token: Token,
     /// The client's new connection.
-    pub client: Recipient<ToClient>,
-    /// The client's current address.
-    pub peer: Peer,
+    pub connection: Connection,
 }
 
 /// The registered sessions, by number.

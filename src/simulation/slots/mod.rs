@@ -1,13 +1,14 @@
-//! The slots that clients wait for: leases, the queue, and the limit per address.
+//! The slots that clients wait for: leases, the queue, and the limit per address; the streams of simulations that have one.
 
-mod messages;
+mod access;
 mod party;
 mod present;
 mod slot_event;
 mod slot_lease;
 mod slot_pool;
+mod stream;
 
-pub use messages::{GetSnapshot, StopOne};
 pub use slot_event::SlotEvent;
-pub use slot_lease::{Slot, SlotLease, update};
+pub use slot_lease::{Slot, SlotLease};
 pub use slot_pool::SlotPool;
+pub use stream::StreamTarget;

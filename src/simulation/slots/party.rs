@@ -9,23 +9,9 @@ pub(super) enum Party {
     User(String),
 }
 
-/// How many slots a party has or may have, and how many of its clients wait or may wait.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Share {
-    pub slots: usize,
-    pub waiting: usize,
-}
-
-impl Share {
-    /// Whether a party with this share may have no further client.
-    pub(super) fn is_used_up(self, has: Self) -> bool {
-        has.waiting >= self.waiting && (has.slots >= self.slots || has.waiting > 0)
-    }
-}
-
 impl Party {
     /// Why it gets no other slot, as text for the client: it has so many, and so many of its clients wait.
-    pub(super) fn refusal(&self, Share { slots, waiting }: Share) -> String {
+    pub(super) fn refusal(&self, slots: usize, waiting: usize) -> String {
         let (have, more) = match self {
             Self::Address(_) => ("Clients of your address have", "more"),
             Self::User(_) => ("You have", "more clients of yours"),

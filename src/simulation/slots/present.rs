@@ -5,6 +5,7 @@ use std::time::SystemTime;
 
 use actix::Recipient;
 
+use super::access::Access;
 use super::party::Party;
 use super::slot_event::SlotEvent;
 use crate::shared::http::Peer;
@@ -23,6 +24,8 @@ pub(super) struct Present {
     pub shown: Simulation,
     /// Its client, which counts for its address.
     pub client: Peer,
+    /// The tokens that lead to its stream, while there is one.
+    pub accesses: Vec<Access>,
     /// How it ends. Only the first report counts.
     pub how: Option<End>,
     events: Vec<String>,
@@ -37,7 +40,8 @@ impl Present {
     /// A simulation that a client has just asked for.
     pub(super) fn new(shown: Simulation, client: Peer, listener: Recipient<SlotEvent>) -> Self {
         let event = format!("its client asks for {}", shown.world);
-        let mut present = Self { sent_position: None, listener, shown, client, how: None, events: Vec::new() };
+        let mut present =
+            Self { sent_position: None, listener, shown, client, accesses: Vec::new(), how: None, events: Vec::new() };
         present.note(&event);
         present
     }

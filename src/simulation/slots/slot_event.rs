@@ -10,8 +10,8 @@ pub enum SlotEvent {
     Queued(usize),
     /// This port may be used until the lease is dropped.
     Granted(u16),
-    /// The slots and the queue are full, or the address or the user has reached its limit: why, in words for the client.
-    Rejected(String),
+    /// The first watcher of the simulation connects, or the last one leaves.
+    Watched(bool),
     /// Too many simulations wait for disconnected clients, and this one has waited longest: it must end.
     AwayTooLong,
     /// The administrator stops the simulation; the words are for its client.

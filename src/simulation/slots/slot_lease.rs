@@ -1,8 +1,9 @@
 //! What the owner of a simulation holds: its slot, or its position in the queue for one.
 
-use actix::prelude::*;
+use std::sync::Arc;
 
-use super::messages::{Acquire, Release, Update};
+use actix::Recipient;
+
 use super::present::Present;
 use super::slot_event::SlotEvent;
 use super::slot_pool::SlotPool;
@@ -14,14 +15,12 @@ use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::snapshot::Simulation;
 
 /// A slot, or a position in the queue for one. Dropping it releases it.
-#[derive(Debug)]
 pub struct SlotLease {
     id: SimulationId,
-    slots: Addr<SlotPool>,
+    slots: Arc<SlotPool>,
 }
 
 /// A port for one simulation, with its lease.
-#[derive(Debug)]
 pub struct Slot {
     /// Frees the slot when it is dropped.
     pub lease: SlotLease,
@@ -29,23 +28,21 @@ pub struct Slot {
     pub port: u16,
 }
 
-/// Changes what pages show of a simulation, if it has not ended.
-pub fn update(slots: &Addr<SlotPool>, id: SimulationId, change: impl FnOnce(&mut Simulation) + Send + 'static) {
-    slots.do_send(Update(id, Box::new(|present| change(&mut present.shown))));
-}
-
 impl SlotLease {
     /// Joins the queue for a slot. `listener` receives the events, `world` is shown, and the client counts for its address and
     /// its user.
-    pub fn new(
-        slots: &Addr<SlotPool>,
+    ///
+    /// # Errors
+    /// Why it may not wait, as text for the client.
+    pub fn acquire(
+        slots: &Arc<SlotPool>,
+        id: SimulationId,
         listener: Recipient<SlotEvent>,
         world: &ProjectUrl,
         (client, identity): (Peer, ClientIdentity),
-    ) -> Self {
-        let id = SimulationId::next();
-        slots.do_send(Acquire(Box::new(Present::new(Simulation::new(id, world, identity), client, listener))));
-        Self { id, slots: slots.clone() }
+    ) -> Result<Self, String> {
+        slots.acquire(Present::new(Simulation::new(id, world, identity), client, listener))?;
+        Ok(Self { id, slots: Arc::clone(slots) })
     }
 
     /// The id of the simulation.
@@ -53,29 +50,32 @@ impl SlotLease {
         self.id
     }
 
+    pub(super) fn change(&self, change: impl FnOnce(&mut Present)) {
+        self.slots.change(self.id, change);
+    }
+
     /// Changes what pages show of the simulation.
-    pub fn update(&self, change: impl FnOnce(&mut Simulation) + Send + 'static) {
-        update(&self.slots, self.id, change);
+    pub fn update(&self, change: impl FnOnce(&mut Simulation)) {
+        self.slots.update(self.id, change);
     }
 
     /// Logs an event of the simulation under its id, and records what everybody may read of it.
-    pub fn log(&self, level: log::Level, event: &str, shown: String) {
+    pub fn log(&self, level: log::Level, event: &str, shown: &str) {
         log::log!(target: "simulation", level, "{}: {event}", self.id);
-        self.slots.do_send(Update(self.id, Box::new(move |present| present.note(&shown))));
+        self.change(|present| present.note(shown));
     }
 
-    /// Reports how the simulation ends, before the lease is dropped. Only the first report counts.
+    /// Reports how the simulation ends, before the lease is dropped. Only the first report counts. Its stream is closed.
     pub fn end(&self, reason: EndReason, why: &str, taken: Taken) {
-        let end = End { reason, why: why.to_owned(), taken };
-        let record = |present: &mut Present| {
-            present.how.get_or_insert(end);
-        };
-        self.slots.do_send(Update(self.id, Box::new(record)));
+        self.change(|present| {
+            present.accesses.clear();
+            present.how.get_or_insert(End { reason, why: why.to_owned(), taken });
+        });
     }
 }
 
 impl Drop for SlotLease {
     fn drop(&mut self) {
-        self.slots.do_send(Release(self.id));
+        self.slots.release(self.id);
     }
 }

@@ -1,29 +1,29 @@
-//! Actor: leases slots to simulations, keeps the queue, and knows all simulations of this server.
+//! Leases slots to simulations, keeps the queue, and knows all simulations of this server.
 //!
-//! One for the whole server, created at start; it never ends. A slot is a streaming port. A session creates a
-//! [`SlotLease`](super::SlotLease), and receives its position in the queue until a port is granted. Dropping the lease
-//! leaves the queue or frees the port, so that neither leaks in any state or after any panic.
+//! One for the whole server. A slot is a streaming port. A session creates a [`SlotLease`](super::SlotLease), and
+//! receives its position in the queue until a port is granted. Dropping the lease leaves the queue or frees the port, so
+//! that neither leaks in any state or after any panic.
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::io::ErrorKind;
 use std::net::{Ipv4Addr, Ipv6Addr, TcpListener};
 use std::ops::RangeInclusive;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use actix::prelude::*;
-
-use super::messages::{Acquire, GetSnapshot, Release, StopOne, Update};
-use super::party::{Party, Share};
+use super::party::Party;
 use super::present::Present;
 use super::slot_event::SlotEvent;
 use crate::shared::domain::Instances;
 use crate::simulation::ends::Ends;
 use crate::simulation::simulation_id::SimulationId;
-use crate::simulation::snapshot::{Snapshot, Stage};
+use crate::simulation::snapshot::{Simulation, Snapshot, Stage};
 
-/// The actor.
-pub struct SlotPool {
+/// The slots of this server, and the simulations that have one or wait for one.
+pub struct SlotPool(Mutex<Slots>);
+
+pub(super) struct Slots {
     ports: RangeInclusive<u16>,
     queue_capacity: usize,
     per_address: Option<usize>,
@@ -31,7 +31,7 @@ pub struct SlotPool {
     /// Number of leases that were requested, including those of clients that were refused.
     arrivals: u64,
     /// All simulations in the order in which they were requested. Those without a port are the queue.
-    present: BTreeMap<SimulationId, Present>,
+    pub(super) present: BTreeMap<SimulationId, Present>,
     ends: Ends,
 }
 
@@ -47,10 +47,90 @@ impl SlotPool {
         per_address: Option<usize>,
         per_user: Option<usize>,
         ends: Ends,
-    ) -> Self {
-        Self { ports, queue_capacity, per_address, per_user, arrivals: 0, present: BTreeMap::new(), ends }
+    ) -> Arc<Self> {
+        let present = BTreeMap::new();
+        Arc::new(Self(Mutex::new(Slots { ports, queue_capacity, per_address, per_user, arrivals: 0, present, ends })))
     }
 
+    pub(super) fn slots(&self) -> MutexGuard<'_, Slots> {
+        // After a panic the server ends: `recheck` notices it.
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Checks again each second which ports other programs have left. Ends once a panic has left the slots in disorder.
+    pub async fn recheck(self: Arc<Self>) {
+        while !self.0.is_poisoned() {
+            actix_rt::time::sleep(RECHECK).await;
+            self.slots().serve();
+        }
+    }
+
+    /// Has a simulation wait for a slot, and grants it one if it is its turn.
+    ///
+    /// # Errors
+    /// Why it may not wait, as text for the client: the slots and the queue are full, or its address or its user has
+    /// reached its limit.
+    pub(super) fn acquire(&self, present: Present) -> Result<(), String> {
+        let mut slots = self.slots();
+        slots.arrivals += 1;
+        let (id, refusal) = (present.shown.id, slots.refusal(&present.parties()));
+        slots.present.insert(id, present);
+        slots.grant();
+        if let Some(refusal) = refusal
+            && slots.queue().any(|one| one.shown.id == id)
+        {
+            slots.present.remove(&id);
+            return Err(refusal);
+        }
+        slots.serve();
+        Ok(())
+    }
+
+    /// Frees the slot of a simulation, or its position in the queue.
+    pub(super) fn release(&self, id: SimulationId) {
+        let mut slots = self.slots();
+        if let Some(present) = slots.present.remove(&id) {
+            slots.ends.record(present.ended());
+        }
+        slots.serve();
+    }
+
+    /// Changes the record of a simulation, if it has not ended.
+    pub(super) fn change(&self, id: SimulationId, change: impl FnOnce(&mut Present)) {
+        let mut slots = self.slots();
+        if let Some(present) = slots.present.get_mut(&id) {
+            change(present);
+            slots.end_longest_away();
+        }
+    }
+
+    /// Changes what pages show of a simulation, if it has not ended.
+    pub fn update(&self, id: SimulationId, change: impl FnOnce(&mut Simulation)) {
+        self.change(id, |present| change(&mut present.shown));
+    }
+
+    /// Stops the simulation that has this id now, and no other one: `why` is for its client. Returns whether there is
+    /// one.
+    pub fn stop(&self, id: &str, why: String) -> bool {
+        let slots = self.slots();
+        let found = slots.present.values().find(|one| one.shown.id.to_string() == id);
+        found.inspect(|one| one.listener.do_send(SlotEvent::Stopped(why))).is_some()
+    }
+
+    /// The numbers of simulations by state.
+    pub fn instances(&self) -> Instances {
+        self.slots().instances()
+    }
+
+    /// All simulations at this moment.
+    pub fn snapshot(&self) -> Snapshot {
+        let slots = self.slots();
+        let simulations = slots.present.values().map(|one| one.shown.clone()).collect();
+        Snapshot { instances: slots.instances(), simulations }
+    }
+}
+
+impl Slots {
     fn queue(&self) -> impl Iterator<Item = &Present> {
         self.present.values().filter(|one| one.shown.port.is_none())
     }
@@ -61,33 +141,36 @@ impl SlotPool {
         for party in self.present.values().filter(|one| one.shown.port.is_some()).flat_map(Present::parties) {
             *lent.entry(party).or_default() += 1;
         }
-        let may_have_one = |party: &Party| lent.get(party).is_none_or(|slots| *slots < self.limit(party).slots);
+        let may_have_one = |party: &Party| {
+            let slots = lent.get(party).copied().unwrap_or_default();
+            self.limit(party).is_none_or(|most| slots < most)
+        };
         self.queue().find(|waiting| waiting.parties().iter().all(may_have_one)).map(|waiting| waiting.shown.id)
     }
 
-    /// What the clients of a party may have.
-    fn limit(&self, party: &Party) -> Share {
-        let slots = match party {
+    /// How many slots the clients of a party may have; `None` for all of them.
+    fn limit(&self, party: &Party) -> Option<usize> {
+        match party {
             Party::Address(_) => self.per_address,
             Party::User(_) => self.per_user,
-        };
-        let Some(slots) = slots else { return Share { slots: usize::MAX, waiting: usize::MAX } };
-        let all = self.ports.len();
-        Share { slots, waiting: (self.queue_capacity * slots.min(all)).div_ceil(all) }
+        }
     }
 
-    /// What the clients of a party have.
-    fn share_of(&self, party: &Party) -> Share {
+    /// Why another client of this party may not wait, if so: the party has its slots, or its clients wait for them, and as
+    /// many wait as in its share of the queue.
+    fn refusal_of(&self, party: &Party) -> Option<String> {
+        let (most, all) = (self.limit(party)?, self.ports.len());
         let present = self.present.values().filter(|one| one.parties().contains(party));
         let (lent, waiting): (Vec<_>, Vec<_>) = present.partition(|one| one.shown.port.is_some());
-        Share { slots: lent.len(), waiting: waiting.len() }
+        let (lent, waiting) = (lent.len(), waiting.len());
+        let is_used_up = waiting >= (self.queue_capacity * most.min(all)).div_ceil(all);
+        (is_used_up && (lent >= most || waiting > 0)).then(|| party.refusal(lent, waiting))
     }
 
     /// Why another client of these parties may not wait, if so, as text for it.
     fn refusal(&self, parties: &[Party]) -> Option<String> {
-        let mut shares = parties.iter().map(|party| (party, self.limit(party), self.share_of(party)));
-        if let Some((party, _, has)) = shares.find(|(_, may, has)| may.is_used_up(*has)) {
-            return Some(party.refusal(has));
+        if let Some(refusal) = parties.iter().find_map(|party| self.refusal_of(party)) {
+            return Some(refusal);
         }
         let (places, waiting) = (self.ports.len(), self.queue().count());
         let full = || {
@@ -163,70 +246,4 @@ fn is_free(port: u16) -> bool {
     let is_taken = |error: std::io::Error| error.kind() == ErrorKind::AddrInUse;
     TcpListener::bind((Ipv4Addr::UNSPECIFIED, port)).is_ok()
         && !TcpListener::bind((Ipv6Addr::UNSPECIFIED, port)).is_err_and(is_taken)
-}
-
-impl Actor for SlotPool {
-    type Context = Context<Self>;
-
-    fn started(&mut self, ctx: &mut Self::Context) {
-        ctx.run_interval(RECHECK, |slots, _| slots.serve());
-    }
-}
-
-impl Handler<Acquire> for SlotPool {
-    type Result = ();
-
-    fn handle(&mut self, Acquire(present): Acquire, _: &mut Self::Context) {
-        self.arrivals += 1;
-        let (id, refusal) = (present.shown.id, self.refusal(&present.parties()));
-        self.present.insert(id, *present);
-        self.grant();
-        if let Some(refusal) = refusal
-            && self.present.get(&id).is_some_and(|one| one.shown.port.is_none())
-            && let Some(refused) = self.present.remove(&id)
-        {
-            refused.listener.do_send(SlotEvent::Rejected(refusal));
-        }
-        self.serve();
-    }
-}
-
-impl Handler<Release> for SlotPool {
-    type Result = ();
-
-    fn handle(&mut self, Release(id): Release, _: &mut Self::Context) {
-        if let Some(present) = self.present.remove(&id) {
-            self.ends.record(present.ended());
-        }
-        self.serve();
-    }
-}
-
-impl Handler<Update> for SlotPool {
-    type Result = ();
-
-    fn handle(&mut self, Update(id, change): Update, _: &mut Self::Context) {
-        if let Some(present) = self.present.get_mut(&id) {
-            change(present);
-            self.end_longest_away();
-        }
-    }
-}
-
-impl Handler<StopOne> for SlotPool {
-    type Result = bool;
-
-    fn handle(&mut self, StopOne { id, why }: StopOne, _: &mut Self::Context) -> bool {
-        let found = self.present.values().find(|one| one.shown.id.to_string() == id);
-        found.inspect(|one| one.listener.do_send(SlotEvent::Stopped(why))).is_some()
-    }
-}
-
-impl Handler<GetSnapshot> for SlotPool {
-    type Result = Snapshot;
-
-    fn handle(&mut self, _: GetSnapshot, _: &mut Self::Context) -> Snapshot {
-        let simulations = self.present.values().map(|one| one.shown.clone()).collect();
-        Snapshot { instances: self.instances(), simulations }
-    }
 }

@@ -5,13 +5,10 @@ use actix_web::http::header;
 use actix_web::{HttpRequest, HttpResponse, web};
 use serde::Deserialize;
 
-use super::queries::ask;
 use crate::shared::http::routing::{GET, POST, path};
 use crate::shared::http::{body, refuse_action, require_administrator};
-use crate::shared::run::ServerCommand;
 use crate::shared::text::excerpt;
 use crate::simulation::protocol;
-use crate::simulation::slots::StopOne;
 use crate::simulation::state::AppState;
 
 /// Longest reason, in characters.
@@ -40,10 +37,8 @@ async fn drain(request: HttpRequest, server: web::Data<AppState>) -> HttpRespons
     if let Some(refusal) = refusal(&request, &server) {
         return refusal;
     }
-    match server.requests.try_send(ServerCommand::Drain) {
-        Ok(()) => HttpResponse::Accepted().body("draining"),
-        Err(error) => HttpResponse::ServiceUnavailable().body(format!("Error: {error}.")),
-    }
+    server.drain();
+    HttpResponse::Accepted().body("draining")
 }
 
 /// Stops one simulation, and no other one that comes in its place: an id is never used again.
@@ -61,7 +56,7 @@ async fn stop(
         Err(refusal) => return Ok(refusal),
     };
     let (id, reason) = (id.into_inner(), excerpt(reason.trim(), MAX_REASON_LENGTH));
-    if !ask(&server, StopOne { id: id.clone(), why: protocol::stopped_by_teacher(&reason) }).await? {
+    if !server.slots.stop(&id, protocol::stopped_by_teacher(&reason)) {
         return Err(ErrorNotFound("Error: there is no such simulation; it may have ended."));
     }
     let peer = server.config.trusted_proxies.peer(&request);

@@ -23,12 +23,11 @@ impl Visitor {
     /// # Errors
     /// When its address has sent too many passwords: the page must not pass for that of a stranger.
     pub fn of(request: &HttpRequest, server: &AppState) -> Result<Self, AuthError> {
-        let peer = server.config.trusted_proxies.peer(request);
-        match server.admin_auth.as_ref().map(|auth| auth.check(request, peer)) {
-            None => Ok(Self::Anybody),
-            Some(Ok(())) => Ok(Self::Administrator),
-            Some(Err(AuthError::NoPassword)) => Ok(Self::Stranger),
-            Some(Err(error @ AuthError::TooMany)) => Err(error),
+        let Some(auth) = &server.admin_auth else { return Ok(Self::Anybody) };
+        match auth.check(request, server.config.trusted_proxies.peer(request)) {
+            Ok(()) => Ok(Self::Administrator),
+            Err(AuthError::NoPassword) => Ok(Self::Stranger),
+            Err(AuthError::TooMany) => Err(AuthError::TooMany),
         }
     }
 

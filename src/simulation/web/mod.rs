@@ -6,11 +6,9 @@ mod metrics;
 mod origins;
 mod page_routes;
 mod pages;
-mod queries;
 mod routes;
 mod status;
 mod stream_routes;
-mod watch_routes;
 mod webots_viewer;
 
 pub use routes::configure;

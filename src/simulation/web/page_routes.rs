@@ -1,4 +1,5 @@
-//! Routes of the simulation server's page, with its assets and event stream, and of Webots' own viewer.
+//! Routes of the simulation server's pages, with their assets and event stream, and of Webots' own viewer: the monitor, and
+//! the page on which an administrator watches a simulation.
 
 use std::collections::BTreeMap;
 
@@ -6,20 +7,19 @@ use actix_files::NamedFile;
 use actix_web::error::ErrorNotFound;
 use actix_web::http::header::{self, HeaderValue};
 use actix_web::{HttpRequest, HttpResponse, web};
+use askama::Template;
 use serde::Deserialize;
 
 use super::administrator::Visitor;
 use super::pages;
-use super::queries::ask;
 use super::webots_viewer;
 use crate::asset;
 use crate::shared::http::assets::{self, Asset};
 use crate::shared::http::routing::{GET, READ, path};
-use crate::shared::http::{ConnectionKind, ContentSecurityPolicy, html};
+use crate::shared::http::{ConnectionKind, ContentSecurityPolicy, PageView, html, own_sources, require_administrator};
 use crate::simulation::container;
 use crate::simulation::ends::{last_lines, output_file};
 use crate::simulation::machine::{Tree, Usages};
-use crate::simulation::slots::GetSnapshot;
 use crate::simulation::snapshot::{Simulation, Snapshot};
 use crate::simulation::state::AppState;
 
@@ -34,21 +34,46 @@ const ASSETS: &[Asset] = &[
 /// How much of an output's end is shown, in bytes: all that is kept of one that has ended, with its events.
 const MAX_TAIL: u64 = 96 * 1024;
 
+/// The page `/watch`.
+#[derive(Template)]
+#[template(path = "simulation/watch.html")]
+struct Watch<'one> {
+    one: &'one Simulation,
+    /// The path of the stream, with a token for one connection.
+    stream: String,
+    /// Webots' own viewer, where this server has it.
+    script: Option<&'static str>,
+}
+
+/// The page that holds Webots' own viewer.
+#[derive(Template)]
+#[template(path = "session/webots_viewer.html")]
+struct WebotsViewer {
+    version: &'static str,
+}
+
 /// Adds the routes to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
     app.service(path("/monitor", READ, monitor))
         .service(path("/events", GET, events))
         .service(path("/history", GET, history))
         .service(path("/output", GET, output))
+        .service(path("/watch", GET, watch))
+        .service(path("/webots-viewer", READ, viewer))
         .service(path("/assets/{name}", READ, asset))
         .service(path("/wwi/{path:.*}", GET, wwi));
 }
 
 async fn monitor(request: HttpRequest, server: web::Data<AppState>) -> actix_web::Result<HttpResponse> {
     let visitor = Visitor::of(&request, &server)?;
-    let snapshot = ask(&server, GetSnapshot).await?;
-    let usages = usages(&server, &snapshot).await;
-    Ok(html(pages::monitor(&server, &snapshot, &usages, visitor), &ContentSecurityPolicy::own()))
+    let page = view(&server, visitor).await.and_then(|view| pages::monitor(&server, &view, visitor));
+    Ok(html(page, &ContentSecurityPolicy::own()))
+}
+
+async fn view(server: &AppState, visitor: Visitor) -> Result<PageView, askama::Error> {
+    let snapshot = server.slots.snapshot();
+    let usages = usages(server, &snapshot).await;
+    pages::view(server, &snapshot, &usages, visitor)
 }
 
 async fn usages(server: &AppState, snapshot: &Snapshot) -> Usages {
@@ -75,14 +100,12 @@ async fn events(request: HttpRequest, server: web::Data<AppState>) -> actix_web:
     let render = move || {
         let server = shown.clone();
         async move {
-            let snapshot = ask(&server, GetSnapshot).await.ok()?;
-            let usages = usages(&server, &snapshot).await;
-            let view = pages::view(&server, &snapshot, &usages, visitor);
+            let view = view(&server, visitor).await;
             view.inspect_err(|error| log::error!("the monitor page can't be rendered: {error}")).ok()
         }
     };
     let live = if visitor == Visitor::Administrator { &server.administrators } else { &server.live };
-    Ok(live.listen(permit, server.phase.clone(), render))
+    Ok(live.listen(permit, server.phase.subscribe(), render))
 }
 
 async fn history(server: web::Data<AppState>) -> HttpResponse {
@@ -94,9 +117,12 @@ async fn asset(request: HttpRequest) -> HttpResponse {
     assets::answer(&request, ASSETS)
 }
 
+/// Which simulation, and by which viewer.
 #[derive(Deserialize)]
 struct Which {
     id: String,
+    #[serde(default)]
+    viewer: String,
 }
 
 /// The last output lines of a simulation, running or ended. They may be private, so the administrator's password
@@ -130,4 +156,31 @@ async fn wwi(request: HttpRequest, server: web::Data<AppState>) -> actix_web::Re
     let mut response = file.disable_content_disposition().into_response(&request);
     response.headers_mut().insert(header::CACHE_CONTROL, HeaderValue::from_static("no-cache"));
     Ok(response)
+}
+
+/// The token in the page is new each time: the page's URL, which may be kept or sent to others, is useless without the
+/// password.
+async fn watch(
+    request: HttpRequest,
+    which: web::Query<Which>,
+    server: web::Data<AppState>,
+) -> actix_web::Result<HttpResponse> {
+    let peer = server.config.trusted_proxies.peer(&request);
+    if let Some(refusal) = require_administrator(server.admin_auth.as_ref(), &request, peer) {
+        return Ok(refusal);
+    }
+    let snapshot = server.slots.snapshot();
+    let one = snapshot.simulations.iter().find(|one| one.id.to_string() == which.id);
+    let found = one.and_then(|one| Some((one, server.slots.watch(one.id)?)));
+    let (one, token) = found.ok_or_else(|| ErrorNotFound("Error: this simulation does not stream."))?;
+    let installed = webots_viewer::folder(&server.config).map(|_| webots_viewer::PATH);
+    let (stream, script) = (format!("stream/{}", token.reveal()), installed.filter(|_| which.viewer != "small"));
+    let page = Watch { one, stream, script };
+    Ok(html(page.render(), &ContentSecurityPolicy::viewer(&request, &[])))
+}
+
+/// Webots' own viewer shows what worlds bring: it runs in an embedded page with an origin of its own.
+async fn viewer(request: HttpRequest) -> HttpResponse {
+    let page = WebotsViewer { version: env!("CARGO_PKG_VERSION") };
+    html(page.render(), &ContentSecurityPolicy::foreign(&own_sources(&request)))
 }

@@ -8,10 +8,9 @@ use url::Url;
 use super::administrator::Visitor;
 use crate::shared::domain::Instances;
 use crate::shared::http::{PageView, TableRow};
-use crate::shared::run::{seconds_since_1970, timestamp};
-use crate::shared::text::{one_line, without_paths};
+use crate::shared::run::timestamp;
+use crate::shared::text::one_line;
 use crate::simulation::ends::Ended;
-use crate::simulation::machine::sensors::{self, Gpu, Machine};
 use crate::simulation::machine::{Readings, Sample, Usage, Usages};
 use crate::simulation::snapshot::{Simulation, Snapshot, Stage};
 use crate::simulation::state::AppState;
@@ -23,38 +22,19 @@ struct Monitor<'server> {
     server: &'server AppState,
     readings: &'server Readings,
     visitor: Visitor,
-    version: &'static str,
-    started: String,
-    title: &'server str,
-    glance: &'server str,
-    /// The columns of the charts' numbers.
-    columns: String,
-    rows: &'server [TableRow],
-    ends: &'server [TableRow],
-    gpus: Vec<(&'server Gpu, String)>,
-    memory: String,
-    swap: String,
-    shows_ports: bool,
-    /// What worlds' programs may do that they should not, and why.
-    shortcoming: Option<(&'static str, &'server str)>,
-    limit: String,
+    view: &'server PageView,
 }
 
 /// The summary of the server.
 #[derive(Template)]
 #[template(path = "simulation/glance.html")]
-struct Glance<'readings> {
-    draining: bool,
+struct Glance<'server> {
+    server: &'server AppState,
+    readings: &'server Readings,
+    instances: Instances,
+    load: f64,
     /// Why no simulation can be started; `None` if some can.
     problem: Option<String>,
-    load: f64,
-    busiest_part: &'static str,
-    machine: Machine,
-    memory: String,
-    gpus: Vec<(&'readings Gpu, String)>,
-    /// The problem with the GPUs, if there is one.
-    gpu_problem: Option<&'readings str>,
-    instances: Instances,
 }
 
 /// The cells of one simulation.
@@ -62,23 +42,20 @@ struct Glance<'readings> {
 #[template(path = "simulation/row.html")]
 struct SimulationRow<'one> {
     visitor: Visitor,
+    shows_port: bool,
     one: &'one Simulation,
-    link: String,
-    world: String,
-    repository: String,
-    stage: &'static str,
-    class: &'static str,
-    since: String,
+    usage: Usage,
     /// When its time limit ends, in seconds since 1970; 0 if it is not launched.
     ends: u64,
-    left: String,
-    cpu: String,
-    cpu_value: f64,
-    memory: String,
-    memory_value: u64,
-    /// The port, if the visitor may see it.
-    port: Option<u16>,
-    can_be_watched: bool,
+}
+
+/// The cells of one simulation that has ended.
+#[derive(Template)]
+#[template(path = "simulation/end.html")]
+struct EndRow<'one> {
+    visitor: Visitor,
+    record: &'one Ended,
+    one: &'one Simulation,
 }
 
 /// The parts of `/monitor` that change.
@@ -94,53 +71,45 @@ pub fn view(
     let readings = server.readings.borrow().clone();
     let shows_port = visitor.sees_ports(&server.config);
     let rows = snapshot.simulations.iter().map(|one| {
-        let usage = one.pid.and_then(|pid| usages.get(&pid)).copied();
-        let html = SimulationRow::new(one, usage, server.config.timeout, (visitor, shows_port)).render()?;
+        let usage = one.pid.and_then(|pid| usages.get(&pid)).copied().unwrap_or_default();
+        let ends = one.launched.map_or(0, |launched| launched + server.config.timeout);
+        let html = SimulationRow { visitor, shows_port, one, usage, ends }.render()?;
         Ok(TableRow { key: one.id.to_string(), html })
     });
     let rows = rows.collect::<Result<Vec<TableRow>, askama::Error>>()?;
     let ends = server.ends.latest();
-    let ends = ends
-        .iter()
-        .map(|one| Ok(TableRow { key: one.simulation.id.to_string(), html: EndRow::new(one, visitor).render()? }));
+    let ends = ends.iter().map(|record| {
+        let html = EndRow { visitor, record, one: &record.simulation }.render()?;
+        Ok(TableRow { key: record.simulation.id.to_string(), html })
+    });
     let ends = ends.collect::<Result<Vec<TableRow>, askama::Error>>()?;
-    let glance = Glance::new(server, snapshot, &readings).render()?;
+    let (instances, load, problem) = (snapshot.instances, server.load().percent(), server.problem());
+    let glance = Glance { server, readings: &readings, instances, load, problem }.render()?;
     let sample = readings.history.back().map(Sample::columns).unwrap_or_default();
     Ok(PageView { parts: [("glance", glance)].into(), tables: [("simulations", rows), ("ends", ends)].into(), sample })
 }
 
-/// The whole of `/monitor`.
+/// The whole of `/monitor`, with these parts.
 ///
 /// # Errors
 /// When a template can't be rendered.
-pub fn monitor(
-    server: &AppState,
-    snapshot: &Snapshot,
-    usages: &Usages,
-    visitor: Visitor,
-) -> Result<String, askama::Error> {
-    let view = view(server, snapshot, usages, visitor)?;
-    let readings = server.readings.borrow().clone();
-    let table = |name| view.tables.get(name).map(Vec::as_slice).unwrap_or_default();
-    let page = Monitor {
-        server,
-        readings: &readings,
-        visitor,
-        version: env!("CARGO_PKG_VERSION"),
-        started: timestamp(SystemTime::now() - server.started.elapsed()),
-        title: server.config.title.as_deref().unwrap_or("Webots simulation server"),
-        glance: view.parts.get("glance").map(String::as_str).unwrap_or_default(),
-        columns: Sample::headings(),
-        rows: table("simulations"),
-        ends: table("ends"),
-        gpus: with_sizes(&readings.gpus),
-        memory: bytes(readings.host.memory),
-        swap: bytes(readings.host.swap),
-        shows_ports: visitor.sees_ports(&server.config),
-        shortcoming: shortcoming(server),
-        limit: duration(server.config.timeout),
-    };
-    page.render()
+pub fn monitor(server: &AppState, view: &PageView, visitor: Visitor) -> Result<String, askama::Error> {
+    Monitor { server, readings: &server.readings.borrow().clone(), visitor, view }.render()
+}
+
+impl Monitor<'_> {
+    fn started(&self) -> String {
+        timestamp(SystemTime::now() - self.server.started.elapsed())
+    }
+
+    /// What worlds' programs can do because isolation is incomplete, and why it is.
+    fn shortcoming(&self) -> Option<(&'static str, &str)> {
+        let (launcher, containers) = (&self.server.launcher, self.server.containers.as_ref());
+        let of_level =
+            launcher.shortcoming.as_deref().map(|why| ("worlds' programs may do whatever this server may.", why));
+        let of_containers = containers.and_then(|containers| containers.shortcoming.as_deref());
+        of_level.or_else(|| of_containers.map(|why| ("", why)))
+    }
 }
 
 /// The charts' numbers of the last ten minutes, the oldest first.
@@ -149,92 +118,23 @@ pub fn history(readings: &Readings) -> Vec<Vec<f64>> {
     readings.history.iter().map(values).collect()
 }
 
-impl<'readings> Glance<'readings> {
-    fn new(server: &AppState, snapshot: &Snapshot, readings: &'readings Readings) -> Self {
-        Self {
-            draining: server.is_draining(),
-            problem: server.problem(),
-            load: server.load().percent(),
-            busiest_part: sensors::busiest(&readings.machine, readings.next_gpu.as_ref()),
-            machine: readings.machine,
-            memory: bytes(readings.host.memory),
-            gpus: with_sizes(&readings.gpus),
-            gpu_problem: readings.gpu_problem.as_deref(),
-            instances: snapshot.instances,
-        }
-    }
-}
-
-/// Each GPU with the size of its memory as text.
-fn with_sizes(gpus: &[Gpu]) -> Vec<(&Gpu, String)> {
-    gpus.iter().map(|gpu| (gpu, bytes(gpu.memory_total))).collect()
-}
-
-/// The cells of one simulation that has ended.
-#[derive(Template)]
-#[template(path = "simulation/end.html")]
-struct EndRow<'one> {
-    visitor: Visitor,
-    record: &'one Ended,
-    one: &'one Simulation,
-    link: String,
-    world: String,
-    repository: String,
-    ended: String,
-    after: String,
-    why: String,
-}
-
-impl<'one> EndRow<'one> {
-    fn new(record: &'one Ended, visitor: Visitor) -> Self {
-        let one = &record.simulation;
-        let (repository, world) = names(one);
-        let (ended, after) = (text_of(record.at), duration(record.at.saturating_sub(one.since)));
-        let (link, why) = (link(&one.world), without_paths(&record.how.why));
-        Self { visitor, record, one, link, world, repository, ended, after, why }
-    }
-}
-
-fn text_of(seconds_since_1970: u64) -> String {
+fn time(seconds_since_1970: u64) -> String {
     timestamp(SystemTime::UNIX_EPOCH + Duration::from_secs(seconds_since_1970))
 }
 
-/// The URL of a world as a link, in which nothing is invisible or turns letters around.
-pub fn link(url: &str) -> String {
-    Url::parse(url).map_or_else(|_| one_line(url), String::from)
+/// The URL of a simulation's world as a link, in which nothing is invisible or turns letters around.
+pub fn link(one: &Simulation) -> String {
+    Url::parse(&one.world).map_or_else(|_| one_line(&one.world), String::from)
 }
 
-/// The repository of a world without its scheme, and the name of its file.
-pub fn names(one: &Simulation) -> (String, String) {
-    let file = one.world.rsplit('/').next().unwrap_or_default();
-    (one_line(one.repository.trim_start_matches("https://")), one_line(file))
+/// The repository of a simulation's world, without its scheme.
+pub fn repository(one: &Simulation) -> String {
+    one_line(one.repository.trim_start_matches("https://"))
 }
 
-impl<'one> SimulationRow<'one> {
-    fn new(one: &'one Simulation, usage: Option<Usage>, limit: u64, (visitor, shows_port): (Visitor, bool)) -> Self {
-        let (stage, class) = words(one.stage);
-        let ends = one.launched.map_or(0, |launched| launched + limit);
-        let now = seconds_since_1970();
-        let (repository, world) = names(one);
-        Self {
-            visitor,
-            one,
-            link: link(&one.world),
-            world,
-            repository,
-            stage,
-            class,
-            since: text_of(one.since),
-            ends,
-            left: duration(ends.saturating_sub(now)),
-            cpu: usage.and_then(|usage| usage.cpu).map(|cpu| format!("{cpu:.0} %")).unwrap_or_default(),
-            cpu_value: usage.and_then(|usage| usage.cpu).unwrap_or(-1.0),
-            memory: usage.map(|usage| bytes(usage.memory)).unwrap_or_default(),
-            memory_value: usage.map_or(0, |usage| usage.memory),
-            port: shows_port.then(|| one.port.unwrap_or_default()),
-            can_be_watched: matches!(one.stage, Stage::Idle | Stage::Running),
-        }
-    }
+/// The name of a world's file.
+pub fn world(one: &Simulation) -> String {
+    one_line(one.world.rsplit('/').next().unwrap_or_default())
 }
 
 /// A stage as text, and the CSS class of its color.
@@ -272,14 +172,6 @@ fn duration(seconds: u64) -> String {
     }
 }
 
-/// What worlds' programs can do because isolation is incomplete, and why it is.
-fn shortcoming(server: &AppState) -> Option<(&'static str, &str)> {
-    let of_level =
-        server.launcher.shortcoming.as_deref().map(|why| ("worlds' programs may do whatever this server may.", why));
-    let of_containers = server.containers.as_ref().and_then(|containers| containers.shortcoming.as_deref());
-    of_level.or_else(|| of_containers.map(|why| ("", why)))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -306,7 +198,9 @@ mod tests {
         for (visitor, has_names) in
             [(Visitor::Anybody, false), (Visitor::Stranger, false), (Visitor::Administrator, true)]
         {
-            let html = SimulationRow::new(&one, None, 7200, (visitor, true)).render().unwrap();
+            let html = SimulationRow { visitor, shows_port: true, one: &one, usage: Usage::default(), ends: 0 }
+                .render()
+                .unwrap();
             assert!(!html.contains("<script>") && !html.contains("<i>"), "{html}");
             assert_eq!(html.contains("root"), has_names, "{html}");
         }

@@ -10,14 +10,11 @@ use super::administrator::Visitor;
 use super::metrics;
 use super::origins::check_origin;
 use super::page_routes;
-use super::queries::ask;
-use super::status::StatusResponse;
+use super::status::status_page;
 use super::stream_routes;
-use super::watch_routes;
 use crate::shared::http::routing::{self, GET, READ, path};
 use crate::shared::http::{CONTENT_TYPE, ConnectionKind, websocket};
 use crate::simulation::client::WebClient;
-use crate::simulation::slots::GetSnapshot;
 use crate::simulation::state::AppState;
 
 /// Adds all routes to an app.
@@ -30,7 +27,6 @@ fn add(app: &mut web::ServiceConfig) {
         .service(path("/load", READ, load))
         .configure(page_routes::configure)
         .configure(stream_routes::configure)
-        .configure(watch_routes::configure)
         .service(path("/status", READ, status_json))
         .service(path("/metrics", READ, metrics_text))
         .service(path("/health", READ, health))
@@ -57,15 +53,15 @@ async fn load(server: web::Data<AppState>) -> HttpResponse {
 
 async fn status_json(request: HttpRequest, server: web::Data<AppState>) -> actix_web::Result<HttpResponse> {
     let visitor = Visitor::of(&request, &server)?;
-    let mut snapshot = ask(&server, GetSnapshot).await?;
+    let mut snapshot = server.slots.snapshot();
     if !visitor.sees_ports(&server.config) {
         snapshot.simulations.iter_mut().for_each(|one| one.port = None);
     }
-    Ok(HttpResponse::Ok().json(StatusResponse::new(&server, snapshot)))
+    Ok(HttpResponse::Ok().json(status_page(&server, &snapshot)))
 }
 
 async fn metrics_text(server: web::Data<AppState>) -> actix_web::Result<HttpResponse> {
-    let snapshot = ask(&server, GetSnapshot).await?;
+    let snapshot = server.slots.snapshot();
     let text = server.metrics.render(&metrics::gauges(&server, &snapshot)).map_err(ErrorInternalServerError)?;
     Ok(HttpResponse::Ok().content_type(CONTENT_TYPE).body(text))
 }

@@ -8,8 +8,8 @@ use super::origins::check_origin;
 use crate::shared::http::routing::{GET, path};
 use crate::shared::http::{ConnectionKind, body};
 use crate::simulation::relay::{self, Upstream};
+use crate::simulation::slots::StreamTarget;
 use crate::simulation::state::AppState;
-use crate::simulation::streams::StreamTarget;
 
 /// Adds the paths to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
@@ -20,7 +20,7 @@ async fn stream(request: HttpRequest, server: web::Data<AppState>) -> actix_web:
     let nothing = || ErrorNotFound("Error: there is no such stream.");
     // As the client has written it: what it has encoded stays so.
     let (token, path) = relay::parse_path(request.uri().path()).ok_or_else(nothing)?;
-    let StreamTarget { simulation, port, read_only } = server.streams.find(&token).ok_or_else(nothing)?;
+    let StreamTarget { simulation, port, read_only } = server.slots.stream(&token).ok_or_else(nothing)?;
     if let Some(refusal) = body::refuse(&request) {
         return Ok(refusal);
     }
@@ -41,7 +41,7 @@ async fn stream(request: HttpRequest, server: web::Data<AppState>) -> actix_web:
     if !read_only {
         return Ok(relay::connect(upstream, &url, &request, false, permit).await);
     }
-    let guard = server.streams.start_watching(&token).ok_or_else(nothing)?;
+    let guard = server.slots.start_watching(simulation, token).ok_or_else(nothing)?;
     log::info!("{simulation}: client {peer} watches");
     Ok(relay::connect(upstream, &url, &request, true, (permit, guard)).await)
 }

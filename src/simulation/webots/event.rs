@@ -10,7 +10,7 @@ use crate::simulation::sessions::Token;
 #[derive(Message, Debug, Clone, PartialEq, Eq)]
 #[rtype(result = "()")]
 pub enum WebotsEvent {
-    /// A step of its preparation, as text.
+    /// A step of its preparation or of the checkout before it, as text.
     Progress(String),
     /// A text of the protocol that its project requests, unchanged.
     Text(String),

@@ -19,7 +19,6 @@ use crate::simulation::machine::sensors::Gpu;
 use crate::simulation::process::{SpawnSpec, until_answering};
 use crate::simulation::protocol::Mode;
 use crate::simulation::slots::Slot;
-use crate::simulation::streams::{Streams, Watched};
 
 /// A port that does not even refuse a connection for so long has a program that does not take it.
 const SILENCE: Duration = Duration::from_millis(100);
@@ -46,10 +45,6 @@ pub struct LaunchSpec {
     pub gpu: Option<Gpu>,
     /// The slot, with its port.
     pub slot: Slot,
-    /// Where its stream is found while it runs.
-    pub streams: Arc<Streams>,
-    /// Is notified whether it is watched.
-    pub watched: Recipient<Watched>,
     /// Receives the events.
     pub events: Recipient<WebotsEvent>,
 }

@@ -89,7 +89,7 @@ pub fn launch(
     let log = folder.join(format!("{}.log", spec.slot.lease.id()));
     let file = RotatedFile::open(&log, OLD_LOGS).inspect_err(|error| {
         let why = format!("what Webots prints is not kept: {} can't be written: {error}", log.display());
-        spec.slot.lease.log(log::Level::Warn, &why, why.clone());
+        spec.slot.lease.log(log::Level::Warn, &why, &why);
     });
     let log = file.is_ok().then_some(log);
     let (reader, output) = std::io::pipe()?;

@@ -21,7 +21,6 @@ use crate::simulation::container::StartError;
 use crate::simulation::ends::{EndReason, Taken};
 use crate::simulation::process::ProcessGroup;
 use crate::simulation::snapshot::Stage;
-use crate::simulation::streams::StreamRegistration;
 
 /// Requests Webots' end, because its client has left or for another reason.
 #[derive(Message)]
@@ -35,8 +34,6 @@ pub struct ResetController(pub String);
 
 /// The actor.
 pub struct Webots {
-    /// Its stream, which is not found any more before another simulation may have its port.
-    stream: Option<StreamRegistration>,
     pub(super) spec: LaunchSpec,
     /// Its session, until it hears of the end.
     hears_end: Option<Recipient<WebotsEvent>>,
@@ -73,7 +70,6 @@ impl Webots {
     /// Creates the actor; Webots starts with it.
     pub fn new(spec: LaunchSpec) -> Self {
         Self {
-            stream: None,
             hears_end: Some(spec.events.clone()),
             spec,
             preparing: None,
@@ -169,8 +165,7 @@ impl Webots {
         self.listening = true;
         self.last_heartbeat = Instant::now();
         self.show_pace();
-        let (slot, watched) = (&self.spec.slot, self.spec.watched.clone());
-        let stream = self.stream.insert(self.spec.streams.register(slot.lease.id(), slot.port, watched)).token();
+        let stream = self.spec.slot.lease.open_stream();
         self.send(WebotsEvent::Listening(self.spec.slot.port, stream));
         self.used(ctx);
     }
@@ -216,7 +211,6 @@ impl Webots {
     }
 
     fn ended(&mut self, end: &End, ctx: &mut Context<Self>) {
-        self.stream = None;
         self.log(Level::Info, &format!("Webots {}", end.reason));
         let (kind, why) = verdict(self.stopped_for.take(), end, self.listening);
         self.spec.slot.lease.end(kind, &why, end.taken);
@@ -268,8 +262,7 @@ impl Webots {
         let (config, port) = (&self.spec.config, self.spec.slot.port);
         let is_shown = config.ports_are_public() || config.admin_password.is_some();
         let line = format!("port {port}: {event}");
-        let shown = if is_shown { line.clone() } else { event.to_owned() };
-        self.spec.slot.lease.log(level, &line, shown);
+        self.spec.slot.lease.log(level, &line, if is_shown { &line } else { event });
     }
 }
 
