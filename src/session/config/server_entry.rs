@@ -131,7 +131,7 @@ mod tests {
             "dns://tasks.simulation:2000",
             "DNS+host:2000",
         ] {
-            let error = read(text).unwrap_err().to_string();
+            let error = read(text).unwrap_err();
             assert!(error.contains(&format!("{text:?}")) && error.contains("dns+NAME:PORT"), "{error}");
         }
     }
