@@ -22,8 +22,7 @@ fn check<C: Configuration>(file: &Path) {
         Ok(loaded) => {
             assert!(loaded.warnings.iter().all(|warning| super::is_one_line(warning)), "{:?}", loaded.warnings)
         }
-        Err(error) => {
-            let told = error.to_string();
+        Err(told) => {
             assert!(told.contains("configuration.json") && super::is_one_line(&told), "{told}");
         }
     }

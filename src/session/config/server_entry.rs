@@ -119,7 +119,7 @@ mod tests {
         let others =
             "dns+10.0.0.7:2000 dns+[::1]:2000 dnssrv+ dnssrv+_webots._tcp.example.org dns://a.b:2000 DNS+host:2000";
         for text in names.split(' ').chain(others.split(' ')).chain(["dns+a b:2000"]) {
-            let error = read(text).unwrap_err().to_string();
+            let error = read(text).unwrap_err();
             assert!(error.contains(&format!("{text:?}")) && error.contains("dns+NAME:PORT"), "{error}");
         }
     }

@@ -98,7 +98,7 @@ mod tests {
     #[test]
     fn a_part_of_a_repository_is_no_prefix() {
         for part in ["blob/main", "tree/main/p", "-/tree/main", "src/branch/main", "src/tag/v1"] {
-            let error = UrlPrefix::try_from(format!("https://forge.org/lab/x/{part}")).unwrap_err().to_string();
+            let error = UrlPrefix::try_from(format!("https://forge.org/lab/x/{part}")).unwrap_err();
             assert!(error.contains("it names a part of a repository"), "{error}");
         }
     }

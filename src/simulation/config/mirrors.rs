@@ -84,7 +84,7 @@ impl TryFrom<BTreeMap<String, String>> for Mirrors {
     fn try_from(map: BTreeMap<String, String>) -> Result<Self, String> {
         map.into_iter()
             .map(|(prefix, replacement)| {
-                let prefix = UrlPrefix::try_from(prefix).map_err(|error| error.to_string())?;
+                let prefix = UrlPrefix::try_from(prefix)?;
                 let replacement = shellexpand::full(&replacement)
                     .map_err(|error| format!("{replacement:?} names {}, which is not set", error.var_name))?
                     .into_owned();
