@@ -26,7 +26,7 @@ struct LastReport {
 #[derive(Debug, Clone, Copy)]
 struct Placement {
     at: Instant,
-    /// Whether it reserves room, see [`super::LoadBalancer::pick_unreserved`].
+    /// Whether it reserves room, see [`super::LoadBalancer::pick`].
     takes_room: bool,
 }
 
@@ -43,15 +43,12 @@ impl ClientDelta {
     fn unseen(&self, now: Instant) -> f64 {
         let span = if self.clients > 0.0 { SETTLING } else { MEAN_WINDOW };
         let age = now.saturating_duration_since(self.at);
-        if age >= span {
-            return 0.0;
-        }
-        self.clients * (1.0 - age.as_secs_f64() / span.as_secs_f64())
+        self.clients * (1.0 - age.as_secs_f64() / span.as_secs_f64()).max(0.0)
     }
 }
 
 /// One server of the fleet.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(super) struct Backend {
     /// Whether it answers.
     pub(super) up: bool,
@@ -85,20 +82,11 @@ impl Backend {
     /// A server without reports: down until its first one.
     pub(super) fn new(policy: &PlacementPolicy, last_pick: u64) -> Self {
         Self {
-            up: false,
-            accepting: true,
-            last: None,
-            in_flight: VecDeque::new(),
-            reserved: 0,
-            fresh: 0,
             clients_per_placement: 1.0,
-            settling: VecDeque::new(),
-            unseen: 0.0,
-            unseen_reserved: 0.0,
             fit: CostFit::new(policy.client_cost),
             cost: believable(policy.client_cost),
-            estimate: Estimate::default(),
             last_pick,
+            ..Self::default()
         }
     }
 
