@@ -96,7 +96,7 @@ async fn availability(server: web::Data<AppState>) -> HttpResponse {
 }
 
 async fn load(server: web::Data<AppState>) -> HttpResponse {
-    let load = server.status().await.map_or(-1.0, |status| status.displayed_mean_load());
+    let load = server.status().await.ok().and_then(|status| status.mean_load).unwrap_or(-1.0);
     HttpResponse::Ok().content_type("text/plain").body(load.to_string())
 }
 
