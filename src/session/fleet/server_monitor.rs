@@ -114,7 +114,7 @@ pub async fn monitor(
         {
             load_only_until = (!has_status).then(|| Instant::now() + LOAD_ONLY);
         }
-        let answer = answer.and_then(|(report, _)| usable(report));
+        let answer = answer.map(|(report, _)| report);
         match results.try_send(ProbeResult { server: server.clone(), latency, answer }) {
             Ok(()) => {}
             Err(SendError::Full(_)) => log::warn!("{server}: a report is lost, too many are waiting"),
@@ -134,7 +134,7 @@ async fn probe(client: &awc::Client, url: &str, load_only: bool) -> Result<(Serv
             let text = String::from_utf8_lossy(body.get(..body.len().min(40)).unwrap_or_default()).into_owned();
             bad_answer(&format!("{error} in {text:?}"))
         })?;
-        return Ok((report, true));
+        return Ok((usable(report)?, true));
     }
     let body = get(client, &format!("{url}/load")).await?;
     let (bytes, length) = body.ok_or_else(|| bad_answer(&"it has neither /status nor /load"))?;
@@ -143,7 +143,7 @@ async fn probe(client: &awc::Client, url: &str, load_only: bool) -> Result<(Serv
         return Err(bad_answer(&"an answer that does not end as its Content-Length says"));
     }
     let load = Load::parse(&bytes).map_err(|error| bad_answer(&error))?;
-    Ok((ServerReport::load_only(load), false))
+    Ok((usable(ServerReport::load_only(load))?, false))
 }
 
 /// Returns the body of a page and its length as announced, `None` if the server has no such page.
