@@ -3,7 +3,6 @@
 mod fleet_status;
 mod name_table;
 mod pick;
-mod probe_error;
 mod registry;
 mod resolver;
 mod server_monitor;

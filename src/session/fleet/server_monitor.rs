@@ -22,7 +22,6 @@ use futures_util::FutureExt;
 use rustls::ClientConfig;
 use tokio::time::{MissedTickBehavior, interval_at};
 
-use super::probe_error::ProbeError;
 use super::resolver::HostResolver;
 use crate::session::config::SessionConfig;
 use crate::shared::domain::{Load, PublicAddress, ServerReport};
@@ -39,6 +38,23 @@ pub struct ProbeResult {
     pub latency: Duration,
     /// The server's report, or why the probe failed.
     pub answer: Result<ServerReport, ProbeError>,
+}
+
+/// Why a probe failed, for the log and the pages.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum ProbeError {
+    /// The connection failed or broke.
+    #[error("no connection: {0}")]
+    Connection(String),
+    /// The answer was not complete within this time.
+    #[error("no answer within {} s", .0.as_secs_f64())]
+    Timeout(Duration),
+    /// The answer is invalid.
+    #[error("an answer that makes no sense: {0}")]
+    BadAnswer(String),
+    /// It answers that it can't start simulations.
+    #[error("it can start no simulation: {0}")]
+    NotReady(String),
 }
 
 /// How servers are probed.

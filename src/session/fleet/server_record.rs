@@ -5,7 +5,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use serde::Serialize;
 
-use super::probe_error::ProbeError;
+use super::server_monitor::ProbeError;
 use crate::session::mail::NoticeKind;
 use crate::shared::domain::{ProjectUrl, PublicAddress, ServerReport};
 use crate::shared::run::serialize_timestamp;

@@ -159,7 +159,7 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
 
     /// Whether others are preferred to a server, because its last starts have failed.
     pub fn is_ejected(&self, id: &Id) -> bool {
-        self.servers.get(id).is_some_and(|server| server.ejection.until().is_some())
+        self.servers.get(id).is_some_and(|server| server.ejection.until.is_some())
     }
 
     /// The load, in percent, that is expected once it shows all clients that reserve room; `None` if the server is
@@ -175,7 +175,7 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
 
     /// Number of clients that were sent to a server and have neither been seen there nor been given up.
     pub fn in_flight(&self, id: &Id) -> usize {
-        self.servers.get(id).map_or(0, |server| server.backend.in_flight())
+        self.servers.get(id).map_or(0, |server| server.backend.in_flight.len())
     }
 
     /// Expected cost of a client on a server, in percent of load; `None` if it is not in the fleet.
@@ -188,7 +188,7 @@ impl Server {
     /// Updates the rank of a server after a change.
     fn sort_in<Id: Clone>(&mut self, id: &Id, policy: &PlacementPolicy, ranking: &mut BTreeMap<Rank, Id>) {
         let load = self.backend.rank_load().filter(|_| self.backend.has_room(policy));
-        let (is_ejected, last_pick) = (self.ejection.until().is_some(), self.backend.last_pick);
+        let (is_ejected, last_pick) = (self.ejection.until.is_some(), self.backend.last_pick);
         let rank = load.map(|load| Rank { is_ejected, load: load.to_bits(), last_pick });
         if self.rank != rank {
             self.rank.map(|before| ranking.remove(&before));
