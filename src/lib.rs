@@ -43,13 +43,13 @@
 //! ```text
 //! session server
 //!
-//!   routes ----------- Pick, GetStatus ------------> Registry --- Notice --> Mailer --> SMTP
+//!   routes ----------- Pick, GetStatus ------------> Registry --- Notice --> mailer --> SMTP
 //!     | one per WebSocket                             ^  |  | one per simulation server
 //!   WebClient ---------- Pick ------------------------'  |  v
-//!     |  ^                                               | ServerMonitor -- GET /status, /load --> simulation server
+//!     |  ^                                               | monitor -- GET /status, /load --> simulation server
 //!     |  '- availability (watch channel) -- Registry     '-- ProbeResult --> Registry
 //!
-//!   The monitors share a thread of their own, so that clients never wait for them.
+//!   Monitors and mailers are tasks. The monitors share a thread of their own, so that clients never wait for them.
 //!
 //! simulation server
 //!
@@ -73,11 +73,11 @@
 //!
 //! # What ends, and what restarts
 //!
-//! | actor | ends by itself | after a panic |
+//! | actor or task | ends by itself | after a panic |
 //! |---|---|---|
 //! | Registry, `LoadMonitor` | never | the server logs it and exits with code 1: the service manager restarts it |
-//! | `ServerMonitor` | when its server leaves the configuration, or its name no longer resolves to it and it does not answer | its supervisor starts a new one |
-//! | Mailer | never | its supervisor starts a new one; unsent notices are lost |
+//! | monitor | when its server leaves the configuration, or its name no longer resolves to it and it does not answer | its supervisor starts a new one |
+//! | mailer | never | its supervisor starts a new one; unsent notices are lost |
 //! | `WebClient` | with its connection | its connection closes, and its session is notified |
 //! | `Session` | with its simulation, or its client | its lease is released, and its client is notified |
 //! | Webots | with its process tree; it is never restarted, its client is notified | its process tree is killed at once, its directory removed, its slot released |

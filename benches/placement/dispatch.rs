@@ -48,7 +48,7 @@ impl Own {
 
     /// Chooses among the servers that are eligible.
     pub(crate) fn place_among(&mut self, now: f64, eligible: impl Fn(&usize) -> bool) -> Option<usize> {
-        self.fleet.pick(self.at(now), eligible)
+        self.fleet.pick(self.at(now), true, eligible)
     }
 
     fn at(&self, now: f64) -> Instant {

@@ -1,5 +1,6 @@
 //! The state that the routes, the pages and the web clients of a session server share. `app` creates it.
 
+use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -10,7 +11,7 @@ use tokio::sync::watch;
 use super::announcements::Announcements;
 use super::config::SessionConfig;
 use crate::session::fleet::{FleetStatus, GetStatus, Pick, PickError, Registry};
-use crate::shared::domain::ClientUrls;
+use crate::shared::domain::{ClientUrls, ProjectUrl};
 use crate::shared::http::{BasicAuth, ConnectionKind, ConnectionLimiter, LiveUpdates, Metrics};
 use crate::shared::run::Phase;
 
@@ -56,15 +57,17 @@ impl AppState {
         self.registry.send(GetStatus).await.map_err(|_| ErrorServiceUnavailable("Error: the server stops."))
     }
 
-    /// Asks the registry for a simulation server, and returns its URL.
+    /// Asks the registry for a simulation server for a client of this address, and returns its URL. The world is a URL, if
+    /// the client named one.
     ///
     /// # Errors
     /// Why there is none.
-    pub async fn pick(&self, wanted: Result<Pick, PickError>) -> Result<String, PickError> {
-        let picked = match wanted {
-            Ok(pick) => self.registry.send(pick).await.unwrap_or(Err(PickError::Unavailable)),
-            Err(wrong) => Err(wrong),
+    pub async fn pick(&self, world: Option<&str>, from: Option<IpAddr>) -> Result<String, PickError> {
+        let picked = async {
+            let world = world.filter(|text| !text.is_empty()).map(ProjectUrl::parse).transpose()?;
+            self.registry.send(Pick { world, from }).await.unwrap_or(Err(PickError::Unavailable))
         };
+        let picked = picked.await;
         let outcome = match &picked {
             Ok(_) => "placed",
             Err(PickError::Unavailable) => "unavailable",

@@ -7,7 +7,7 @@ mod server_entry;
 mod session_config;
 mod timing;
 
-pub use announcement::Announcement;
+pub use announcement::{Announcement, AnnouncementKeys};
 pub use example::Example;
 pub use server_entry::{DnsName, ServerEntry};
 pub use session_config::SessionConfig;

@@ -5,7 +5,7 @@ use std::time::SystemTime;
 
 use serde::Serialize;
 
-use super::server_record::{ServerRecord, ServerState};
+use super::server_record::{ServerRecord, StateChange};
 use crate::shared::run::serialize_timestamp;
 
 /// Everything that is known of the fleet.
@@ -50,25 +50,4 @@ pub struct ServerStatus {
     pub in_flight: usize,
     /// Expected cost of one more client, in percent of load.
     pub client_cost: Option<f64>,
-}
-
-/// A simulation server has changed its state, or lookups of a name have begun to fail or to succeed.
-#[derive(Debug, Clone, Serialize)]
-pub struct StateChange {
-    /// When it changed.
-    #[serde(serialize_with = "serialize_timestamp")]
-    pub at: SystemTime,
-    /// The simulation server's address, or the name.
-    pub server: String,
-    /// Its new state.
-    pub state: ServerState,
-    /// The reason, as text.
-    pub why: String,
-}
-
-impl FleetStatus {
-    /// The mean load as `/load` shows it, in percent; -1 if no server answers.
-    pub fn displayed_mean_load(&self) -> f64 {
-        self.mean_load.unwrap_or(-1.0)
-    }
 }

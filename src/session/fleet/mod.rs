@@ -3,7 +3,6 @@
 mod fleet_status;
 mod name_table;
 mod pick;
-mod probe_error;
 mod registry;
 mod resolver;
 mod server_monitor;
@@ -11,7 +10,7 @@ mod server_record;
 mod server_table;
 mod state_history;
 
-pub use fleet_status::{FleetStatus, NameStatus, ServerStatus, StateChange};
+pub use fleet_status::{FleetStatus, NameStatus, ServerStatus};
 pub use pick::{Pick, PickError};
 pub use registry::{GetStatus, Reconfigure, Registry};
-pub use server_record::{ServerRecord, ServerState};
+pub use server_record::{ServerRecord, ServerState, StateChange};

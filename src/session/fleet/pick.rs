@@ -28,23 +28,12 @@ pub enum PickError {
     NotAccepted(String),
     /// The URL does not name a world.
     #[error("Error: {0}")]
-    InvalidWorld(ProjectUrlError),
+    InvalidWorld(#[from] ProjectUrlError),
 }
 
 impl PickError {
     /// The message for the client, safe to show.
     pub fn for_client(&self) -> String {
         client_text(&self.to_string())
-    }
-}
-
-impl Pick {
-    /// Parses a request from a client of this address, for a world or without one.
-    ///
-    /// # Errors
-    /// When the URL does not name a world.
-    pub fn parse(world: Option<&str>, from: Option<IpAddr>) -> Result<Self, PickError> {
-        let world = world.filter(|text| !text.is_empty()).map(ProjectUrl::parse).transpose();
-        world.map(|world| Self { world, from }).map_err(PickError::InvalidWorld)
     }
 }

@@ -16,8 +16,7 @@ use tokio::sync::watch;
 use super::fleet_status::{FleetStatus, ServerStatus};
 use super::name_table::{self, LookupResult};
 use super::pick::{Pick, PickError};
-use super::probe_error::ProbeError;
-use super::server_monitor::ProbeResult;
+use super::server_monitor::{ProbeError, ProbeResult};
 use super::server_record::{ServerRecord, ServerState, is_refused};
 use super::server_table::ServerTable;
 use super::state_history::StateHistory;
@@ -80,15 +79,10 @@ impl Registry {
 
     /// Evaluates the last reports again, because a threshold has changed, or which servers are drained.
     fn reevaluate(&mut self) {
-        let last = |record: &ServerRecord| {
-            Some((
-                record.address.clone(),
-                record.report.clone().filter(|_| record.current().is_some())?,
-                record.answered?,
-            ))
-        };
-        for (server, report, at) in self.servers.in_order().filter_map(last).collect::<Vec<_>>() {
-            self.record(&server, Ok(report), at);
+        for record in self.servers.in_order().cloned().collect::<Vec<_>>() {
+            if let (Some(_), Some(report), Some(at)) = (record.current(), record.report.clone(), record.answered) {
+                self.record(&record.address, Ok(report), at);
+            }
         }
         self.publish();
     }
@@ -148,10 +142,7 @@ impl Registry {
         let ServerTable { records, fleet, .. } = &mut self.servers;
         let accepts = |address: &PublicAddress, world| records.get(address)?.accepts(world);
         let eligible = |address: &PublicAddress| world.is_none_or(|world| accepts(address, world) == Some(true));
-        let now = Instant::now();
-        let picked =
-            if self.quota.take(from) { fleet.pick(now, eligible) } else { fleet.pick_unreserved(now, eligible) };
-        picked.ok_or_else(|| match world {
+        fleet.pick(Instant::now(), self.quota.take(from), eligible).ok_or_else(|| match world {
             Some(world) if is_refused(records.values(), world) => PickError::NotAccepted(world.repository()),
             _ => PickError::Unavailable,
         })

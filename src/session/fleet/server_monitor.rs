@@ -8,6 +8,7 @@
 //! It requests `/status`, or `/load` if the server has no such page: the original has only that. No answer is trusted:
 //! the whole probe has a timeout, the answer a size limit, and the load must be plausible.
 
+use std::fmt::Display;
 use std::sync::{Arc, LazyLock};
 use std::time::{Duration, Instant};
 
@@ -21,7 +22,6 @@ use futures_util::FutureExt;
 use rustls::ClientConfig;
 use tokio::time::{MissedTickBehavior, interval_at};
 
-use super::probe_error::ProbeError;
 use super::resolver::HostResolver;
 use crate::session::config::SessionConfig;
 use crate::shared::domain::{Load, PublicAddress, ServerReport};
@@ -38,6 +38,23 @@ pub struct ProbeResult {
     pub latency: Duration,
     /// The server's report, or why the probe failed.
     pub answer: Result<ServerReport, ProbeError>,
+}
+
+/// Why a probe failed, for the log and the pages.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum ProbeError {
+    /// The connection failed or broke.
+    #[error("no connection: {0}")]
+    Connection(String),
+    /// The answer was not complete within this time.
+    #[error("no answer within {} s", .0.as_secs_f64())]
+    Timeout(Duration),
+    /// The answer is invalid.
+    #[error("an answer that makes no sense: {0}")]
+    BadAnswer(String),
+    /// It answers that it can't start simulations.
+    #[error("it can start no simulation: {0}")]
+    NotReady(String),
 }
 
 /// How servers are probed.
@@ -68,6 +85,8 @@ const NEVER: Duration = Duration::from_hours(24);
 const SLOT: Duration = Duration::from_millis(10);
 /// The start of the first of these slots.
 static BEGIN: LazyLock<Instant> = LazyLock::new(Instant::now);
+/// Longest text of a server that is kept, in characters.
+const MAX_REASON_LENGTH: usize = 500;
 /// How long only `/load` is requested from a server that has no `/status`.
 const LOAD_ONLY: Duration = Duration::from_mins(1);
 
@@ -127,16 +146,20 @@ pub async fn monitor(
 /// Requests the state of a server. Returns its report, and whether that comes from `/status`.
 async fn probe(client: &awc::Client, url: &str, load_only: bool) -> Result<(ServerReport, bool), ProbeError> {
     if !load_only && let Some((body, _)) = get(client, &format!("{url}/status")).await? {
-        return parse_status(&body).map(|report| (report, true));
+        let report = ServerReport::parse(&body).map_err(|error| {
+            let text = String::from_utf8_lossy(body.get(..body.len().min(40)).unwrap_or_default()).into_owned();
+            bad_answer(&format!("{error} in {text:?}"))
+        })?;
+        return Ok((usable(report)?, true));
     }
     let body = get(client, &format!("{url}/load")).await?;
-    let (bytes, length) = body.ok_or_else(|| ProbeError::BadAnswer("it has neither /status nor /load".to_owned()))?;
+    let (bytes, length) = body.ok_or_else(|| bad_answer(&"it has neither /status nor /load"))?;
     // awc takes the end of the connection for the end of the body: 95.5 may be 9. JSON that is cut off is none.
     if length != Some(bytes.len()) {
-        return Err(ProbeError::BadAnswer("an answer that does not end as its Content-Length says".to_owned()));
+        return Err(bad_answer(&"an answer that does not end as its Content-Length says"));
     }
-    let load = Load::parse(&bytes).map_err(|error| ProbeError::BadAnswer(shortened(&error)))?;
-    plausible(load).map(|load| (ServerReport::load_only(load), false))
+    let load = Load::parse(&bytes).map_err(|error| bad_answer(&error))?;
+    Ok((usable(ServerReport::load_only(load))?, false))
 }
 
 /// Returns the body of a page and its length as announced, `None` if the server has no such page.
@@ -155,12 +178,11 @@ async fn get(client: &awc::Client, url: &str) -> Result<Option<(Bytes, Option<us
         return Ok(None);
     }
     if !status.is_success() {
-        return Err(ProbeError::BadAnswer(format!("status {status}")));
+        return Err(bad_answer(&format!("status {status}")));
     }
     let length = answer.headers().get(CONTENT_LENGTH).and_then(|value| value.to_str().ok()?.parse::<usize>().ok());
     let bytes = answer.timeout(NEVER).body().limit(MAX_ANSWER_SIZE).await;
-    let bytes = bytes.map_err(|error| ProbeError::BadAnswer(shortened(&error.to_string())))?;
-    Ok(Some((bytes, length)))
+    Ok(Some((bytes.map_err(|error| bad_answer(&error))?, length)))
 }
 
 /// Whether a connection broke, as opposed to one that could not be made.
@@ -171,32 +193,19 @@ fn is_broken(error: &SendRequestError) -> bool {
 fn no_answer(error: SendRequestError) -> ProbeError {
     ProbeError::Connection(match error {
         SendRequestError::Connect(ConnectError::Disconnected) => "it was closed without an answer".to_owned(),
-        error => tls::reason(&error).unwrap_or_else(|| shortened(&error.to_string())),
+        error => tls::reason(&error).unwrap_or_else(|| excerpt(&error.to_string(), MAX_REASON_LENGTH)),
     })
 }
 
-/// Parses a `/status`; it must contain a load, all else is optional.
-fn parse_status(body: &[u8]) -> Result<ServerReport, ProbeError> {
-    let report = ServerReport::parse(body).map_err(|error| {
-        let text = String::from_utf8_lossy(body.get(..body.len().min(40)).unwrap_or_default()).into_owned();
-        ProbeError::BadAnswer(shortened(&format!("{error} in {text:?}")))
-    })?;
-    plausible(report.load)?;
+/// Refuses the report of a server that can't start simulations, or whose load is not plausible.
+fn usable(report: ServerReport) -> Result<ServerReport, ProbeError> {
     match &report.problem {
-        Some(problem) => Err(ProbeError::NotReady(shortened(problem))),
+        _ if report.load.percent() > MAX_LOAD => Err(bad_answer(&format!("a load of {} %", report.load))),
+        Some(problem) => Err(ProbeError::NotReady(excerpt(problem, MAX_REASON_LENGTH))),
         None => Ok(report),
     }
 }
 
-fn plausible(load: Load) -> Result<Load, ProbeError> {
-    let is_none = load.percent() > MAX_LOAD;
-    if is_none { Err(ProbeError::BadAnswer(shortened(&format!("a load of {load} %")))) } else { Ok(load) }
-}
-
-/// Longest text of a server that is kept, in characters.
-const MAX_REASON_LENGTH: usize = 500;
-
-/// Cuts an untrusted text.
-fn shortened(text: &str) -> String {
-    excerpt(text, MAX_REASON_LENGTH)
+fn bad_answer(reason: &dyn Display) -> ProbeError {
+    ProbeError::BadAnswer(excerpt(&reason.to_string(), MAX_REASON_LENGTH))
 }

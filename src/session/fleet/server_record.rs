@@ -5,10 +5,10 @@ use std::time::{Duration, Instant, SystemTime};
 
 use serde::Serialize;
 
-use super::fleet_status::StateChange;
-use super::probe_error::ProbeError;
+use super::server_monitor::ProbeError;
 use crate::session::mail::NoticeKind;
 use crate::shared::domain::{ProjectUrl, PublicAddress, ServerReport};
+use crate::shared::run::serialize_timestamp;
 
 /// The state of a simulation server. Those that need attention come first, as on the monitor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -51,19 +51,27 @@ pub struct ServerRecord {
     pub told_full: bool,
 }
 
+/// A simulation server has changed its state, or lookups of a name have begun to fail or to succeed.
+#[derive(Debug, Clone, Serialize)]
+pub struct StateChange {
+    /// When it changed.
+    #[serde(serialize_with = "serialize_timestamp")]
+    pub at: SystemTime,
+    /// The simulation server's address, or the name.
+    pub server: String,
+    /// Its new state.
+    pub state: ServerState,
+    /// The reason, as text.
+    pub why: String,
+}
+
 /// A change of a server's state, and what is mailed to the administrator.
 pub type ServerChange = (StateChange, Vec<NoticeKind>);
 
 impl ServerState {
     /// The name of the state in pages and metrics.
-    pub fn word(self) -> &'static str {
-        match self {
-            Self::Unknown => "unknown",
-            Self::Up => "up",
-            Self::Full => "full",
-            Self::Draining => "draining",
-            Self::Down => "down",
-        }
+    pub fn word(self) -> String {
+        format!("{self:?}").to_lowercase()
     }
 }
 

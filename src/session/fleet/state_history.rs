@@ -3,8 +3,8 @@
 
 use std::collections::VecDeque;
 
-use super::fleet_status::{NameStatus, StateChange};
-use super::server_record::{ServerChange, ServerRecord, ServerState};
+use super::fleet_status::NameStatus;
+use super::server_record::{ServerChange, ServerRecord, ServerState, StateChange};
 use crate::session::config::SessionConfig;
 use crate::session::mail::{self, Notice, NoticeKind};
 use crate::shared::run::Supervisor;

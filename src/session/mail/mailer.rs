@@ -26,7 +26,9 @@ pub fn start(config: &SessionConfig) -> Supervisor<&'static str, Notice> {
             actix_rt::spawn(send_all(channel.clone(), signature.clone(), outbox.clone(), notices));
         }
     });
-    names.into_iter().for_each(|name| mailers.add(name));
+    for name in names {
+        mailers.add(name);
+    }
     mailers
 }
 

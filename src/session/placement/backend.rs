@@ -24,9 +24,9 @@ struct LastReport {
 
 /// A client that was sent to a server and has not been seen there.
 #[derive(Debug, Clone, Copy)]
-struct Placement {
+pub(super) struct Placement {
     at: Instant,
-    /// Whether it reserves room, see [`super::LoadBalancer::pick_unreserved`].
+    /// Whether it reserves room, see [`super::LoadBalancer::pick`].
     takes_room: bool,
 }
 
@@ -43,15 +43,12 @@ impl ClientDelta {
     fn unseen(&self, now: Instant) -> f64 {
         let span = if self.clients > 0.0 { SETTLING } else { MEAN_WINDOW };
         let age = now.saturating_duration_since(self.at);
-        if age >= span {
-            return 0.0;
-        }
-        self.clients * (1.0 - age.as_secs_f64() / span.as_secs_f64())
+        self.clients * (1.0 - age.as_secs_f64() / span.as_secs_f64()).max(0.0)
     }
 }
 
 /// One server of the fleet.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(super) struct Backend {
     /// Whether it answers.
     pub(super) up: bool,
@@ -59,8 +56,8 @@ pub(super) struct Backend {
     accepting: bool,
     /// The last report; kept while the server is down, to know what is new when it comes back.
     last: Option<LastReport>,
-    /// The placements whose clients have not been seen yet, oldest first.
-    in_flight: VecDeque<Placement>,
+    /// The placements whose clients have neither been seen nor given up, oldest first.
+    pub(super) in_flight: VecDeque<Placement>,
     /// Number of them that reserve room.
     reserved: usize,
     /// Number of these that were placed since the last report.
@@ -85,20 +82,11 @@ impl Backend {
     /// A server without reports: down until its first one.
     pub(super) fn new(policy: &PlacementPolicy, last_pick: u64) -> Self {
         Self {
-            up: false,
-            accepting: true,
-            last: None,
-            in_flight: VecDeque::new(),
-            reserved: 0,
-            fresh: 0,
             clients_per_placement: 1.0,
-            settling: VecDeque::new(),
-            unseen: 0.0,
-            unseen_reserved: 0.0,
             fit: CostFit::new(policy.client_cost),
             cost: believable(policy.client_cost),
-            estimate: Estimate::default(),
             last_pick,
+            ..Self::default()
         }
     }
 
@@ -184,11 +172,6 @@ impl Backend {
     /// Estimated number of clients that other session servers have sent here since the last report.
     fn sent_by_others(&self) -> f64 {
         count(self.fresh.min(self.reserved)) * (self.clients_per_placement - 1.0)
-    }
-
-    /// Number of clients that were sent here and have neither been seen nor given up.
-    pub(super) fn in_flight(&self) -> usize {
-        self.in_flight.len()
     }
 
     fn learn(&mut self, report: LastReport) {
@@ -305,7 +288,7 @@ mod tests {
         server.assert_load(12.0, 0.0);
         for (after, load, expected) in [(1.0, 10.0, 11.75), (4.0, 11.0, 12.0), (8.0, 12.0, 12.0)] {
             server.report(after, load, Some((6, 6)));
-            assert_eq!(server.0.in_flight(), 0);
+            assert_eq!(server.0.in_flight.len(), 0);
             server.assert_load(expected, 0.3);
         }
     }
@@ -333,7 +316,7 @@ mod tests {
             server.place(f64::from(second) - 0.5);
             server.report(second.into(), 10.0, Some((second, second.into())));
         }
-        assert_eq!(server.0.in_flight(), 0);
+        assert_eq!(server.0.in_flight.len(), 0);
     }
 
     #[test]
@@ -352,7 +335,7 @@ mod tests {
         server.report(1.0, 10.0, Some((6, 6)));
         let before = server.0.effective_load().unwrap();
         server.report(1.0, 10.0, Some((6, 6)));
-        assert_eq!(server.0.in_flight(), 1);
+        assert_eq!(server.0.in_flight.len(), 1);
         server.assert_load(before, 0.01);
     }
 
@@ -362,9 +345,9 @@ mod tests {
         server.place(0.0);
         server.0.up = false;
         server.report(3.0, 1.0, Some((0, 0)));
-        assert_eq!(server.0.in_flight(), 1);
+        assert_eq!(server.0.in_flight.len(), 1);
         server.assert_load(3.0, 0.1);
         server.report(4.0, 1.0, Some((1, 1)));
-        assert_eq!(server.0.in_flight(), 0);
+        assert_eq!(server.0.in_flight.len(), 0);
     }
 }

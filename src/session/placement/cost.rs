@@ -51,7 +51,7 @@ pub(super) struct Estimate {
     precision: f64,
 }
 
-/// The fit for one server: the weighted sums of its reports, and what follows from them.
+/// The fit for one server: the weighted sums of its reports.
 #[derive(Debug, Clone, Default)]
 pub(super) struct CostFit {
     guess: f64,
@@ -67,26 +67,24 @@ pub(super) struct CostFit {
     seen: f64,
     /// Number of arrivals since the last report that counted in full.
     arrived: f64,
-    base: f64,
-    slope: f64,
-    variance: f64,
 }
 
 impl CostFit {
     /// Nothing learned yet: a client costs `guess` percent.
     pub(super) fn new(guess: f64) -> Self {
         let guess = believable(guess);
-        Self { guess, idle_weight: BASE_TRUST, slope: guess, variance: guess * guess, ..Self::default() }
+        Self { guess, idle_weight: BASE_TRUST, ..Self::default() }
     }
 
     /// This server's own estimate. `believed` is the cost that was assumed until now, in percent: a high estimate is
     /// not more precise for being high.
     pub(super) fn estimate(&self, believed: f64) -> Estimate {
-        let relative = self.variance / (believed * believed);
+        let (_, slope, variance) = self.fit();
+        let relative = variance / (believed * believed);
         // One start is not evidence: any load that began at the same time would be attributed to it.
         let seen = if self.seen > 1.0 { self.seen } else { 0.0 };
         // The precision is 1 / (relative + VARIETY / seen), and 0 without evidence.
-        Estimate { log: self.slope.ln(), precision: seen / (seen * relative + VARIETY) }
+        Estimate { log: slope.ln(), precision: seen / (seen * relative + VARIETY) }
     }
 
     /// Counts clients that have arrived.
@@ -100,7 +98,9 @@ impl CostFit {
         let seconds = elapsed.min(MAX_STEP).as_secs_f64();
         let load = load.min(100.0);
         // A full machine can show that its clients cost more than assumed, but not that they cost less.
-        let says_nothing = load >= FULL && self.base + self.slope * clients >= load;
+        let (base, slope, _) = self.fit();
+        let expected = base + slope * clients;
+        let says_nothing = load >= FULL && expected >= load;
         if says_nothing || seconds == 0.0 {
             return;
         }
@@ -111,7 +111,7 @@ impl CostFit {
             self.idle_weight = weight;
         } else {
             let fade = (-seconds / MEMORY.as_secs_f64()).exp();
-            let weight = if is_foreign(load, self.base + self.slope * clients) {
+            let weight = if is_foreign(load, expected) {
                 trust * seconds * FOREIGN_TRUST
             } else {
                 self.seen += std::mem::take(&mut self.arrived);
@@ -124,10 +124,10 @@ impl CostFit {
             self.clients_by_load = self.clients_by_load * fade + weight * clients * load;
             self.seen *= fade;
         }
-        self.fit();
     }
 
-    fn fit(&mut self) {
+    /// The base and the cost of a client, both in percent of load, and the variance of the cost.
+    fn fit(&self) -> (f64, f64, f64) {
         let trust = NOISE / (self.guess * self.guess);
         let (weight, load) = (self.weight + self.idle_weight, self.load + self.idle_weight * self.idle_load);
         let squares = self.clients_squared + trust;
@@ -142,9 +142,7 @@ impl CostFit {
         } else {
             (base, (weight * products - self.clients * load) / determinant, NOISE * weight / determinant)
         };
-        self.base = base;
-        self.slope = believable(slope);
-        self.variance = variance;
+        (base, believable(slope), variance)
     }
 }
 
@@ -295,7 +293,7 @@ mod tests {
         for noise in [5.0, 8.0, 13.0, 40.0] {
             let (mut fleet, now) = taught(&[(30, 3.0, 0), (60, 5.0 + noise, 1), (10, 3.0, 0)]);
             assert_near(fleet.client_cost(&0), 2.0, 0.1);
-            let placed = (0..40).filter(|_| fleet.pick(now, |_| true).is_some()).count();
+            let placed = (0..40).filter(|_| fleet.pick(now, true, |_| true).is_some()).count();
             assert_eq!(placed, 40, "at {:?} % each", fleet.client_cost(&0));
         }
     }

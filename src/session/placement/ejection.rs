@@ -26,8 +26,8 @@ pub(super) struct Ejection {
     failed: u32,
     /// Number of ejections since the last successful start, trials excluded.
     times: u32,
-    /// The end of the ejection.
-    until: Option<Instant>,
+    /// When the ejection ends; `None` if the server is not ejected.
+    pub(super) until: Option<Instant>,
     /// Whether a client was sent there after an ejection, and the outcome of its start is not known yet.
     is_on_trial: bool,
 }
@@ -65,11 +65,6 @@ impl Ejection {
     pub(super) fn expire(&mut self, now: Instant) {
         self.until.take_if(|until| *until <= now);
     }
-
-    /// When the ejection ends; `None` if the server is not ejected.
-    pub(super) fn until(&self) -> Option<Instant> {
-        self.until
-    }
 }
 
 #[cfg(test)]
@@ -82,7 +77,7 @@ mod tests {
         for (second, failed) in (0..).zip(reports) {
             ejection.report(begin + Duration::from_secs(second), *failed);
         }
-        ejection.until().map(|until| (until - begin).as_secs())
+        ejection.until.map(|until| (until - begin).as_secs())
     }
 
     #[test]
@@ -100,13 +95,13 @@ mod tests {
         let (mut now, mut ejection, mut times) = (begin, Ejection::default(), Vec::new());
         ejection.report(now, 3);
         for failed in 4..10 {
-            let until = ejection.until().unwrap();
+            let until = ejection.until.unwrap();
             times.push((until - now).as_secs());
             now = until;
             ejection.expire(now);
-            assert_eq!(ejection.until(), None, "a client may try");
+            assert_eq!(ejection.until, None, "a client may try");
             ejection.note_pick(now);
-            assert!(ejection.until().is_some(), "one is enough");
+            assert!(ejection.until.is_some(), "one is enough");
             ejection.report(now, failed);
         }
         assert_eq!(times, [30, 60, 120, 240, 300, 300]);
@@ -124,7 +119,7 @@ mod tests {
             ejection.expire(now);
             ejection.note_pick(now);
             ejection.report(now, 3);
-            assert_eq!(ejection.until(), Some(now + Duration::from_secs(30)));
+            assert_eq!(ejection.until, Some(now + Duration::from_secs(30)));
         }
     }
 }

@@ -23,7 +23,7 @@ use std::time::{Duration, Instant};
 ///     fleet.add(id);
 ///     fleet.report(&id, now, &ServerReport::load_only(Load::try_from(load).unwrap()), true);
 /// }
-/// assert_eq!(fleet.pick(now, |_| true), Some("idle"));
+/// assert_eq!(fleet.pick(now, true, |_| true), Some("idle"));
 /// assert_eq!(fleet.effective_load(&"idle"), Some(5.0));
 /// ```
 #[derive(Debug)]
@@ -121,17 +121,10 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
 
     /// Returns the server with the lowest load among those that have room and are `eligible`, and counts the client as
     /// sent there. Of servers with equal loads it is the one that was chosen longest ago; ejected servers come last.
-    pub fn pick(&mut self, now: Instant, eligible: impl Fn(&Id) -> bool) -> Option<Id> {
-        self.pick_from(now, true, eligible)
-    }
-
-    /// The same for a client that may never arrive. It counts when servers are compared, and reserves no room: any
-    /// number of these does not make a server full before they have arrived.
-    pub fn pick_unreserved(&mut self, now: Instant, eligible: impl Fn(&Id) -> bool) -> Option<Id> {
-        self.pick_from(now, false, eligible)
-    }
-
-    fn pick_from(&mut self, now: Instant, takes_room: bool, eligible: impl Fn(&Id) -> bool) -> Option<Id> {
+    ///
+    /// A client that may never arrive does not take room: it counts when servers are compared, but any number of these
+    /// does not make a server full before they have arrived.
+    pub fn pick(&mut self, now: Instant, takes_room: bool, eligible: impl Fn(&Id) -> bool) -> Option<Id> {
         self.expire(now);
         let id = self.ranking.values().find(|id| eligible(id))?.clone();
         self.picks += 1;
@@ -166,7 +159,7 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
 
     /// Whether others are preferred to a server, because its last starts have failed.
     pub fn is_ejected(&self, id: &Id) -> bool {
-        self.servers.get(id).is_some_and(|server| server.ejection.until().is_some())
+        self.servers.get(id).is_some_and(|server| server.ejection.until.is_some())
     }
 
     /// The load, in percent, that is expected once it shows all clients that reserve room; `None` if the server is
@@ -182,7 +175,7 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
 
     /// Number of clients that were sent to a server and have neither been seen there nor been given up.
     pub fn in_flight(&self, id: &Id) -> usize {
-        self.servers.get(id).map_or(0, |server| server.backend.in_flight())
+        self.servers.get(id).map_or(0, |server| server.backend.in_flight.len())
     }
 
     /// Expected cost of a client on a server, in percent of load; `None` if it is not in the fleet.
@@ -195,7 +188,7 @@ impl Server {
     /// Updates the rank of a server after a change.
     fn sort_in<Id: Clone>(&mut self, id: &Id, policy: &PlacementPolicy, ranking: &mut BTreeMap<Rank, Id>) {
         let load = self.backend.rank_load().filter(|_| self.backend.has_room(policy));
-        let (is_ejected, last_pick) = (self.ejection.until().is_some(), self.backend.last_pick);
+        let (is_ejected, last_pick) = (self.ejection.until.is_some(), self.backend.last_pick);
         let rank = load.map(|load| Rank { is_ejected, load: load.to_bits(), last_pick });
         if self.rank != rank {
             self.rank.map(|before| ranking.remove(&before));
@@ -256,7 +249,7 @@ mod tests {
             fleet.add(0);
             fleet.report(&0, now, &report(load, instances), accepting);
             assert_eq!(fleet.available(now), available, "{why}");
-            assert_eq!(fleet.pick(now, |_| true).is_some(), available, "{why}");
+            assert_eq!(fleet.pick(now, true, |_| true).is_some(), available, "{why}");
         }
     }
 
@@ -271,7 +264,7 @@ mod tests {
                 if step % 100 == 0 {
                     (0..3).for_each(|id| fleet.report(&id, at, &report(10.0 * f64::from(id + 1)), true));
                 }
-                let id = fleet.pick_unreserved(at, |_| true).unwrap();
+                let id = fleet.pick(at, false, |_| true).unwrap();
                 got[usize::try_from(id).unwrap()] += 1;
                 assert!(fleet.available(at));
             }
@@ -286,7 +279,7 @@ mod tests {
     fn a_client_without_room_that_has_come_takes_room() {
         let now = Instant::now();
         let mut fleet = fleet(2.0, now, [full_report(10.0, 0, 0)]);
-        fleet.pick_unreserved(now, |_| true);
+        fleet.pick(now, false, |_| true);
         assert_eq!((fleet.effective_load(&0), fleet.in_flight(&0)), (Some(10.0), 1));
         fleet.report(&0, now, &full_report(10.0, 1, 1), true);
         assert_eq!((fleet.effective_load(&0), fleet.in_flight(&0)), (Some(12.0), 0));
@@ -297,8 +290,8 @@ mod tests {
         let now = Instant::now();
         let mut fleet = fleet(2.0, now, [10.0, 20.0].map(|load| ServerReport { failed_starts: 5, ..load_only(load) }));
         assert!(fleet.available(now));
-        assert_eq!(fleet.pick(now, |_| true), Some(0));
-        assert_eq!(fleet.pick(now, |id| *id == 1), Some(1));
+        assert_eq!(fleet.pick(now, true, |_| true), Some(0));
+        assert_eq!(fleet.pick(now, true, |id| *id == 1), Some(1));
     }
 
     #[test]
@@ -308,13 +301,13 @@ mod tests {
         let mut beside = [(); 2].map(|()| fleet(0.25, now, [report(0)]));
         for client in 0..300_u32 {
             let at = now + Duration::from_secs(client.into());
-            beside[usize::from(client % 2 == 0)].pick(at, |_| true);
+            beside[usize::from(client % 2 == 0)].pick(at, true, |_| true);
             for fleet in &mut beside {
                 fleet.report(&0, at, &report(client + 1), true);
             }
         }
         let at = now + Duration::from_mins(5);
-        let placed = beside.map(|mut fleet| std::iter::from_fn(|| fleet.pick(at, |_| true)).count());
+        let placed = beside.map(|mut fleet| std::iter::from_fn(|| fleet.pick(at, true, |_| true)).count());
         assert!(placed.iter().all(|placed| (95..=115).contains(placed)), "200 places are left: {placed:?}");
     }
 
@@ -328,7 +321,7 @@ mod tests {
         let mut placed = 0;
         for second in 2..15 {
             let at = now + Duration::from_secs(second);
-            placed += std::iter::from_fn(|| fleet.pick(at, |_| true)).count();
+            placed += std::iter::from_fn(|| fleet.pick(at, true, |_| true)).count();
             fleet.report(&0, at, &report(1_000), true);
         }
         assert_eq!(placed, 20, "of 20 clients that wait for 20 places");
@@ -337,7 +330,7 @@ mod tests {
     /// Sends this many clients at once; returns how many each server got.
     fn burst(fleet: &mut LoadBalancer<u32>, now: Instant, clients: usize, servers: u32) -> Vec<usize> {
         for _ in 0..clients {
-            fleet.pick(now, |_| true);
+            fleet.pick(now, true, |_| true);
         }
         (0..servers).map(|id| fleet.in_flight(&id)).collect()
     }
@@ -376,8 +369,8 @@ mod tests {
                 match action {
                     0 => fleet.lose(&id),
                     1 => { fleet.remove(&id); fleet.add(id); }
-                    2 => prop_assert_eq!(fleet.available(now), fleet.pick(now, |_| true).is_some()),
-                    3 => prop_assert_eq!(fleet.available(now), fleet.pick_unreserved(now, |_| true).is_some()),
+                    2 => prop_assert_eq!(fleet.available(now), fleet.pick(now, true, |_| true).is_some()),
+                    3 => prop_assert_eq!(fleet.available(now), fleet.pick(now, false, |_| true).is_some()),
                     _ => fleet.report(&id, now, &report(load, instances.map(counts)), action > 4),
                 }
                 for id in 0..3 {

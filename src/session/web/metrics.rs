@@ -25,13 +25,13 @@ pub fn gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> 
         Gauge::plain(
             "webots_session_load_percent",
             "Mean load of the servers that answer, -1 where none does",
-            status.displayed_mean_load(),
+            status.mean_load.unwrap_or(-1.0),
         ),
         Gauge {
             name: "webots_session_servers",
             help: "Simulation servers by state",
             labels: &["state"],
-            values: all.iter().map(|state| (vec![state.word().to_owned()], number(count(*state)))).collect(),
+            values: all.iter().map(|state| (vec![state.word()], number(count(*state)))).collect(),
         },
         of_servers("webots_session_server_up", "1 while a simulation server gives good answers", &|server| {
             Some(f64::from(u8::from(!matches!(server.record.state, ServerState::Down | ServerState::Unknown))))

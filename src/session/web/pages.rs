@@ -139,9 +139,9 @@ impl<'status> Glance<'status> {
         let count = |wanted: &[ServerState]| {
             status.servers.iter().filter(|server| wanted.contains(&server.record.state)).count()
         };
-        let instances = || status.servers.iter().filter_map(instances);
+        let instances: Vec<_> = status.servers.iter().filter_map(|one| one.record.current()?.instances).collect();
         // Numbers that another server reports may be arbitrarily large.
-        let sum = |part: fn(Instances) -> u32| instances().map(|one| u64::from(part(one))).sum::<u64>();
+        let sum = |part: fn(&Instances) -> u32| instances.iter().map(|one| u64::from(part(one))).sum();
         Self {
             status,
             clients,
@@ -175,7 +175,7 @@ impl<'server> ServerRow<'server> {
             load,
             load_value: sort_value(load),
             effective_value: sort_value(server.effective_load),
-            instances: instances(server),
+            instances: report.and_then(|report| report.instances),
             repositories: repositories.iter().map(|prefix| one_line(without_scheme(prefix.as_str()))).collect(),
             accepted,
             version: report.map(|report| report.version.as_str()).unwrap_or_default(),
@@ -190,10 +190,6 @@ impl Changes<'_> {
     fn time(at: &SystemTime) -> String {
         timestamp(*at)
     }
-}
-
-fn instances(server: &ServerStatus) -> Option<Instances> {
-    server.record.current()?.instances
 }
 
 fn without_scheme(url: &str) -> &str {

@@ -13,7 +13,7 @@ use super::metrics;
 use super::page_routes;
 use super::status::status_page;
 use super::web_client::WebClient;
-use crate::session::fleet::{Pick, PickError};
+use crate::session::fleet::PickError;
 use crate::session::state::AppState;
 use crate::shared::http::routing::{self, GET, READ, path, retry_after};
 use crate::shared::http::{CONTENT_TYPE, ConnectionKind, websocket};
@@ -50,7 +50,7 @@ async fn session(request: HttpRequest, stream: web::Payload, server: web::Data<A
     }
     let from = server.config.trusted_proxies.peer(&request).rate_limit_key();
     let world = wanted_world(request.query_string());
-    let picked = server.pick(Pick::parse(world.as_deref(), from)).await;
+    let picked = server.pick(world.as_deref(), from).await;
     let status = match &picked {
         Ok(_) => StatusCode::OK,
         // As the Python server answers: clients such as PHP's `file_get_contents` read no body with another status.
@@ -96,7 +96,7 @@ async fn availability(server: web::Data<AppState>) -> HttpResponse {
 }
 
 async fn load(server: web::Data<AppState>) -> HttpResponse {
-    let load = server.status().await.map_or(-1.0, |status| status.displayed_mean_load());
+    let load = server.status().await.ok().and_then(|status| status.mean_load).unwrap_or(-1.0);
     HttpResponse::Ok().content_type("text/plain").body(load.to_string())
 }
 

@@ -15,7 +15,6 @@ use serde::Deserialize;
 use tokio::sync::watch;
 
 use crate::session::config::Announcement;
-use crate::session::fleet::Pick;
 use crate::session::state::AppState;
 use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::websocket::wrong_message;
@@ -49,7 +48,7 @@ impl WebClient {
     fn pick(&self, text: &str, ctx: &mut Context) {
         let server = Arc::clone(&self.server);
         let (wanted, from) = (wanted_world(text), self.peer.rate_limit_key());
-        let picked = async move { server.pick(Pick::parse(wanted.as_deref(), from)).await };
+        let picked = async move { server.pick(wanted.as_deref(), from).await };
         // The actor handles nothing else until then, so that answers keep the order of the texts and precede a close.
         picked
             .into_actor(self)
