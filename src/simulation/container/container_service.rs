@@ -61,7 +61,9 @@ impl ContainerService {
         if let Some(why) = &shortcoming {
             log::warn!("{why}");
         }
-        templates::faults(&config.container).iter().for_each(|fault| log::error!("{fault}"));
+        for fault in templates::faults(&config.container) {
+            log::error!("{fault}");
+        }
         let images = Images::new(docker.clone(), owner.clone(), Arc::clone(&config));
         let (images, active) = (Arc::new(images), ActiveProjects::default());
         let keeper = run_cleanup(owner.clone(), active.clone(), Arc::clone(&images), Arc::clone(&config));
