@@ -38,15 +38,23 @@ impl Drop for Xvfb {
     }
 }
 
-/// An authority file with one cookie for all displays of this machine.
-fn authority(folder: &Path) -> std::path::PathBuf {
-    let file = folder.join("authority");
-    let mut entry = vec![0xff, 0xff, 0, 0, 0, 0];
-    for part in [b"MIT-MAGIC-COOKIE-1".as_slice(), b"sixteen letters!".as_slice()] {
-        entry.extend(u16::try_from(part.len()).unwrap().to_be_bytes());
-        entry.extend(part);
+const COOKIE: &[u8; 16] = b"sixteen letters!";
+/// The families of an authority file: every host, and the one of that name.
+const EVERY: u16 = 0xffff;
+const NAMED: u16 = 256;
+
+/// An authority file with these cookies, each for a family, a host and the number of a display.
+fn authority(folder: &Path, name: &str, cookies: &[(u16, &str, &str, &[u8; 16])]) -> std::path::PathBuf {
+    let file = folder.join(name);
+    let mut all = Vec::new();
+    for (family, host, number, cookie) in cookies {
+        all.extend(family.to_be_bytes());
+        for part in [host.as_bytes(), number.as_bytes(), b"MIT-MAGIC-COOKIE-1", cookie.as_slice()] {
+            all.extend(u16::try_from(part.len()).unwrap().to_be_bytes());
+            all.extend(part);
+        }
     }
-    std::fs::write(&file, entry).unwrap();
+    std::fs::write(&file, all).unwrap();
     file
 }
 
@@ -62,7 +70,7 @@ async fn an_open_display_is_told_from_one_that_refuses_until_it_is_opened_and_on
     assert!(words.starts_with(&format!("no display answers at {gone}: ")) && words.contains("Xvfb"), "{words}");
     assert!(words.contains("nvidia-xconfig --allow-empty-initial-configuration"), "{words}");
 
-    let cookies = authority(folder.path());
+    let cookies = authority(folder.path(), "all", &[(EVERY, "", "", COOKIE)]);
     let locked = Xvfb::start(Some(&cookies));
     let words = check(&locked.display).unwrap_err();
     let refused = format!("the display {} refuses this user (Authorization required", locked.display);
@@ -102,14 +110,19 @@ async fn check_tells_which_case_it_is() {
     let _alone = display::alone().await;
     let folder = tempfile::tempdir().unwrap();
     let open = Xvfb::start(None);
-    let cookies = authority(folder.path());
+    let cookies = authority(folder.path(), "all", &[(EVERY, "", "", COOKIE)]);
     let locked = Xvfb::start(Some(&cookies));
     let (open, locked) = (open.display.as_str(), locked.display.as_str());
+    let (host, wrong) = (std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap(), b"sixteen numbers!");
+    let (host, number) = (host.trim(), locked.trim_start_matches(':'));
+    let several = [(NAMED, "another", "", wrong), (NAMED, host, "9999", wrong), (NAMED, host, number, COOKIE)];
+    let several = authority(folder.path(), "several", &several);
     let table = [
         (Some(open), None, None, format!("display: {open} answers (the environment variable DISPLAY names it)")),
         (Some("nonsense"), Some(open), None, format!("display: {open} answers (the configuration names it)")),
         (Some(locked), None, None, format!("warning: display: the display {locked} refuses this user")),
         (Some(locked), None, Some(cookies.to_str().unwrap()), format!("display: {locked} answers")),
+        (Some(locked), None, Some(several.to_str().unwrap()), format!("display: {locked} answers")),
         (Some(":59000"), None, None, "warning: display: no display answers at :59000: start an X server".to_owned()),
         (Some("nonsense"), None, None, "warning: display: \"nonsense\" is no display".to_owned()),
     ];
