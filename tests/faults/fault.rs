@@ -119,7 +119,7 @@ async fn stop_server(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
 async fn signal(fleet: &Fleet, random: &mut SmallRng, words: &str, signal: Signal) -> bool {
     let deadline = Instant::now() + WHILE;
     while Instant::now() < deadline {
-        let all = (0..SERVERS).flat_map(|index| instances_below(&fleet.folder(index)));
+        let all = instances_below(fleet.root()).into_iter();
         let all: Vec<i32> = all.filter(|(_, command)| command.contains(words)).map(|(pid, _)| pid).collect();
         if !all.is_empty() {
             return kill(Pid::from_raw(all[random.random_range(0..all.len())]), signal).is_ok();

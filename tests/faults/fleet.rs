@@ -102,6 +102,11 @@ impl Fleet {
         }
     }
 
+    /// Where the files of all servers are.
+    pub fn root(&self) -> &Path {
+        self.folder.path()
+    }
+
     /// Where a server's files are.
     pub fn folder(&self, index: usize) -> PathBuf {
         self.folder.path().join(format!("server-{index}"))
