@@ -1,6 +1,6 @@
 //! A fleet for interactive robot simulations in the browser: a session server and simulation servers.
 //!
-//! They succeed two Python servers, which comments call the original. This page is the map. Each directory is a module:
+//! They replace two Python servers; comments call those *the original*. This page is the map. Each directory is a module:
 //! its `mod.rs` says what belongs there and re-exports its public API.
 //!
 //! | module | contents |
@@ -10,35 +10,36 @@
 //! | [`shared::domain`] | addresses, loads, world URLs and the forges that they name (`project_url`), a server's report |
 //! | [`shared::run`] | start, readiness, log, stop |
 //! | [`shared::http`] | pages, live updates, WebSockets, limits, certificates, metrics |
-//! | [`session::placement`] | which server gets the next client: ranking, load, cost |
+//! | [`session::placement`] | which server gets the next client: ranking (`load_balancer`), the load that is ranked (`backend`), cost |
 //! | `session::announcements` | the administrator's message to all clients |
-//! | [`session::mail`] | notices: to whom (`smtp`), what is in them (`notice_text`), when they go (`outbox`), by mail and by webhook |
+//! | [`session::mail`] | notices: to whom (key `administrator`: `config/session_config`, `config/mail_address`) and how (`smtp`, `webhook`), what is in them (`notice_text`), when they go (`outbox`) |
 //! | [`session::fleet`] | the registry and the monitors of simulation servers |
-//! | [`session::web`] | routes, pages, `/status`, Prometheus metrics and the WebSocket of the session server |
-//! | [`simulation::process`] | process trees: how they start and end (`process_group`; what has left its group: `process_tree`); directories of simulations |
+//! | [`session::web`] | routes, pages, `/status`, Prometheus gauges (`metrics`; counters: `app`) and the WebSocket of the session server |
+//! | [`simulation::process`] | process trees: how they start and end (`process_group`; what a server that has died left: `process_tree`, `guardian`); directories of simulations |
 //! | [`simulation::machine`] | readings of the machine and its GPUs, the load; which GPU a simulation gets (`spread`) |
-//! | [`simulation::checkout`] | worlds checked out with git, within the limits that keys give (`timing.checkout`, `projectSize`) |
-//! | `simulation::isolation` | how a simulation is launched: its level of isolation, the variables that it inherits, limits |
+//! | [`simulation::checkout`] | worlds checked out with git; `timing.checkout` limits a whole checkout (`checkout_service`) and a stalled fetch (`git`), `projectSize` its size; `config/mirrors` has the address of each Git host |
+//! | `simulation::isolation` | how a simulation is launched: its level of isolation (`launcher`), the variables that it inherits, limits; the control group that ends with it (`cgroup`) |
 //! | [`simulation::container`] | simulations in containers: what a project requests, its image, its compose project (its GPU and user, too) |
 //! | [`simulation::ends`] | how simulations have ended: counter, table, their logs (`kept_output`) |
-//! | [`simulation::webots`] | one running Webots: command line, its GPU (`launch_spec`), what it prints and its log (`output`), end |
-//! | [`simulation::client`] | one web client, the session of its simulation |
+//! | [`simulation::webots`] | one running Webots: its command line and GPU (`launch_spec`), its log (opened by `launched`, written by `output`), end |
+//! | [`simulation::client`] | a client's WebSocket (`web_client`), the session of its simulation, which sends it nearly all messages (`session`; `start`: before Webots runs, with the choice of the GPU) |
 //! | [`simulation::sessions`] | how a connection is attached to its session, and how a client resumes it |
-//! | [`simulation::slots`] | the slots that clients wait for: leases, the queue (`slot_pool`), shares (`party`), the streams of simulations and the tokens that lead to them (`stream`) |
+//! | [`simulation::slots`] | the slots that clients wait for: leases, the queue and the shares of addresses and users (`slot_pool`), the streams of simulations and the tokens that lead to them (`stream`) |
 //! | `simulation::relay` | a stream between a client and the port of its Webots |
-//! | `simulation::web` | routes, pages, `/status` and Prometheus metrics of the simulation server |
+//! | `simulation::web` | routes, pages, `/status` and Prometheus gauges of the simulation server (`metrics`; counters and histograms: `app`, `ends`) |
 //!
-//! The HTML of pages is in `templates/session` and `templates/simulation` (`row.html`: a row of the monitor's table), their
-//! styles and scripts in `templates/assets`.
+//! The HTML of pages is in `templates/session` and `templates/simulation` (`monitor.html`: the head of
+//! the monitor's table, `row.html`: a row), their styles (`style.css`) and scripts in `templates/assets`.
 //!
 //! Each server also has a folder `config` (every key; time limits in `timing`), its `app` (start and end) and its `state`
-//! (what its paths share). Files of `simulation` are the wire [`protocol`](simulation::protocol), the `snapshot` of all simulations, the `simulation_id`, the
-//! `client_identity`, the `failed_starts`, the `announcer` (key `notify`), `preflight` (`--check`) and `readiness` (`/health`).
+//! (what its paths share). Files of `simulation` are the wire [`protocol`](simulation::protocol), the `snapshot` of all
+//! simulations, the `simulation_id`, the `client_identity`, the `failed_starts`, the `announcer` (key `notify`), `preflight` (`--check`) and `readiness` (`/health`).
 //! The programs are in `src/bin`.
 //! Imports point down only, in the order that `tests/project/layering.rs` lists. `session` and `simulation` never see each
-//! other. A child never names its parent: it is given a `Recipient` of its events, which are defined in the child's file.
+//! other. A child never names its parent. The parent gives it a `Recipient` for the child's events, which the child's file
+//! defines.
 //!
-//! # Messages between actors
+//! # Who talks to whom
 //!
 //! ```text
 //! session server
@@ -59,15 +60,15 @@
 //!     | one per simulation  |  |
 //!   Session --- SlotLease -----'  |
 //!     ^  ^------- SlotEvent --'
-//!     |  |--- checkout (its search is shared by all clients of a world, each copy has a thread) --> git
+//!     |  |--- checkout (clients of a world share the search for its commit; each copy has its own thread) --> git
 //!     |  '--- starts ---> Webots (one per simulation) --> Webots' process group, in a sandbox
 //!     '------ WebotsEvent ---'
 //! ```
 //!
 //! The [`session::fleet::Registry`] alone decides availability: it receives every report and every pick. A
-//! [`simulation::webots::Webots`] owns its process group, its instance directory and the lease of its slot through
-//! guards, so that all three are freed in any state, even after a panic. One [`simulation::process::guardian`] process
-//! ends everything that the simulation server has started once the server has exited for any reason.
+//! [`simulation::webots::Webots`] holds its process group, its instance directory and the lease of its slot in
+//! guards. Dropping it frees all three, whatever its state, even after a panic. When the simulation server exits, for
+//! whatever reason, its [`simulation::process::guardian`] process ends everything that the server has started.
 //! One `simulation::isolation::Watcher` enforces the limits that the kernel does not, and notes what simulations use. One
 //! thread copies all streams that are relayed; the server exits if it panics.
 //!
@@ -76,24 +77,24 @@
 //! | actor or task | ends by itself | after a panic |
 //! |---|---|---|
 //! | Registry, `LoadMonitor` | never | the server logs it and exits with code 1: the service manager restarts it |
-//! | monitor | when its server leaves the configuration, or its name no longer resolves to it and it does not answer | its supervisor starts a new one |
+//! | monitor | when its server is removed from the configuration, or no name resolves to that server any more and the server does not answer | its supervisor starts a new one |
 //! | mailer | never | its supervisor starts a new one; unsent notices are lost |
 //! | `WebClient` | with its connection | its connection closes, and its session is notified |
 //! | `Session` | with its simulation, or its client | its lease is released, and its client is notified |
 //! | Webots | with its process tree; it is never restarted, its client is notified | its process tree is killed at once, its directory removed, its slot released |
 //!
-//! The `SlotPool` is no actor: a mutex holds it, and a panic meanwhile ends the server with exit code 1, too.
+//! The `SlotPool` is no actor: a mutex guards it. A panic while that mutex is locked also ends the server with exit code 1.
 //! The registry runs the supervisors ([`shared::run::Supervisor`], one for each kind). More than five panics of a kind
 //! within a minute end the server with exit code 1, too.
 //!
 //! # Facts about actix 0.13 that this relies on
 //!
-//! 1. A `Supervisor` restarts an actor that has stopped with the same value: resetting it is its own job.
+//! 1. actix's own `Supervisor` restarts a stopped actor and reuses its value: the actor must reset its own state.
 //! 2. After a panic in a handler the actor is dropped, not restarted, and every later message fails as 'closed'.
 //! 3. When the system ends, an actor is dropped without `stopped`. Only `Drop` always runs.
 //! 4. tokio's `kill_on_drop` reaches the direct child only; Webots' launcher has a child of its own.
-//! 5. If the peer of a WebSocket does not read, its actor is not polled once the buffers are full: such a connection
-//!    must be closed before that, see [`shared::http::liveness`].
+//! 5. If a WebSocket's peer stops reading, the buffers fill, and from then on the connection's actor is no longer polled.
+//!    The connection must be closed before that happens, see [`shared::http::liveness`].
 
 pub mod session;
 pub mod shared;

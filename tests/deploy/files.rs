@@ -20,7 +20,7 @@ fn run(package: &str, program: &str, arguments: &[&str]) -> (bool, String) {
 }
 
 #[test]
-fn the_units_expose_little() {
+fn the_units_expose_little_and_start_again_what_hangs_or_fails() {
     // The simulation server runs programs of others on the graphics card and a display, and can't close itself off more.
     // A user's own manager can't take away more than system calls.
     for (unit, most) in [
@@ -37,6 +37,10 @@ fn the_units_expose_little() {
             said.lines().find(|line| line.contains("Overall exposure level")).unwrap_or_else(|| panic!("{said}"));
         let level: f64 = line.rsplit(": ").next().unwrap().split_whitespace().next().unwrap().parse().unwrap();
         assert!(level <= most, "{unit}: {level}\n{said}");
+        let text = std::fs::read_to_string(&file).unwrap();
+        for line in ["Type=notify", "WatchdogSec=30", "Restart=on-failure", "RestartPreventExitStatus=2"] {
+            assert!(!unit.contains('@') || text.lines().any(|one| one == line), "{unit} has no {line}");
+        }
     }
 }
 

@@ -147,9 +147,9 @@ make_root() {
     [[ -n $(debian_mirror) ]] || skip 'this is no Debian or Ubuntu with a package mirror'
     rm -rf "$ROOT"
     echo "makes a clean $DISTRIBUTION, once"
-    # What was downloaded stays, and the lists of packages.
+    # What was downloaded stays, and the lists of packages. mmdebstrap itself wants no recommended packages.
     make_debian "$DISTRIBUTION" "$PACKAGES" "$ROOT" --skip=cleanup/apt \
-        --customize-hook="chroot \"\$1\" apt-get install --quiet --yes --download-only ${LATER[*]}" >"$WORK/mmdebstrap.log" 2>&1 || {
+        --customize-hook="chroot \"\$1\" apt-get --option APT::Install-Recommends=true install --quiet --yes --download-only ${LATER[*]}" >"$WORK/mmdebstrap.log" 2>&1 || {
         tail -n 5 "$WORK/mmdebstrap.log" >&2
         fail 'mmdebstrap failed'
     }

@@ -67,7 +67,7 @@ main() {
     if in_machine runuser -u webots-simulation -- cat /etc/webots-fleet/session/main.json 2>/dev/null; then
         fail "a simulation can read the session server's secrets"
     fi
-    in_machine systemd-analyze verify webots-session@main.service webots-simulation@main.service || fail 'systemd finds faults'
+    in_machine systemd-analyze verify webots-session@main.service webots-simulation@main.service webots-fleet-packet-filter.service || fail 'systemd finds faults'
 
     echo 'starts both servers, simulation servers first'
     make_project /srv/webots-demo/project worlds/a.wbt
@@ -218,6 +218,7 @@ main() {
     # Of a desktop session there is what starts the units of a user.
     in_machine sh -c 'printf "[Unit]\nBindsTo=graphical-session.target\nBefore=graphical-session.target\n" >/etc/systemd/user/desktop.target'
     as_lab systemctl --user daemon-reload
+    as_lab systemd-analyze --user verify webots-session@main.service webots-simulation@main.service || fail 'systemd finds faults in units of a user'
     as_lab bash -euo pipefail /mnt/packages/commands 2>/dev/null || fail "$(as_lab systemctl --user status 'webots-*' 2>&1)"
     eventually answers 1999 /status '"state":"\(up\|full\)"'
     simulate https://github.com/cyberbotics/demo/blob/main/worlds/a.wbt &

@@ -37,6 +37,8 @@ fn the_rules_forward_the_ports_of_the_configurations_and_no_others() {
     let ranges = in_the_guide();
     assert_eq!(ranges.len(), 2, "{ranges:?}");
     assert_eq!(ranges[0], shipped(), "the package has another configuration than the guide");
+    let opened = found(r"to any port (\S+) proto tcp", GUIDE);
+    assert_eq!(opened, [format!("{}:{}", ranges[1].start(), ranges[1].end())], "the firewall");
     for (name, rules) in RULES {
         // In what counts, and in what has a '#' in front; WebSockets have rules of their own in Apache.
         let each = if name == "apache.conf" { 2 } else { 1 };

@@ -112,7 +112,7 @@ fn no_file_has_what_its_place_forbids() {
         // A front page, without code.
         (
             r"(/mod|^src/lib)\.rs$",
-            r"(?m)\*|^ *(pub(\(crate\))? )?(fn|struct|enum|trait|impl|const|static|type|macro_rules)\b",
+            r"(?m)\*|^ *(pub(\([a-z]+\))? )?((async|unsafe|const) )*(fn|struct|enum|trait|impl|const|static|type|macro_rules)\b|!\(",
         ),
     ];
     for (files, forbidden) in rules {

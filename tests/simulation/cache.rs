@@ -40,7 +40,7 @@ type Damage = fn(&Path);
 #[actix_rt::test]
 async fn a_damaged_cache_heals() {
     let server = server_of(reader(), 2).start().await;
-    let damage: [(&str, Damage); 8] = [
+    let damage: [(&str, Damage); 9] = [
         ("a pack is cut", |repository| change_packs(repository, |bytes| bytes.truncate(4))),
         ("a pack has noise", |repository| {
             change_packs(repository, |bytes| {
@@ -51,6 +51,11 @@ async fn a_damaged_cache_heals() {
         ("it is empty", |repository| {
             std::fs::remove_dir_all(repository).unwrap();
             std::fs::create_dir(repository).unwrap();
+        }),
+        ("its init was killed", |repository| {
+            std::fs::remove_dir_all(repository).unwrap();
+            std::fs::create_dir(repository).unwrap();
+            std::fs::write(repository.join("config.lock"), "").unwrap();
         }),
         ("it is gone", |repository| std::fs::remove_dir_all(repository).unwrap()),
         ("no objects", |repository| std::fs::remove_dir_all(repository.join("objects")).unwrap()),

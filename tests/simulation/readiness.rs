@@ -2,6 +2,7 @@
 
 use serde_json::Value;
 
+use super::scene::{instance_folders, nothing_left};
 use crate::support::{
     Client, Forge, Server, Webots, arm, demo_server, http, is_told, session_server, simulation_server, until,
 };
@@ -102,4 +103,19 @@ async fn the_limit_of_files_is_raised_as_far_as_it_is_needed_and_one_without_cli
     assert!(few.log().contains("300 files may be open, which is enough for 46 clients"), "{}", few.log());
     let said = demo_server(1).files(128).refused(1).await;
     assert!(said.starts_with("error: 128 files may be open, which is not enough for 1 places"), "{said}");
+}
+
+#[actix_rt::test]
+async fn clients_that_leave_at_once_leave_no_folder() {
+    let server = demo_server(8).start().await;
+    let visitor = async |number: u64| {
+        for visit in 0..40 {
+            let client = Client::start(&server, &arm()).await;
+            actix_rt::time::sleep(std::time::Duration::from_millis((number + 5 * visit) % 50)).await;
+            client.leave().await;
+        }
+    };
+    futures_util::future::join_all((0..8).map(visitor)).await;
+    until("no folder is left", async || instance_folders(&server.folder).is_empty()).await;
+    nothing_left(&server, 8).await;
 }

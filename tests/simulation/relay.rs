@@ -297,8 +297,11 @@ async fn no_trick_leads_anywhere_else() {
     for path in [
         format!("{path}/../status"),
         format!("{path}/%2e%2e/a.png"),
+        format!("{path}/a%2f..%2fb"),
+        format!("{path}//{elsewhere}/"),
         format!("{path}@{elsewhere}/"),
         format!("{path}:80/a.png"),
+        format!("{path}/a%0d%0aHost:%20{elsewhere}"),
         format!("/%73tream/{token}/a.png"),
         format!("/stream/{wrong}/a.png"),
         format!("/stream/{}/a.png", &token[..47]),

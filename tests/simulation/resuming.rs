@@ -289,7 +289,7 @@ async fn who_comes_back_counts_for_the_address_that_has_asked_and_keeps_to_allow
 
 #[actix_rt::test]
 async fn a_class_that_vanishes_at_once_comes_back_to_the_same_simulations() {
-    const CLASS: usize = 40;
+    const CLASS: usize = 100;
     let change = |builder: Builder| builder.set("timing.launch", 60).set("timing.heartbeat", 2);
     let server = change(quick(demo_server(2 * u16::try_from(CLASS).unwrap()))).start().await;
     let mut class = Vec::new();

@@ -1,6 +1,6 @@
 //! Task: probes one simulation server.
 //!
-//! Created by the registry for each simulation server. Every [`ProbeSettings::interval`] it requests the server's
+//! Started by the registry for each simulation server. Every [`ProbeSettings::interval`] it requests the server's
 //! state, one request at a time, and sends the result to the registry. If the registry's mailbox is full, the result is
 //! dropped: the next probe replaces it. The task ends when the registry drops its channel; after a panic the registry
 //! starts a new one.

@@ -102,7 +102,10 @@ impl Backend {
     ) {
         let report = LastReport { at: now, load: report.load.percent(), instances: report.instances };
         self.note_changes(report, replicas);
-        self.fresh = 0;
+        // The same report may be judged again, as after a change of names.
+        if self.last.is_none_or(|last| last.at < now) {
+            self.fresh = 0;
+        }
         self.settle(now);
         self.learn(report);
         self.last = Some(report);

@@ -61,7 +61,7 @@ struct Rank {
 }
 
 /// Interval between checks for placements and ejections that expire.
-const CHECK_INTERVAL: Duration = Duration::from_millis(250);
+const CHECK_INTERVAL: Duration = Duration::from_millis(100);
 
 impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
     /// A fleet without servers.

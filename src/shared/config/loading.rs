@@ -73,7 +73,8 @@ fn parse<C: Configuration>(file: &Path) -> Result<(C, Vec<String>), String> {
         return Err(format!("{key}: it is missing"));
     }
     let known = known_keys(&config);
-    let unknown = given.keys().filter(|key| !known.contains(key));
+    // `part.key` is known as a name for a hint: it is a key inside of its part only.
+    let unknown = given.keys().filter(|key| key.contains('.') || !known.contains(key));
     let mut warnings: Vec<String> = unknown.map(|key| unknown_key(key, &known)).collect();
     warnings.extend(config.complete(file)?);
     Ok((config, warnings))
@@ -109,6 +110,13 @@ mod tests {
     #[serde(rename_all = "camelCase")]
     struct Small {
         load_refresh: f64,
+        timing: Timing,
+    }
+
+    #[derive(Default, serde::Deserialize, Serialize)]
+    #[serde(default)]
+    struct Timing {
+        stop: u32,
     }
 
     impl Configuration for Small {
@@ -121,11 +129,16 @@ mod tests {
     fn an_unknown_key_is_told_once_with_the_most_similar_one() {
         let file = tempfile::NamedTempFile::new().unwrap();
         let again = r#""loadRefrsh": 1, "#.repeat(100);
-        std::fs::write(file.path(), format!(r#"{{"loadRefresh": 1, {again} "colour": 2}}"#)).unwrap();
+        std::fs::write(
+            file.path(),
+            format!(r#"{{"loadRefresh": 1, {again} "colour": 2, "timing": {{}}, "timing.stop": 2}}"#),
+        )
+        .unwrap();
         let told = load::<Small>(file.path()).unwrap().warnings;
         let expected = [
             r#"unknown key "colour" is ignored"#,
             r#"unknown key "loadRefrsh" is ignored; did you mean "loadRefresh"?"#,
+            r#"unknown key "timing.stop" is ignored; did you mean "timing.stop"?"#,
         ];
         assert_eq!(told, expected.map(|words| format!("{}: {words}", file.path().display())));
     }

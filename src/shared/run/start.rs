@@ -43,7 +43,10 @@ pub fn check<C: Configuration>(loaded: &LoadedConfig<C>) {
     for warning in &loaded.warnings {
         eprintln!("warning: {}", one_line(warning));
     }
-    let text = serde_json::to_string_pretty(&loaded.config).unwrap_or_else(|error| format!("error: {error}"));
+    let text = serde_json::to_string_pretty(&loaded.config).unwrap_or_else(|error| {
+        eprintln!("error: {error}");
+        std::process::exit(WRONG_CONFIGURATION)
+    });
     // The reader may have closed the pipe.
     writeln!(std::io::stdout(), "{text}").ok();
 }

@@ -18,12 +18,12 @@ pub async fn blocking<T: Send + 'static>(work: impl FnOnce() -> io::Result<T> + 
     actix_rt::task::spawn_blocking(work).await?
 }
 
-/// Removes what a killed git has left: a lock that would make every later fetch fail, and incomplete packs.
+/// Removes what a killed git has left: locks that would make every later fetch fail, and incomplete packs.
 pub fn remove_leftovers(repository: &Path) {
     let is_unfinished = |name: &[u8]| name.starts_with(b"tmp_") || name.starts_with(b".tmp-");
     let packs = fs::read_dir(repository.join("objects/pack")).into_iter().flatten().flatten();
     let unfinished = packs.filter(|pack| is_unfinished(pack.file_name().as_encoded_bytes())).map(|pack| pack.path());
-    for path in unfinished.chain([repository.join("shallow.lock")]) {
+    for path in unfinished.chain(["shallow.lock", "config.lock"].map(|name| repository.join(name))) {
         // What is still there fails the fetch.
         fs::remove_file(path).ok();
     }

@@ -67,7 +67,7 @@ impl Repository {
         self.configured(&[format!("remote.{REMOTE}.url={}", self.remote().location)], arguments)
     }
 
-    /// A git command on this repository that does not ask the remote, with these settings, each as `name=value`.
+    /// A git command on this repository with these settings alone, each as `name=value`: it can't ask the remote.
     pub fn configured(&self, settings: &[String], arguments: &[impl AsRef<OsStr>]) -> Run {
         self.git.command((&self.path, self.remote().protocol), settings, arguments)
     }
@@ -150,9 +150,14 @@ impl Repository {
     async fn create(&self) -> Result<(), GitError> {
         let path = self.path.clone();
         let is_there = blocking(move || {
-            remove_leftovers(&path);
-            // The last folder that git makes of a new repository.
-            Ok(path.join("objects/pack").is_dir())
+            // The last folder that git makes of a new repository. A git that was killed before has left locks.
+            let is_there = path.join("objects/pack").is_dir();
+            if is_there {
+                remove_leftovers(&path);
+            } else {
+                remove_tree(&path)?;
+            }
+            Ok(is_there)
         });
         if !is_there.await? {
             self.run(self.call(&["init", "--quiet", "--bare"]), |_| ()).await?;

@@ -14,7 +14,7 @@ use super::session::Session;
 use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::websocket::wrong_message;
 use crate::shared::http::{ConnectionPermit, Peer};
-use crate::shared::run::closing;
+use crate::shared::run::{Phase, closing};
 use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::protocol::{self, ClientRequest};
 use crate::simulation::sessions::{ClientAction, Connection, Resume, ToClient, Token};
@@ -75,10 +75,14 @@ impl WebClient {
         resumed
             .into_actor(self)
             .map(|answer, this, ctx| {
-                if let Err(refusal) = answer.unwrap_or_else(|_| Err(protocol::ended(None))) {
-                    log::info!("client {}: does not come back: {refusal}", this.peer);
-                    Self::finish(refusal, CloseCode::Normal, ctx);
-                }
+                let Err(refusal) = answer.unwrap_or_else(|_| Err(protocol::ended(None))) else { return };
+                // Its session may have ended because the server stops.
+                let (refusal, code) = match *this.server.phase.borrow() {
+                    Phase::Closing => (protocol::stopping(), CloseCode::Away),
+                    _ => (refusal, CloseCode::Normal),
+                };
+                log::info!("client {}: does not come back: {refusal}", this.peer);
+                Self::finish(refusal, code, ctx);
             })
             .spawn(ctx);
     }

@@ -13,7 +13,7 @@ use super::compose_project::DEFAULT_MEMORY;
 use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
 use super::dockerfile::LABEL;
 use super::owned_resources::{ResourceOwner, digest};
-use super::start_error::{StartError, is_disk_full};
+use super::start_error::{StartError, blame, is_disk_full};
 use super::steps;
 use crate::simulation::checkout::{OnProgress, Project, SingleFlight};
 use crate::simulation::config::SimulationConfig;
@@ -34,8 +34,6 @@ const DEFAULT_BASE: [&str; 2] = ["$WEBOTS_DEFAULT_IMAGE", "${WEBOTS_DEFAULT_IMAG
 /// configuration of its programs.
 const ID: &str = "{{.Id}}";
 const CONFIG: &str = "{{json .Config}}";
-/// Why an image is not there although it was, as text for the client.
-const REMOVED: &str = "An image that this simulation needs was removed meanwhile";
 
 impl Images {
     /// The images of this owner.
@@ -58,7 +56,7 @@ impl Images {
             let pulled = this.docker.follow(command, Vec::new(), this.config.timing.build, on_line).await;
             pulled.map_err(|error| not_pulled(&name, error))
         };
-        self.made(image, ID, progress, pull).await
+        self.made(image, ID, false, progress, pull).await
     }
 
     /// Builds an image of a project unless it exists.
@@ -86,17 +84,20 @@ impl Images {
             });
         }
         let name = format!("webots-fleet/{}:{}", self.owner.0, digest(parts.join("\0").as_bytes()));
+        let is_projects = build.folder.is_some();
         let (this, project, tag) = (Arc::clone(self), Arc::clone(project), name.clone());
         let job = |sender| async move { this.build_now(&tag, &project, build, sender).await };
-        let config = self.made(&name, CONFIG, progress, job).await?;
+        let config = self.made(&name, CONFIG, is_projects, progress, job).await?;
         Ok(BuiltImage::read(name, &config)?)
     }
 
-    /// Makes an image by this job unless it exists. Returns what Docker says of it in this format.
+    /// Makes an image by this job unless it exists. Returns what Docker says of it in this format. What a project's own
+    /// Dockerfile makes may have settings that are too large to be read.
     async fn made<F: Future<Output = Result<(), StartError>> + Send + 'static>(
         &self,
         name: &str,
         format: &str,
+        is_projects: bool,
         progress: OnProgress<'_>,
         job: impl FnOnce(watch::Sender<String>) -> F,
     ) -> Result<String, StartError> {
@@ -104,7 +105,9 @@ impl Images {
             return Ok(found);
         }
         self.jobs.join(name.to_owned(), progress, job).await?;
-        self.inspect(name, format).await?.ok_or_else(|| StartError::Server(REMOVED.to_owned()))
+        let inspect = ["image", "inspect", "--format", format, name];
+        let found = self.docker.run(&inspect, SHORT_TIMEOUT).await.map_err(|error| blame(is_projects, error))?;
+        Ok(found.trim().to_owned())
     }
 
     async fn build_now(

@@ -122,9 +122,10 @@ impl Sandbox {
             command.extend(["--dev-bind-try".into(), device.clone().into(), device.into()]);
         }
         // Of two mounts at the same path the last one counts.
-        let mounts = self.own(program)?.into_iter().chain(self.mounts.iter().cloned());
-        let mounts: BTreeMap<_, _> =
-            mounts.map(|mount| ((mount.at.components().count(), mount.at.clone()), mount)).collect();
+        let mut mounts = BTreeMap::new();
+        for mount in self.own(program)?.into_iter().chain(self.mounts.iter().cloned()) {
+            mounts.insert((mount.at.components().count(), mount.at.clone()), mount);
+        }
         // Empty directories are memory: they are made read-only, as is the rest of `/dev`.
         let empty = mounts.values().filter(|mount| mount.source.is_none()).map(|mount| mount.at.clone());
         let closed: Vec<PathBuf> = empty.chain(["/dev".into()]).collect();

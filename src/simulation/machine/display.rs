@@ -2,8 +2,7 @@
 
 use std::io::{self, ErrorKind, Read, Write};
 use std::net::{IpAddr, TcpStream};
-use std::os::linux::net::SocketAddrExt;
-use std::os::unix::net::{SocketAddr, UnixStream};
+use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc;
 use std::time::Duration;
@@ -75,7 +74,7 @@ pub fn check(display: &str) -> Result<(), String> {
     let (_, _, screen) = parse(display).ok_or_else(|| malformed(display))?;
     let strange = |reason: &str| format!("what is at {display} does not answer as a display does: {reason}");
     let (name, (sender, answer)) = (display.to_owned(), mpsc::channel());
-    // A connection has no time limit of its own.
+    // To connect may take longer.
     let thread = std::thread::Builder::new().name("display".to_owned()).spawn(move || sender.send(connect(&name)));
     thread.map_err(|error| strange(&format!("no thread can be started to ask it: {error}")))?;
     let answer = answer.recv_timeout(ANSWER);
@@ -100,11 +99,14 @@ pub fn check(display: &str) -> Result<(), String> {
 fn connect(display: &str) -> io::Result<Result<u8, String>> {
     let (host, number, _) = parse(display).ok_or(ErrorKind::InvalidInput)?;
     if let Some(path) = socket(display) {
-        let hidden = SocketAddr::from_abstract_name(path.as_os_str().as_encoded_bytes());
-        let stream = hidden.and_then(|address| UnixStream::connect_addr(&address));
-        return greet(stream.or_else(|_| UnixStream::connect(&path))?, &cookie(None, number));
+        // Not at the abstract address of that name, which anybody can take, and which a sandbox does not have.
+        let stream = UnixStream::connect(path)?;
+        // A display that hangs must not keep the thread.
+        stream.set_read_timeout(Some(ANSWER))?;
+        return greet(stream, &cookie(None, number));
     }
     let stream = TcpStream::connect((host, FIRST_PORT + number))?;
+    stream.set_read_timeout(Some(ANSWER))?;
     let peer = Some(stream.peer_addr()?.ip()).filter(|address| !address.is_loopback());
     greet(stream, &cookie(peer, number))
 }

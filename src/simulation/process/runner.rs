@@ -105,11 +105,16 @@ impl Run {
             actix_rt::task::spawn_blocking(start).await.map_err(io::Error::other)??
         };
         let said = Receiver::from_owned_fd(said.into())?;
-        let mut output = Receiver::from_owned_fd(output.into())?.take(most + 1);
-        let mut answer = Vec::new();
-        // A broken pipe ends the answer; the exit code decides whether that is an error.
-        let all = async { tokio::join!(output.read_to_end(&mut answer), tell(said, line, told), ended).2 };
-        let Ok(ending) = actix_rt::time::timeout(time, all).await else {
+        let output = Receiver::from_owned_fd(output.into())?;
+        // The pipe is closed at the limit: who writes on would wait for its reader. A broken pipe ends the answer; the
+        // exit code decides whether that is an error.
+        let answer = async move {
+            let mut answer = Vec::new();
+            output.take(most + 1).read_to_end(&mut answer).await.ok();
+            answer
+        };
+        let all = async { tokio::join!(answer, tell(said, line, told), ended) };
+        let Ok((answer, (), ending)) = actix_rt::time::timeout(time, all).await else {
             return Err(RunError::Slow(time));
         };
         if answer.len() as u64 > most { Err(RunError::TooLong) } else { Ok(Ran { ending, answer }) }
@@ -178,6 +183,8 @@ mod tests {
         assert!(matches!(slow, RunError::Slow(_)) && begin.elapsed() < LONG, "{slow}");
         let long = Run { answer: 3, ..shell("echo long", LONG) }.run(drop).await.unwrap_err();
         assert!(matches!(long, RunError::TooLong), "{long}");
+        let endless = Run { answer: 3, ..shell("yes", LONG) }.run(drop).await.unwrap_err();
+        assert!(matches!(endless, RunError::TooLong) && begin.elapsed() < LONG, "{endless}");
         let none = Run::new(["/nowhere/program"], Path::new("/"), LONG).run(drop).await.unwrap_err();
         assert!(matches!(none, RunError::NotStarted(_)), "{none}");
         let script = "until [ \"$(ulimit -f)\" -le 8 ] 2>/dev/null; do sleep 0.01; done; echo bounded";

@@ -34,7 +34,9 @@ pub async fn connect(
         let (Ok(to_client), Ok(to_webots)) = (client.tcp.into_std(), webots.into_std()) else { return };
         let client_end = (to_client, client.read_buffer.into());
         let stream = Stream::new(client_end, (to_webots, from_webots), read_only, Box::new((held, client.permit)));
-        if let Err(error) = stream.and_then(|stream| stream_thread.add(stream)) {
+        // An error: what the client has sent with its request ends the stream.
+        let Ok(stream) = stream else { return };
+        if let Err(error) = stream_thread.add(stream) {
             log::warn!("a stream is not relayed: {error}");
         }
     });

@@ -65,7 +65,8 @@ impl SlotLease {
         self.change(|present| present.note(shown));
     }
 
-    /// Reports how the simulation ends, before the lease is dropped. Only the first report counts. Its stream is closed.
+    /// Reports how the simulation ends, before the lease is dropped. Only the first report counts. Its tokens
+    /// lead nowhere from then on: another simulation may soon have its port.
     pub fn end(&self, reason: EndReason, why: &str, taken: Taken) {
         self.change(|present| {
             present.accesses.clear();
