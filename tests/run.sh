@@ -32,6 +32,7 @@ fi
 # dockerd would begin to run on a machine that has not asked for it.
 [[ -z ${CI-} ]] || tests/install.sh dockerd=docker.io iptables=iptables docker-compose=docker-compose
 # Most tests wait most of the time, for servers and timers.
+threads=${RUST_TEST_THREADS:-$((5 * $(nproc)))}
 export RUST_TEST_THREADS=${RUST_TEST_THREADS:-$((3 * $(nproc)))}
 readonly CARGO=(cargo test --locked --no-fail-fast)
 if (($# > 0)); then
@@ -98,7 +99,7 @@ memory=$(awk '$1 == "MemAvailable:" { print int($2 / 1024) }' /proc/meminfo)
 # The package is mostly systemd that waits: what is measured beside it does not notice.
 start tests/deploy/package.sh
 ((memory > 10000)) || finish tests/deploy/package.sh
-tests/own_tmp.sh "${CARGO[@]}" --lib --bins --test integration || failed+=('cargo test')
+RUST_TEST_THREADS=$threads tests/own_tmp.sh "${CARGO[@]}" --lib --bins --test integration || failed+=('cargo test')
 echo "runs side by side, and tells when each has ended: ${beside[*]@Q}"
 for command in "${beside[@]}"; do
     # shellcheck disable=SC2086 # None of its words has a space.
