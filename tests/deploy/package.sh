@@ -67,7 +67,7 @@ main() {
     if in_machine runuser -u webots-simulation -- cat /etc/webots-fleet/session/main.json 2>/dev/null; then
         fail "a simulation can read the session server's secrets"
     fi
-    in_machine systemd-analyze verify webots-session@main.service webots-simulation@main.service webots-fleet-packet-filter.service || fail 'systemd finds faults'
+    in_machine systemd-analyze verify webots-session@main.service webots-simulation@main.service || fail 'systemd finds faults'
 
     echo 'starts both servers, simulation servers first'
     make_project /srv/webots-demo/project worlds/a.wbt
@@ -92,6 +92,7 @@ main() {
     [[ $(property webots-fleet-packet-filter ActiveState) == inactive ]] || fail 'it is loaded without nft'
     ! in_machine systemctl is-failed --quiet webots-fleet-packet-filter || fail 'it fails without nft'
     in_machine apt-get install --yes --quiet --no-install-recommends nftables >"$WORK/install.log" 2>&1 || fail "$(<"$WORK/install.log")"
+    in_machine systemd-analyze verify webots-fleet-packet-filter.service || fail 'systemd finds faults in the packet filter'
     in_machine systemctl enable --quiet --now nftables webots-fleet-packet-filter
     filters || fail 'it is not loaded'
     # Both begin with an empty set of rules.
