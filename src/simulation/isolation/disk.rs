@@ -34,9 +34,9 @@ impl Disk {
         Self { folder, reserve, room, lost: 0, relieved: None }
     }
 
-    /// Reads the free room; it stays as it was if the file system does not answer. Returns whether a simulation has to end for
-    /// the reserve now, if one has grown.
-    pub fn look(&mut self) -> bool {
+    /// Reads the free room; it stays as it was if the file system does not answer. Returns how much a simulation must have
+    /// grown, in bytes, to end for the reserve now; `None` if none has to end.
+    pub fn look(&mut self) -> Option<u64> {
         if let Ok(room) = DiskRoom::of(&self.folder) {
             let bytes = self.room.bytes.saturating_sub(room.bytes);
             let inodes = self.room.inodes.saturating_sub(room.inodes).saturating_mul(SMALLEST);
@@ -45,17 +45,25 @@ impl Disk {
         }
         if self.room.shortage(self.reserve).is_none() {
             self.relieved = None;
-            return false;
+            return None;
         }
-        let is_more = self.relieved.is_some_and(|(free, _)| self.room.bytes > free);
-        let has_to_end = self.relieved.is_none_or(|(free, at)| {
-            free.saturating_sub(self.room.bytes) > (self.reserve << 20) / PARTS || at.elapsed() >= EFFECT
-        });
-        // Where there is more, the folder of the ended simulation is being removed.
-        if is_more || has_to_end {
-            self.relieved = Some((self.room.bytes, Instant::now()));
+        let part = (self.reserve << 20) / PARTS;
+        match self.relieved {
+            // The folder of the ended simulation is being removed.
+            Some((free, _)) if self.room.bytes > free => {
+                self.relieve();
+                None
+            }
+            Some((_, at)) if at.elapsed() >= EFFECT => Some(0),
+            // That may be what the ended one still writes while it is killed: another must have written as much.
+            Some((free, _)) => (free - self.room.bytes > part).then_some(part),
+            None => Some(0),
         }
-        has_to_end && !is_more
+    }
+
+    /// Notes that a simulation ends for the reserve, or that none has grown.
+    pub fn relieve(&mut self) {
+        self.relieved = Some((self.room.bytes, Instant::now()));
     }
 
     /// Time until the next look: the shorter, the closer the free room is to the reserve.

@@ -117,8 +117,10 @@ impl Table {
                 }
             }
             self.all.retain(|one| one.excess.as_ref().is_some_and(|excess| !excess.is_closed()));
-            if self.disk.look() {
-                self.end_grown_most();
+            if let Some(least) = self.disk.look()
+                && (self.end_grown_most(least) || least == 0)
+            {
+                self.disk.relieve();
             }
             if Instant::now() >= tick {
                 let begin = processor_time();
@@ -129,8 +131,9 @@ impl Table {
         }
     }
 
-    /// Ends the simulation that has grown most; none if none has grown: then another program fills the disk.
-    fn end_grown_most(&mut self) {
+    /// Ends the simulation that has grown most, and by so many bytes at least. Returns false if none has: then another program
+    /// fills the disk.
+    fn end_grown_most(&mut self, least: u64) -> bool {
         let (until, lost) = (Instant::now() + COUNTS_AT_RESERVE, self.disk.lost);
         // The one that had grown most is counted first, then those whose count is oldest.
         self.all.sort_by_key(|one| one.watch.disk.counted);
@@ -141,12 +144,17 @@ impl Table {
                 break;
             }
             if let Some(why) = one.watch.disk.count(lost, COUNT_AT_RESERVE) {
-                return one.end(why);
+                one.end(why);
+                return true;
             }
         }
         let grown = self.all.iter_mut().filter_map(|one| Some((one.watch.disk.growth()?, one)));
-        if let Some((growth, one)) = grown.max_by_key(|(growth, _)| *growth) {
-            one.end(words(growth));
+        match grown.max_by_key(|(growth, _)| *growth) {
+            Some((growth, one)) if growth >= least => {
+                one.end(words(growth));
+                true
+            }
+            _ => false,
         }
     }
 
