@@ -99,7 +99,7 @@ memory=$(awk '$1 == "MemAvailable:" { print int($2 / 1024) }' /proc/meminfo)
 # The package is mostly systemd that waits: what is measured beside it does not notice.
 start tests/deploy/package.sh
 ((memory > 10000)) || finish tests/deploy/package.sh
-RUST_TEST_THREADS=$threads tests/own_tmp.sh "${CARGO[@]}" --lib --bins --test integration || failed+=('cargo test')
+tests/own_tmp.sh "${CARGO[@]}" --lib --bins --test integration || failed+=('cargo test')
 echo "runs side by side, and tells when each has ended: ${beside[*]@Q}"
 for command in "${beside[@]}"; do
     # shellcheck disable=SC2086 # None of its words has a space.

@@ -5,6 +5,9 @@
 #
 # Without the internet some things stand in for others: the package is built before, Webots is the demo simulator in a
 # package of that name, certbot is the script beside this one, the repository of the lab's world is on the machine.
+#
+# guide.sh [nginx|apache]: both parts side by side, or the one with this web server first.
+[[ ${1-} == machine ]] || export PART=${1-}
 # shellcheck source=tests/deploy/machine.sh
 . "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/machine.sh"
 
@@ -239,21 +242,17 @@ step() { # WORDS
     printf '%3s s  %s\n' "$SECONDS" "$1"
 }
 
-main() {
-    prepare
-    [[ -x $BROWSER && -e ${CHROMIUM:-/usr/bin/chromium} ]] || skip 'there is no browser: tests/python.sh, and apt install chromium'
-    make_stand_ins
-
+with_nginx() {
     step 'one machine with nginx'
     one_machine nginx nginx
     in_machine /usr/local/bin/certbot renew
     page https://fleet.lab.example/monitor html || fail 'a renewed certificate is not used'
-    step 'everything is started at boot'
+    step 'nginx: everything is started at boot'
     comes_back
-    step 'a running simulation survives an upgrade'
+    step 'nginx: a running simulation survives an upgrade'
     upgrade
 
-    step 'a further machine with a web server of its own, Apache'
+    step 'nginx: a further machine with a web server of its own, Apache'
     fresh gpu2 "$FURTHER"
     cable nginx gpu2
     up_to_the_servers gpu2.lab.example for_simulations_only
@@ -262,15 +261,16 @@ main() {
     commands 'A web server on each' | sed 's/gpu2.example.org/gpu2.lab.example/' | follow fleet.lab.example
     visit_the_other 2001 gpu2
     ! firewall_lets_in "$FURTHER" gpu2 2010 || fail "everybody reaches Webots"
-    shut_down gpu2
-    shut_down nginx
+    step 'nginx: ok'
+}
 
+with_apache() {
     step 'one machine with Apache'
     one_machine apache Apache
     in_machine /usr/local/bin/certbot renew
     page https://fleet.lab.example/monitor html || fail 'a renewed certificate is not used'
 
-    step 'a further machine behind it'
+    step 'Apache: a further machine behind it'
     fresh behind "$FURTHER"
     cable apache behind
     { commands '1. The programs' 2 && commands '2. Webots' && commands 'A virtual display for each simulation' &&
@@ -282,7 +282,21 @@ main() {
     visit_the_other 3001 behind
     firewall_lets_in "$FURTHER" behind 3010 || fail 'the web server does not reach Webots'
     ! firewall_lets_in "$FURTHER" behind 2010 || fail "what is no part of the fleet is reachable"
-    echo 'ok'
+    step 'Apache: ok'
 }
 
-main
+both() {
+    local parts=() part result=0
+    for part in nginx apache; do
+        "$SCRIPT" "$part" &
+        parts+=($!)
+    done
+    for part in "${parts[@]}"; do wait "$part" || result=$?; done
+    exit "$result"
+}
+
+[[ -n $PART ]] || both
+prepare
+[[ -x $BROWSER && -e ${CHROMIUM:-/usr/bin/chromium} ]] || skip 'there is no browser: tests/python.sh, and apt install chromium'
+make_stand_ins
+"with_$PART"

@@ -2,6 +2,7 @@
 #
 # The Debian is made by mmdebstrap once, and kept in target/deploy. The scripts can run side by side. Each machine looks at it through an overlay in
 # memory, in namespaces of its own (processes, mounts, network), so that nothing of a run is left, however it ends.
+# A script of several parts that run side by side exports PART, the name of this one.
 #
 # FLEET_DISTRIBUTION and FLEET_MIRROR, say 'jammy' and 'http://archive.ubuntu.com/ubuntu', make another system of it.
 # FLEET_BIN, an absolute path, names a folder with programs to package in place of building them.
@@ -18,7 +19,7 @@ readonly DISTRIBUTION=${FLEET_DISTRIBUTION:-$(. /etc/os-release && echo "${VERSI
 readonly DEPLOY=$PWD/target/deploy
 readonly ROOT=$DEPLOY/$DISTRIBUTION
 WORK=${SCRIPT##*/}
-readonly WORK=$DEPLOY/${WORK%.sh}
+readonly WORK=$DEPLOY/${WORK%.sh}${PART:+-$PART}
 readonly PACKAGES=systemd,systemd-sysv,libpam-systemd,dbus,dbus-user-session,sudo,adduser,ca-certificates,openssl,curl
 # What is installed later, in machines that can't reach the internet.
 readonly LATER=(git git-lfs bubblewrap xvfb ufw nginx apache2 certbot needrestart nftables passt)
@@ -156,29 +157,37 @@ make_root() {
     echo "$made" >"$ROOT/.complete"
 }
 
-# Two packages: what is built here, and a later version in which every program, an example and a configuration differ.
-make_packages() {
-    local file
-    rm -rf "$WORK/packages" "$WORK/unpacked" "$WORK/release"
-    mkdir -p "$WORK/packages"
-    deploy/build-release "$WORK/release" -Zgzip -z1 >/dev/null
-    (cd "$WORK/release" && sha256sum --check --quiet SHA256SUMS) || fail 'the checksums of the release are wrong'
-    mv "$WORK"/release/*.deb "$WORK/packages/1.deb"
-    mv "$WORK"/release/*.tar.gz "$WORK/packages/release.tar.gz"
-    dpkg-deb --raw-extract "$WORK/packages/1.deb" "$WORK/unpacked"
-    sed -i 's/^Version: .*-1$/Version: 999.0.0-2/' "$WORK/unpacked/DEBIAN/control"
-    # What follows a program in its file does not change what it does.
-    for file in "$WORK"/unpacked/usr/bin/* "$WORK/unpacked/usr/share/webots-fleet/nginx.conf"; do
-        printf '\n# later\n' >>"$file"
-    done
-    sed -i 's/"maxConnections": 20/"maxConnections": 19/' "$WORK/unpacked/etc/webots-fleet/simulation/main.json"
-    (cd "$WORK/unpacked" && find . -path ./DEBIAN -prune -o -type f -printf '%P\0' | xargs -0 md5sum >DEBIAN/md5sums)
-    dpkg-deb -Zgzip -z1 --root-owner-group --build "$WORK/unpacked" "$WORK/packages/2.deb" >/dev/null
-    rm -rf "$WORK/unpacked"
+# Whether the packages are of these programs and files. What is to be built is always packaged anew.
+packages_are_made() {
+    [[ -n ${FLEET_BIN-} && -e $DEPLOY/packages/of && $(<"$DEPLOY/packages/of") == "$FLEET_BIN" ]] &&
+        [[ -z $(find "$FLEET_BIN"/{session-server,simulation-server,demo-simulator,rehearse} Cargo.* config deploy docs server.sh templates \
+            -newer "$DEPLOY/packages/of" -print -quit) ]]
 }
 
-# What all scripts need, and what takes no programs under test. One script makes it, the others wait.
-prepare_all() {
+# Two packages: what is built here, and a later version in which every program, an example and a configuration differ.
+make_packages() {
+    local file made=$DEPLOY/packages release=$DEPLOY/release unpacked=$DEPLOY/unpacked
+    rm -rf "$made" "$release" "$unpacked"
+    mkdir -p "$made"
+    deploy/build-release "$release" -Zgzip -z1 >/dev/null
+    (cd "$release" && sha256sum --check --quiet SHA256SUMS) || fail 'the checksums of the release are wrong'
+    mv "$release"/*.deb "$made/1.deb"
+    mv "$release"/*.tar.gz "$made/release.tar.gz"
+    dpkg-deb --raw-extract "$made/1.deb" "$unpacked"
+    sed -i 's/^Version: .*-1$/Version: 999.0.0-2/' "$unpacked/DEBIAN/control"
+    # What follows a program in its file does not change what it does.
+    for file in "$unpacked"/usr/bin/* "$unpacked/usr/share/webots-fleet/nginx.conf"; do
+        printf '\n# later\n' >>"$file"
+    done
+    sed -i 's/"maxConnections": 20/"maxConnections": 19/' "$unpacked/etc/webots-fleet/simulation/main.json"
+    (cd "$unpacked" && find . -path ./DEBIAN -prune -o -type f -printf '%P\0' | xargs -0 md5sum >DEBIAN/md5sums)
+    dpkg-deb -Zgzip -z1 --root-owner-group --build "$unpacked" "$made/2.deb" >/dev/null
+    rm -rf "$unpacked" "$release"
+    echo "${FLEET_BIN-}" >"$made/of"
+}
+
+# What takes no programs under test. One script makes it, the others wait.
+prepare_root() {
     local tool lock
     [[ $(id -u) == 0 ]] || skip 'only root can make a Debian of its own'
     for tool in mmdebstrap dpkg-deb unshare nsenter setpriv pivot_root findmnt; do
@@ -191,10 +200,16 @@ prepare_all() {
     exec {lock}>&-
 }
 
-# Everything that machines need.
+# Everything that machines need. The packages are made by one script, too.
 prepare() {
-    prepare_all
-    make_packages
+    local lock
+    prepare_root
+    exec {lock}>"$DEPLOY/.packages.lock"
+    flock "$lock"
+    packages_are_made || make_packages
+    rm -rf "$WORK/packages"
+    cp -r "$DEPLOY/packages" "$WORK"
+    exec {lock}>&-
 }
 
 # --- The guide.

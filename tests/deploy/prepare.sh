@@ -3,4 +3,4 @@
 # shellcheck source=tests/deploy/machine.sh
 . "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/machine.sh"
 
-prepare_all
+prepare_root
