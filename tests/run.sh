@@ -31,9 +31,6 @@ if ((EUID == 0)) && [[ ! -c /dev/net/tun || $(stat --format=%a /dev/net/tun) != 
 fi
 # dockerd would begin to run on a machine that has not asked for it.
 [[ -z ${CI-} ]] || tests/install.sh dockerd=docker.io iptables=iptables docker-compose=docker-compose
-# Most tests wait most of the time, for servers and timers.
-threads=${RUST_TEST_THREADS:-$((5 * $(nproc)))}
-export RUST_TEST_THREADS=${RUST_TEST_THREADS:-$((3 * $(nproc)))}
 readonly CARGO=(cargo test --locked --no-fail-fast)
 if (($# > 0)); then
     tests/python.sh >/dev/null
