@@ -2,7 +2,7 @@
 
 use std::ops::RangeInclusive;
 
-use regex::Regex;
+use regex_lite::Regex;
 use serde_json::Value;
 
 const GUIDE: &str = include_str!("../../docs/deployment.md");

@@ -34,7 +34,7 @@ fn the_changelog_has_the_version_of_the_program() {
 
 #[test]
 fn every_guarantee_names_tests_that_exist() {
-    let test = regex::Regex::new(r"#\[(?:\w+::)?test\]\s+(?:#\[.*\]\s+)*(?:async )?fn (\w+)\(").unwrap();
+    let test = regex_lite::Regex::new(r"#\[(?:\w+::)?test\]\s+(?:#\[.*\]\s+)*(?:async )?fn (\w+)\(").unwrap();
     let is_rust = |path: &PathBuf| path.extension().is_some_and(|end| end == "rs");
     let files = ["tests", "src"].into_iter().flat_map(|folder| walk(&root().join(folder))).filter(is_rust);
     let texts: Vec<String> = files.map(|file| std::fs::read_to_string(file).unwrap()).collect();
