@@ -90,13 +90,12 @@ echo "built: $(elapsed)"
 # All of these wait most of the time, and run side by side, the longest first. What needs a machine of its own, or a daemon with
 # images, is in memory: where there is little of it, these run one after another.
 containers="tests/own_network.sh ${CARGO[*]} --test containers"
-faults="${CARGO[*]} --test faults --"
-beside=("$containers" 'tests/browser/run' "$faults whole_again" "${CARGO[*]} --test simulation_limits")
+beside=("$containers" 'tests/browser/run' "${CARGO[*]} --test faults -- --skip on_a_quiet_machine" "${CARGO[*]} --test simulation_limits")
 memory=$(awk '$1 == "MemAvailable:" { print int($2 / 1024) }' /proc/meminfo)
 # The package is mostly systemd that waits: what is measured beside it does not notice.
 start tests/deploy/package.sh
 ((memory > 10000)) || finish tests/deploy/package.sh
-tests/own_tmp.sh "${CARGO[@]}" --lib --bins --test integration || failed+=('cargo test')
+tests/own_tmp.sh "${CARGO[@]}" --lib --bins --test integration -- --skip on_a_quiet_machine || failed+=('cargo test')
 echo "runs side by side, and tells when each has ended: ${beside[*]@Q}"
 for command in "${beside[@]}"; do
     # shellcheck disable=SC2086 # None of its words has a space.
@@ -111,11 +110,9 @@ for command in tests/deploy/package.sh "${beside[@]}"; do
     # shellcheck disable=SC2086
     [[ -z ${jobs[$command]-} ]] || finish $command
 done
-# These measure times: nothing runs beside them.
-# shellcheck disable=SC2086
-start $faults --skip whole_again
-# shellcheck disable=SC2086
-finish $faults --skip whole_again
+# These depend on how fast the machine is: nothing runs beside them.
+start "${CARGO[@]}" --test integration --test faults on_a_quiet_machine
+finish "${CARGO[@]}" --test integration --test faults on_a_quiet_machine
 rm "$logs/busy"
 [[ -n ${jobs[tests/swarm.sh]-} ]] || start tests/swarm.sh
 # The guide is mostly apt that unpacks, in the time in which the Swarm waits.
