@@ -514,14 +514,7 @@ function disconnect() {
   find('connect').focus();
 }
 
-/** The page may reach the fleet alone; a server that calls itself otherwise than the fleet does is a stranger. */
-function forbidden({ effectiveDirective, blockedURI }) {
-  if (simulation && effectiveDirective === 'connect-src')
-    failed(`This page may not connect to ${blockedURI}: no simulation server of the fleet is known by that name.`);
-}
-
 form.addEventListener('submit', start);
-document.addEventListener('securitypolicyviolation', forbidden);
 find('disconnect').addEventListener('click', disconnect);
 for (const example of form.querySelectorAll('[data-url]')) {
   example.addEventListener('click', () => {

@@ -87,7 +87,7 @@ async fn only_the_password_announces_something() {
     assert_eq!(post(&url, None, order).await, 401);
     assert_eq!(post(&url, Some("guess"), order).await, 401);
     let foreign = awc::Client::default().post(&url).basic_auth("admin", PASSWORD);
-    let answer = foreign.insert_header(("Sec-Fetch-Site", "cross-site")).send_body(order).await.unwrap();
+    let answer = foreign.insert_header(("Origin", "https://evil.example")).send_body(order).await.unwrap();
     assert_eq!(answer.status(), 403);
     for wrong in [
         json!({"text": 5}),

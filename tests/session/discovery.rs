@@ -169,8 +169,8 @@ async fn names_come_and_go_with_the_configuration() {
     names.set("fleet.test", &loopback([2, 3]));
     let session = looking_up(&[], &names).start().await;
     let any_host = async || {
-        let viewer = http::get(&session.url("/viewer")).await;
-        viewer.header("content-security-policy").unwrap().contains(" http: ws:")
+        let viewer = http::get(&session.url("/webots-viewer")).await;
+        viewer.header("content-security-policy").unwrap().contains("script-src 'self' http: ")
     };
     assert!(!any_host().await);
     session.reload(json!({"simulationServers": [format!("dns+fleet.test:{port}")]}));

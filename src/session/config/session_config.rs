@@ -15,8 +15,8 @@ use super::timing::Timing;
 use crate::session::placement::PlacementPolicy;
 use crate::shared::config::keys::keys;
 use crate::shared::config::{
-    Configuration, ExpandedPath, Secret, expanded, folder, is_web_url, local_address, object, one_or_many,
-    optional_expanded, optional_whole, percent, require, seconds, whole,
+    Configuration, ExpandedPath, Secret, expanded, is_web_url, one_or_many, optional_whole, percent, require, seconds,
+    whole,
 };
 use crate::shared::domain::{ClientUrls, PublicAddress, PublicUrl, complete_host};
 use crate::shared::http::TrustedProxies;
@@ -35,13 +35,11 @@ pub struct SessionConfig {
     #[serde(deserialize_with = "whole::<0, 65535, _, _>")]
     pub port: u16 = 1999,
     /// Local address to listen on. Default: `::`, all addresses of IPv4 and IPv6.
-    #[serde(deserialize_with = "local_address")]
     pub bind: IpAddr = Ipv6Addr::UNSPECIFIED.into(),
     /// Whether a reverse proxy rewrites ports in URLs: HOST/PORT, not HOST:PORT. Default: true.
     pub port_rewrite: bool = true,
     /// How clients reach the simulation servers through one reverse proxy: a URL with the placeholders `{host}` and
     /// `{port}`. Default: none, and each is reached under its own address.
-    #[serde(deserialize_with = "optional_expanded")]
     pub public_url: Option<PublicUrl> = None,
     /// The simulation servers: HOST:PORT, HOST/PORT, or `dns+NAME:PORT` for all addresses of a name.
     /// Required.
@@ -72,7 +70,6 @@ pub struct SessionConfig {
     /// Password for actions such as `/announcement`. Default: none, and actions are off.
     pub admin_password: Option<Secret> = None,
     /// Folder of `session/output.log`. Default: `log`.
-    #[serde(deserialize_with = "folder")]
     pub log_dir: ExpandedPath = ExpandedPath("log".into()),
     /// Log to standard output. Default: false.
     pub debug: bool = false,
@@ -103,7 +100,6 @@ pub struct SessionConfig {
     /// URL of Webots' own viewer (`WebotsView.js`), for simulation servers that don't have it. Default: none.
     pub viewer_script: Option<url::Url> = None,
     /// All other durations.
-    #[serde(deserialize_with = "object")]
     pub timing: Timing = Timing::default(),
 }
 }
@@ -142,15 +138,8 @@ impl SessionConfig {
         ClientUrls { ssl: self.ssl, public: self.public_url.clone() }
     }
 
-    /// Normalizes the addresses of simulation servers, and checks that each is listed once.
-    fn check_servers(&mut self) -> Result<(), String> {
-        let listed = self.simulation_servers.iter_mut().filter_map(|entry| match entry {
-            ServerEntry::Server(address) => Some(address),
-            ServerEntry::Name(_) => None,
-        });
-        for address in listed.chain(&mut self.drained_servers) {
-            *address = address.clone().without_usual_web_port(self.ssl);
-        }
+    /// Checks that each simulation server is listed once.
+    fn check_servers(&self) -> Result<(), String> {
         let mut seen = HashSet::new();
         for entry in &self.simulation_servers {
             require(seen.insert(entry), "simulationServers", || {

@@ -7,11 +7,10 @@ use askama::Template;
 
 use super::pages::{self, Viewer, WebotsViewer};
 use crate::asset;
-use crate::session::fleet::FleetStatus;
 use crate::session::state::AppState;
 use crate::shared::http::assets::{self, Asset};
 use crate::shared::http::routing::{GET, READ, path};
-use crate::shared::http::{ConnectionKind, ContentSecurityPolicy, any_host, fleet_sources, html};
+use crate::shared::http::{ConnectionKind, OWN_FILES, VIEWER, any_host, fleet_sources, foreign_scripts, html};
 
 /// Assets of this server's pages, besides those that both servers share.
 const ASSETS: &[Asset] =
@@ -31,7 +30,7 @@ async fn monitor(server: web::Data<AppState>) -> Result<HttpResponse> {
     let (clients, started) = (server.clients(), SystemTime::now() - server.started.elapsed());
     let more = (announcement.as_deref(), server.admin_auth.is_some());
     let page = pages::monitor(&status, clients, &server.client_urls, started, more);
-    Ok(html(page, &ContentSecurityPolicy::own()))
+    Ok(html(page, OWN_FILES))
 }
 
 async fn events(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
@@ -52,29 +51,25 @@ async fn events(request: HttpRequest, server: web::Data<AppState>) -> HttpRespon
     server.live.listen(permit, server.phase.clone(), render)
 }
 
-async fn viewer(request: HttpRequest, server: web::Data<AppState>) -> Result<HttpResponse> {
-    let fleet = fleet(&server, &*server.status().await?);
+async fn viewer(server: web::Data<AppState>) -> HttpResponse {
     let script = server.config.viewer_script.as_ref().map(url::Url::as_str);
     let page = Viewer { version: env!("CARGO_PKG_VERSION"), examples: &server.config.examples, script };
-    Ok(html(page.render(), &ContentSecurityPolicy::viewer(&request, &fleet)))
+    html(page.render(), VIEWER)
 }
 
 /// Webots' own viewer is third-party code, and a link to this page can name another script on a host of the fleet. So
 /// it runs in an embedded page with an origin of its own.
 async fn webots_viewer(server: web::Data<AppState>) -> Result<HttpResponse> {
-    let mut sources = fleet(&server, &*server.status().await?);
+    let (status, urls) = (server.status().await?, &server.client_urls);
+    let mut sources = match &urls.public {
+        Some(public) => vec![public.http_door()],
+        // Names may resolve to other servers by the time the page starts a simulation.
+        None if !status.names.is_empty() => vec![any_host(urls.ssl)],
+        None => fleet_sources(status.servers.iter().map(|one| &one.record.address), urls.ssl),
+    };
     sources.extend(server.config.viewer_script.as_ref().map(|script| script.origin().ascii_serialization()));
     let page = WebotsViewer { version: env!("CARGO_PKG_VERSION") };
-    Ok(html(page.render(), &ContentSecurityPolicy::foreign(&sources)))
-}
-
-fn fleet(server: &AppState, status: &FleetStatus) -> Vec<String> {
-    match &server.client_urls.public {
-        Some(public) => vec![public.http_door(), public.websocket_door()],
-        // Names may resolve to other servers by the time the page starts a simulation.
-        None if !status.names.is_empty() => any_host(server.client_urls.ssl),
-        None => fleet_sources(status.servers.iter().map(|one| &one.record.address), server.client_urls.ssl),
-    }
+    Ok(html(page.render(), &foreign_scripts(&sources)))
 }
 
 async fn asset(request: HttpRequest) -> HttpResponse {

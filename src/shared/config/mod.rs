@@ -8,6 +8,6 @@ mod value;
 pub use loading::{Configuration, LoadedConfig, load, require};
 pub use secret::Secret;
 pub use value::{
-    ExpandedPath, choice, expanded, folder, is_web_url, local_address, minutes_or_zero, object, one_or_many,
-    optional_expanded, optional_object, optional_whole, percent, seconds, seconds_or_zero, whole,
+    ExpandedPath, expand, expanded, is_web_url, minutes_or_zero, one_or_many, optional_whole, percent, seconds,
+    seconds_or_zero, whole,
 };

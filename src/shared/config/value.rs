@@ -3,14 +3,11 @@
 use std::borrow::Cow;
 use std::env::VarError;
 use std::fmt;
-use std::marker::PhantomData;
-use std::net::IpAddr;
 use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use serde::de::value::MapAccessDeserializer;
-use serde::de::{DeserializeOwned, Error as _, IntoDeserializer, MapAccess, Visitor};
+use serde::de::{DeserializeOwned, Error as _};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use serde_json::Value;
 use shellexpand::LookupError;
@@ -29,8 +26,8 @@ impl TryFrom<String> for ExpandedPath {
     type Error = String;
 
     fn try_from(text: String) -> Result<Self, String> {
-        if text.contains('\0') {
-            return Err(format!("{text:?} is not a path: it contains a NUL"));
+        if text.is_empty() || text.contains('\0') {
+            return Err(format!("{text:?} is no path; \".\" is the working folder"));
         }
         shellexpand::full(&text).map(|path| Self(path.into_owned().into())).map_err(|error| not_set(&text, &error))
     }
@@ -40,61 +37,20 @@ fn not_set(text: &str, error: &LookupError<VarError>) -> String {
     format!("{text:?} names the environment variable {}, which is not set", error.var_name)
 }
 
+/// Expands `$VARIABLE` in a text.
+///
+/// # Errors
+/// When the text names a variable that is not set.
+pub fn expand(text: &str) -> Result<String, String> {
+    shellexpand::env(text).map(Cow::into_owned).map_err(|error| not_set(text, &error))
+}
+
 /// Reads a text and expands `$VARIABLE`.
 ///
 /// # Errors
 /// When the value is not a text, or names a variable that is not set.
 pub fn expanded<'de, D: Deserializer<'de>>(deserializer: D) -> Result<String, D::Error> {
-    let text = String::deserialize(deserializer)?;
-    shellexpand::env(&text).map(Cow::into_owned).map_err(|error| D::Error::custom(not_set(&text, &error)))
-}
-
-/// Reads the path of a directory.
-///
-/// # Errors
-/// When the value is not a text, or empty.
-pub fn folder<'de, D: Deserializer<'de>>(deserializer: D) -> Result<ExpandedPath, D::Error> {
-    let path = ExpandedPath::deserialize(deserializer)?;
-    let is_empty = path.0.as_os_str().is_empty();
-    if is_empty { Err(D::Error::custom("\"\" is no folder; \".\" is the working folder")) } else { Ok(path) }
-}
-
-/// Reads an IP address.
-///
-/// # Errors
-/// When the value is something else.
-pub fn local_address<'de, D: Deserializer<'de>>(deserializer: D) -> Result<IpAddr, D::Error> {
-    let text = String::deserialize(deserializer)?;
-    text.parse()
-        .map_err(|_| D::Error::custom(format!("{text:?} is not an IP address; allowed are such as 127.0.0.1 or ::1")))
-}
-
-/// Reads a value with `read`, or `null`.
-fn optional<'de, T, D: Deserializer<'de>>(
-    deserializer: D,
-    read: impl FnOnce(Value) -> serde_json::Result<T>,
-) -> Result<Option<T>, D::Error> {
-    Option::<Value>::deserialize(deserializer)?.map(read).transpose().map_err(D::Error::custom)
-}
-
-/// Reads a text, expands `$VARIABLE`, and converts it to a value; `null` is `None`.
-///
-/// # Errors
-/// When the value is not a text, names a variable that is not set, or is not allowed.
-pub fn optional_expanded<'de, T, D>(deserializer: D) -> Result<Option<T>, D::Error>
-where
-    T: TryFrom<String, Error: fmt::Display>,
-    D: Deserializer<'de>,
-{
-    optional(deserializer, |value| T::try_from(expanded(value)?).map_err(serde_json::Error::custom))
-}
-
-/// Reads the name of a choice.
-///
-/// # Errors
-/// When the value is not a text, or no choice.
-pub fn choice<'de, T: DeserializeOwned, D: Deserializer<'de>>(deserializer: D) -> Result<T, D::Error> {
-    T::deserialize(String::deserialize(deserializer)?.into_deserializer())
+    expand(&String::deserialize(deserializer)?).map_err(D::Error::custom)
 }
 
 /// Whether a text is the URL of a web server.
@@ -126,7 +82,8 @@ where
     T: TryFrom<u64>,
     D: Deserializer<'de>,
 {
-    optional(deserializer, whole::<MIN, MAX, _, _>)
+    let value = Option::<Value>::deserialize(deserializer)?;
+    value.map(whole::<MIN, MAX, _, _>).transpose().map_err(D::Error::custom)
 }
 
 /// Reads a percentage from 0 to `MAX`.
@@ -207,34 +164,6 @@ fn between<'de, D: Deserializer<'de>>(
 
 fn not_allowed<E: serde::de::Error>(value: &Value, allowed: fmt::Arguments<'_>) -> E {
     E::custom(format_args!("{} is not allowed; allowed is {allowed}", excerpt(&value.to_string(), MAX_SHOWN)))
-}
-
-/// Reads an object. serde alone accepts a list as well, as the values of the first keys.
-///
-/// # Errors
-/// When the value is something else.
-pub fn object<'de, T: Deserialize<'de>, D: Deserializer<'de>>(deserializer: D) -> Result<T, D::Error> {
-    struct Object<T>(PhantomData<T>);
-    impl<'de, T: Deserialize<'de>> Visitor<'de> for Object<T> {
-        type Value = T;
-
-        fn expecting(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-            out.write_str("an object: {\"KEY\": VALUE, ...}")
-        }
-
-        fn visit_map<A: MapAccess<'de>>(self, map: A) -> Result<T, A::Error> {
-            T::deserialize(MapAccessDeserializer::new(map))
-        }
-    }
-    deserializer.deserialize_map(Object(PhantomData))
-}
-
-/// Reads an object or `null`, like [`object`].
-///
-/// # Errors
-/// When the value is something else.
-pub fn optional_object<'de, T: DeserializeOwned, D: Deserializer<'de>>(deserializer: D) -> Result<Option<T>, D::Error> {
-    optional(deserializer, object)
 }
 
 /// Reads a list; a single value is a list of one, and `null` an empty one.

@@ -3,8 +3,10 @@
 use serde::{Deserialize, Serialize};
 
 use super::address::PublicAddress;
+use crate::shared::config::expand;
 
-/// The WebSocket URL of servers behind one reverse proxy, with placeholders: `wss://DOOR/{host}/{port}`.
+/// The WebSocket URL of servers behind one reverse proxy, with placeholders: `wss://DOOR/{host}/{port}`. `$VARIABLE` is
+/// expanded in it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct PublicUrl {
@@ -35,6 +37,7 @@ impl TryFrom<String> for PublicUrl {
     type Error = String;
 
     fn try_from(text: String) -> Result<Self, String> {
+        let text = expand(&text)?;
         let parts = || {
             let (scheme, rest) = text.split_once("://")?;
             let (door, path) = rest.split_at_checked(rest.find('/')?)?;

@@ -12,6 +12,6 @@ pub use address::{PublicAddress, complete_host};
 pub use admission::AdmissionRules;
 pub use client_urls::{ClientUrls, PublicUrl};
 pub use load::Load;
-pub use project_url::{ProjectUrl, ProjectUrlError, Reading, RefKind};
+pub use project_url::{ProjectUrl, ProjectUrlError, Reading};
 pub use server_report::{Instances, ServerReport};
 pub use url_prefix::UrlPrefix;

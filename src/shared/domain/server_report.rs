@@ -6,7 +6,6 @@ use super::admission::AdmissionRules;
 use super::load::Load;
 use super::project_url::ProjectUrl;
 use super::url_prefix::UrlPrefix;
-use crate::shared::config::{object, optional_object};
 use crate::shared::text::one_line;
 
 /// The part of a simulation server's `/status` that the session server uses to place clients.
@@ -19,10 +18,10 @@ pub struct ServerReport {
     /// Mean load of the last five seconds, in percent.
     pub load: Load,
     /// The server's version; empty if it is not reported.
-    #[serde(default, deserialize_with = "line")]
+    #[serde(default)]
     pub version: String,
     /// Simulations by state; `None` if the server does not report them.
-    #[serde(default, deserialize_with = "optional_object")]
+    #[serde(default)]
     pub instances: Option<Instances>,
     /// Repositories whose worlds the server runs at any load.
     #[serde(default, deserialize_with = "prefixes")]
@@ -43,7 +42,7 @@ pub struct ServerReport {
     #[serde(default)]
     pub failed_starts: u32,
     /// Why the server can't start simulations; `None` if it can.
-    #[serde(default, skip_serializing_if = "Option::is_none", deserialize_with = "optional_line")]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub problem: Option<String>,
 }
 
@@ -65,18 +64,10 @@ pub struct Instances {
     pub arrivals: u64,
 }
 
-fn line<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<String, D::Error> {
-    String::deserialize(deserializer).map(|text| one_line(&text))
-}
-
 /// Prefixes that this version does not know guide nobody: their server enforces them itself.
 fn prefixes<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<Vec<UrlPrefix>, D::Error> {
     let texts = Vec::<String>::deserialize(deserializer)?;
     Ok(texts.into_iter().filter_map(|text| UrlPrefix::try_from(text).ok()).collect())
-}
-
-fn optional_line<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<Option<String>, D::Error> {
-    Option::<String>::deserialize(deserializer).map(|text| text.map(|text| one_line(&text)))
 }
 
 impl Instances {
@@ -93,9 +84,9 @@ impl ServerReport {
     /// # Errors
     /// When it is not a JSON object with a `load`.
     pub fn parse(page: &[u8]) -> serde_json::Result<Self> {
-        let mut json = serde_json::Deserializer::from_slice(page);
-        let report = object(&mut json)?;
-        json.end().map(|()| report)
+        let report: Self = serde_json::from_slice(page)?;
+        let problem = report.problem.as_deref().map(one_line);
+        Ok(Self { version: one_line(&report.version), problem, ..report })
     }
 
     /// The report of a server that has only `/load`.

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::project_url::{ProjectUrl, ProjectUrlError, split_repository, split_url, without_git};
+use super::project_url::{ProjectUrl, ProjectUrlError, plain_repository, split_repository, split_url};
 
 /// A URL prefix by whole path segments, of a host, an owner or a repository: `https://github.com/lab` covers
 /// `https://github.com/lab/x`, but not `https://github.com/lab-evil/x` (the original compares characters, and accepts
@@ -44,17 +44,15 @@ impl TryFrom<String> for UrlPrefix {
     type Error = String;
 
     fn try_from(text: String) -> Result<Self, String> {
-        let wrong = |ProjectUrlError { problem }| {
+        let wrong = |ProjectUrlError(problem)| {
             format!("{text:?} is no URL prefix: {problem}; allowed are such as https://github.com/USER")
         };
-        let (host, mut segments) = split_url(text.trim_end_matches('/')).map_err(wrong)?;
+        let (host, mut segments) = split_url(&text).map_err(wrong)?;
         if split_repository(&segments).is_ok() {
-            return Err(wrong(ProjectUrlError { problem: "it names a part of a repository".to_owned() }));
+            return Err(wrong(ProjectUrlError("it names a part of a repository".to_owned())));
         }
-        if segments.len() >= 2
-            && let Some(name) = segments.last_mut()
-        {
-            *name = without_git(name).map_err(wrong)?;
+        if segments.len() >= 2 {
+            segments = plain_repository(segments).map_err(wrong)?;
         }
         Ok(Self { text, host, segments })
     }
@@ -86,7 +84,7 @@ mod tests {
             ("https://github.com/lab", "lab-evil/x", false, "another owner with the same beginning"),
             ("https://github.com/lab/x", "lab/xy", false, "another repository with the same beginning"),
             ("https://github.com/lab/x.git", "lab/x", true, "git's ending changes nothing"),
-            ("https://github.com/lab/x", "lab/x.git", true, "nor does it in the world's URL"),
+            ("https://github.com/lab/x", "lab/x.GIT.git", true, "nor does it in the world's URL"),
             ("https://gitlab.com/lab", "lab/x", false, "another host"),
             ("https://github.com:444/lab", "lab/x", false, "another port"),
         ];

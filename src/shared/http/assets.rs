@@ -1,8 +1,5 @@
 //! Style sheets, scripts and images of the pages, which are embedded in the program.
 
-use std::hash::{DefaultHasher, Hash, Hasher};
-
-use actix_web::http::header::{self, EntityTag, Header, IfNoneMatch};
 use actix_web::{HttpRequest, HttpResponse};
 
 /// A file that pages refer to as `assets/NAME`.
@@ -52,61 +49,13 @@ impl Asset {
             _ => "text/plain; charset=utf-8",
         }
     }
-
-    fn tag(self) -> EntityTag {
-        let mut hasher = DefaultHasher::new();
-        self.text.hash(&mut hasher);
-        EntityTag::new_strong(format!("{:016x}", hasher.finish()))
-    }
 }
 
-/// Answers a request for one of these files. Browsers may cache it, and must revalidate it each time.
+/// Answers a request for one of these files. Browsers fetch it again for each page.
 pub fn answer(request: &HttpRequest, assets: &[Asset]) -> HttpResponse {
     let name = request.match_info().get("name").unwrap_or_default();
-    let Some(asset) = assets.iter().chain(COMMON).find(|asset| asset.name == name) else {
-        return HttpResponse::NotFound().body("Error: there is no such file.");
-    };
-    let tag = asset.tag();
-    let known = match IfNoneMatch::parse(request) {
-        Ok(IfNoneMatch::Any) => true,
-        Ok(IfNoneMatch::Items(tags)) => tags.iter().any(|one| one.weak_eq(&tag)),
-        Err(_) => false,
-    };
-    let mut response = if known { HttpResponse::NotModified() } else { HttpResponse::Ok() };
-    response.insert_header(header::ETag(tag)).insert_header((header::CACHE_CONTROL, "no-cache"));
-    response.insert_header((header::X_CONTENT_TYPE_OPTIONS, "nosniff"));
-    if known { response.finish() } else { response.content_type(asset.media_type()).body(asset.text) }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use actix_web::body::MessageBody;
-    use actix_web::test::TestRequest;
-
-    fn ask(name: &str, tag: Option<&str>) -> HttpResponse {
-        let mut request = TestRequest::default().param("name", name.to_owned());
-        if let Some(tag) = tag {
-            request = request.insert_header((header::IF_NONE_MATCH, tag.to_owned()));
-        }
-        answer(&request.to_http_request(), &[])
-    }
-
-    #[test]
-    fn a_file_is_sent_once() {
-        let first = ask("style.css", None);
-        assert_eq!(first.headers().get(header::CONTENT_TYPE).unwrap(), "text/css; charset=utf-8");
-        let tag = first.headers().get(header::ETAG).unwrap().to_str().unwrap().to_owned();
-        let second = ask("style.css", Some(&tag));
-        assert_eq!(second.status(), 304);
-        assert!(second.into_body().try_into_bytes().unwrap().is_empty());
-        assert_eq!(ask("style.css", Some("\"other\"")).status(), 200);
-    }
-
-    #[test]
-    fn nothing_else_is_sent() {
-        for name in ["", "../style.css", "style.css/", "mail.txt"] {
-            assert_eq!(ask(name, None).status(), 404, "{name:?}");
-        }
+    match assets.iter().chain(COMMON).find(|asset| asset.name == name) {
+        Some(asset) => HttpResponse::Ok().content_type(asset.media_type()).body(asset.text),
+        None => HttpResponse::NotFound().body("Error: there is no such file."),
     }
 }

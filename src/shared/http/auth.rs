@@ -12,7 +12,7 @@ use subtle::ConstantTimeEq;
 
 use super::address_quota::AddressQuota;
 use super::peer::Peer;
-use super::routing::{reject_cross_site, retry_after};
+use super::routing::retry_after;
 use crate::shared::config::Secret;
 
 /// Passwords that an address may send in a burst: 30.
@@ -51,7 +51,8 @@ impl BasicAuth {
     /// When the password is missing or wrong, or `peer` has sent too many.
     pub fn check(&self, request: &HttpRequest, peer: Peer) -> Result<(), AuthError> {
         let given = password_of(request).ok_or(AuthError::NoPassword)?;
-        if !self.may_try(peer) {
+        // Proxies that don't report client addresses share one quota.
+        if !self.attempts.take(Some(peer.rate_limit_key().unwrap_or(Ipv6Addr::UNSPECIFIED.into()))) {
             return Err(AuthError::TooMany);
         }
         if given.as_bytes().ct_eq(self.password.reveal().as_bytes()).into() {
@@ -60,18 +61,25 @@ impl BasicAuth {
         log::warn!("client {peer}: a wrong administrator password");
         Err(AuthError::NoPassword)
     }
-
-    /// Whether a client may send one more password. A proxy that does not report client addresses shares one quota with all
-    /// such proxies. While too many addresses are tracked, others may send none.
-    fn may_try(&self, peer: Peer) -> bool {
-        self.attempts.check(peer.rate_limit_key().unwrap_or(Ipv6Addr::UNSPECIFIED.into())) == Some(true)
-    }
 }
 
-/// Refuses a request for an action unless it brings the password and no page of another site has made it. Without a
-/// password in the configuration there are no actions.
+/// Refuses a request for an action unless it brings the password and no page of another site has made it (CSRF): the
+/// browser would add the stored password. Without a password in the configuration there are no actions.
 pub fn refuse_action(auth: Option<&BasicAuth>, request: &HttpRequest, peer: Peer) -> Option<HttpResponse> {
-    reject_cross_site(request).or_else(|| require_administrator(auth, request, peer))
+    if is_cross_site(request) {
+        return Some(HttpResponse::Forbidden().body("Error: this request comes from a page of another site."));
+    }
+    require_administrator(auth, request, peer)
+}
+
+/// Whether a page of another site has made a request. Browsers send the page's `Origin`; other programs send none.
+fn is_cross_site(request: &HttpRequest) -> bool {
+    let header = |name| request.headers().get(name).map(|value| value.to_str().unwrap_or_default());
+    let host = header(header::HOST).unwrap_or_default();
+    header(header::ORIGIN).is_some_and(|origin| {
+        let of_page = origin.split_once("://").map_or(origin, |(_, authority)| authority);
+        !of_page.eq_ignore_ascii_case(host)
+    })
 }
 
 /// Refuses a request without the administrator's password, and every request if there is none in the configuration.
@@ -105,16 +113,23 @@ impl actix_web::ResponseError for AuthError {
 
 #[cfg(test)]
 mod tests {
-    use std::net::IpAddr;
+    use actix_web::test::TestRequest;
 
     use super::*;
 
     #[test]
-    fn only_so_many_addresses_may_send_passwords() {
-        let auth = BasicAuth::new(serde_json::from_str("\"open sesame\"").unwrap());
-        let may_try = |number: u32| auth.may_try(Peer::Client(IpAddr::from((number << 8).to_be_bytes())));
-        let tried: Vec<bool> = (0..20_000).map(may_try).collect();
-        let limit = tried.iter().position(|may| !may).unwrap();
-        assert!((1_000..20_000).contains(&limit) && !tried[limit..].contains(&true), "{limit}");
+    fn only_pages_of_the_same_site_and_other_programs_change_something() {
+        let request = || TestRequest::post().insert_header((header::HOST, "lab.org:2000"));
+        assert!(!is_cross_site(&request().to_http_request()));
+        for (origin, is_other) in [
+            ("https://lab.org:2000", false),
+            ("http://LAB.org:2000", false),
+            ("https://lab.org", true),
+            ("https://lab.org:2000.evil.example", true),
+            ("null", true),
+        ] {
+            let request = request().insert_header((header::ORIGIN, origin)).to_http_request();
+            assert_eq!(is_cross_site(&request), is_other, "{origin}");
+        }
     }
 }

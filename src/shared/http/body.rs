@@ -29,12 +29,10 @@ pub async fn json<T: DeserializeOwned + Default>(
     payload: Payload,
     form: &str,
 ) -> Result<T, HttpResponse> {
-    if request.headers().contains_key(header::TRANSFER_ENCODING) {
-        return Err(HttpResponse::LengthRequired().body("Error: a body needs Content-Length."));
-    }
-    let length = request.headers().get(header::CONTENT_LENGTH).and_then(|length| length.to_str().ok());
-    if length.and_then(|length| length.parse().ok()).is_some_and(|length: usize| length > MAX_BODY) {
-        let words = format!("Error: the body is larger than {MAX_BODY} bytes.");
+    let headers = request.headers();
+    let length = headers.get(header::CONTENT_LENGTH).and_then(|length| length.to_str().ok()?.parse().ok());
+    if headers.contains_key(header::TRANSFER_ENCODING) || length.is_some_and(|length: usize| length > MAX_BODY) {
+        let words = format!("Error: a body has a Content-Length of at most {MAX_BODY} bytes.");
         return Err(HttpResponse::PayloadTooLarge().force_close().body(words));
     }
     let wrong = || HttpResponse::BadRequest().body(format!("Error: the body is not {form}."));

@@ -1,41 +1,71 @@
-//! A client's TCP connection that reads the next request only once the answer to the one before has begun, and none
-//! once the server stops. A request may have a body of up to 8 KiB.
+//! A client's TCP connection that reads the next request only once the answer to the one before has begun. A request may
+//! have a body of up to 8 KiB.
 //!
 //! actix decodes all requests that it has read before it answers the first. Without this limit, a client that sends
 //! many requests and reads no answer would fill the memory.
+//!
+//! Once a request was answered with 101 (Switching Protocols), the connection can be taken from actix, as
+//! `hyper::upgrade` does: bytes that are only copied need no parser of HTTP between.
 
+use std::cell::RefCell;
 use std::io;
 use std::pin::Pin;
+use std::rc::Rc;
 use std::task::{Context, Poll, ready};
 
 use actix_http::Extensions;
+use actix_web::HttpRequest;
 use actix_web::rt::net::TcpStream;
+use actix_web::web::{Bytes, BytesMut};
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
-use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
+use tokio::sync::oneshot;
+use tokio_util::io::poll_read_buf;
 
 use super::connections::ConnectionPermit;
-use super::upgrade::{UpgradeSlot, Upgraded};
 
 /// Size of one read from the socket, in bytes.
 const READ_AT_ONCE: usize = 4 * 1024;
 /// Begin of the answer that upgrades a connection to a WebSocket.
 const SWITCHING_PROTOCOLS: &[u8] = b"HTTP/1.1 101 ";
-/// Number of bytes that are kept of a line, enough for the header Content-Length.
-const MAX_LINE: usize = 40;
+/// Size limit of the head of a request, in bytes. A connection with a larger one is closed.
+const MAX_HEAD: usize = 32 * 1024;
 /// Size limit of a body, in bytes. A request with a larger one, or one in chunks, is answered without it.
 pub const MAX_BODY: usize = 8 * 1024;
+/// Limit of headers in a request, the same as that of actix.
+const MAX_HEADERS: usize = 96;
 
 /// What the connection is currently used for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum State {
-    /// The head of a request is read.
+    /// A request may be read.
     Request,
-    /// So many bytes of a request's body are still to come; its answer may have begun.
-    Body(usize, bool),
-    /// A request was handed over, and nothing of its answer was written yet.
+    /// A request was read, and nothing of its answer was written yet.
     Answer,
     /// Messages go in both directions.
     WebSocket,
+}
+
+/// A connection that speaks another protocol than HTTP from now on.
+#[derive(Debug)]
+pub struct Upgraded {
+    /// The connection.
+    pub tcp: TcpStream,
+    /// What was read from it after the request.
+    pub read_buffer: Bytes,
+    /// Counts the connection.
+    pub permit: ConnectionPermit,
+}
+
+/// Where a connection goes when it is upgraded; empty where nobody takes it.
+type UpgradeSlot = Rc<RefCell<Option<oneshot::Sender<Upgraded>>>>;
+
+/// The connection of a request, once the answer 101 was written to it. An error means that it has ended before.
+pub fn upgrade(request: &HttpRequest) -> oneshot::Receiver<Upgraded> {
+    let (sender, receiver) = oneshot::channel();
+    if let Some(slot) = request.conn_data::<UpgradeSlot>() {
+        slot.replace(Some(sender));
+    }
+    receiver
 }
 
 /// A client's TCP connection.
@@ -45,36 +75,30 @@ pub struct ClientStream {
     connection: Option<(TcpStream, ConnectionPermit)>,
     upgrade: UpgradeSlot,
     /// Bytes that were read from the socket and not yet passed to actix.
-    unread: Vec<u8>,
-    /// The beginning of the line that is read, without line breaks.
-    line: Vec<u8>,
-    /// The length of the body that the head tells; `None` before its first line.
-    body: Option<usize>,
+    unread: BytesMut,
+    /// Number of bytes of the current request that were not yet passed to actix.
+    left: usize,
     /// Whether the system takes no more of an answer, since the client does not read.
     is_blocked: bool,
     state: State,
-    /// `None` once it is a WebSocket, which its actor closes.
-    stopping: Option<Pin<Box<WaitForCancellationFutureOwned>>>,
 }
 
 impl ClientStream {
-    /// A connection that `permit` counts; `stopping` is cancelled when the server stops.
-    pub fn new(tcp: TcpStream, permit: ConnectionPermit, stopping: CancellationToken) -> Self {
+    /// A connection that `permit` counts.
+    pub fn new(tcp: TcpStream, permit: ConnectionPermit) -> Self {
         Self {
             connection: Some((tcp, permit)),
             upgrade: UpgradeSlot::default(),
-            unread: Vec::new(),
-            line: Vec::new(),
-            body: None,
+            unread: BytesMut::new(),
+            left: 0,
             is_blocked: false,
             state: State::Request,
-            stopping: Some(Box::pin(stopping.cancelled_owned())),
         }
     }
 
     /// Called by actix for each new connection, so that its requests find its slot.
     pub fn on_connect(&self, data: &mut Extensions) {
-        data.insert(self.upgrade.clone());
+        data.insert(Rc::clone(&self.upgrade));
     }
 
     fn tcp(&mut self) -> io::Result<Pin<&mut TcpStream>> {
@@ -82,64 +106,45 @@ impl ClientStream {
         connection.ok_or_else(|| io::ErrorKind::NotConnected.into())
     }
 
-    /// Frees what only requests need: thousands of WebSockets are open at a time, and most of them are idle.
-    fn release(&mut self) {
-        if self.state == State::WebSocket {
-            self.stopping = None;
-            self.line = Vec::new();
-            if self.unread.is_empty() {
-                self.unread = Vec::new();
+    /// Reads more from the socket. Returns the number of bytes; 0 at its end.
+    fn poll_fill(&mut self, context: &mut Context<'_>) -> Poll<io::Result<usize>> {
+        let Some((tcp, _)) = &mut self.connection else { return Poll::Ready(Ok(0)) };
+        self.unread.reserve(READ_AT_ONCE);
+        poll_read_buf(Pin::new(tcp), context, &mut self.unread)
+    }
+
+    /// Reads the head of a request. Returns the length of the request; 0 if the client sends no more.
+    fn poll_head(&mut self, context: &mut Context<'_>) -> Poll<io::Result<usize>> {
+        loop {
+            if let Some(length) = request_length(&self.unread) {
+                return Poll::Ready(Ok(length));
+            }
+            if self.unread.len() > MAX_HEAD {
+                return Poll::Ready(Err(io::ErrorKind::InvalidData.into()));
+            }
+            if ready!(self.poll_fill(context))? == 0 {
+                return Poll::Ready(Ok(0));
             }
         }
     }
+}
 
-    /// Number of unread bytes that may be passed on, at most `room`: those of one request.
-    fn readable(&mut self, room: usize) -> usize {
-        let room = room.min(self.unread.len());
-        if self.state == State::WebSocket {
-            return room;
-        }
-        if let State::Body(left, is_answered) = self.state {
-            let count = room.min(left);
-            self.state = after(left - count, is_answered);
-            return count;
-        }
-        for (index, byte) in self.unread.iter().take(room).enumerate() {
-            match byte {
-                // An empty line ends the head of a request, and means nothing before one.
-                b'\n' if self.line.is_empty() => {
-                    if let Some(body) = self.body.take() {
-                        self.state = after(body, false);
-                        return index + 1;
-                    }
-                }
-                b'\n' => {
-                    self.body = content_length(&self.line).or(self.body).or(Some(0));
-                    self.line.clear();
-                }
-                b'\r' => {}
-                other if self.line.len() < MAX_LINE => self.line.push(*other),
-                _ => {}
-            }
-        }
-        room
+/// The length of the request that these bytes begin with; `None` while its head is incomplete. Of an invalid one, which
+/// actix answers, it is all bytes.
+fn request_length(bytes: &[u8]) -> Option<usize> {
+    let mut headers = [httparse::EMPTY_HEADER; MAX_HEADERS];
+    let mut request = httparse::Request::new(&mut headers);
+    match request.parse(bytes) {
+        Ok(httparse::Status::Complete(head)) => Some(head + body_length(request.headers).unwrap_or(0)),
+        Ok(httparse::Status::Partial) => None,
+        Err(_) => Some(bytes.len()),
     }
 }
 
-/// The state once so many bytes of a body are left.
-fn after(left: usize, is_answered: bool) -> State {
-    match (left, is_answered) {
-        (0, true) => State::Request,
-        (0, false) => State::Answer,
-        (left, _) => State::Body(left, is_answered),
-    }
-}
-
-/// The length of a body, where this line of a head tells it and it is not too large.
-fn content_length(line: &[u8]) -> Option<usize> {
-    let (name, value) = std::str::from_utf8(line).ok()?.split_once(':')?;
-    let length = value.trim().parse().ok().filter(|length| *length <= MAX_BODY)?;
-    name.eq_ignore_ascii_case("content-length").then_some(length)
+/// The length of a body, if the headers have one and it is not too large.
+fn body_length(headers: &[httparse::Header<'_>]) -> Option<usize> {
+    let header = headers.iter().find(|header| header.name.eq_ignore_ascii_case("content-length"))?;
+    std::str::from_utf8(header.value).ok()?.trim().parse().ok().filter(|length| *length <= MAX_BODY)
 }
 
 impl AsyncRead for ClientStream {
@@ -152,28 +157,30 @@ impl AsyncRead for ClientStream {
             // End of input: actix has no more to do with what was handed over.
             return Poll::Ready(Ok(()));
         }
-        if self.is_blocked || self.state == State::Answer || self.upgrade.is_wanted() {
+        if self.is_blocked || self.upgrade.borrow().is_some() {
             // The next write wakes the task, or the socket once it accepts more.
             return Poll::Pending;
         }
-        let is_stopping = |end: &mut Pin<Box<WaitForCancellationFutureOwned>>| end.as_mut().poll(context).is_ready();
-        if self.state == State::Request && self.stopping.as_mut().is_some_and(is_stopping) {
-            // End of input: requests in progress are answered, and the connection closes.
-            return Poll::Ready(Ok(()));
+        if self.left == 0 {
+            match self.state {
+                State::Answer => return Poll::Pending,
+                State::Request => {
+                    self.left = ready!(self.poll_head(context))?;
+                    if self.left == 0 {
+                        return Poll::Ready(Ok(()));
+                    }
+                    self.state = State::Answer;
+                }
+                State::WebSocket if self.unread.is_empty() => return self.tcp()?.poll_read(context, buffer),
+                State::WebSocket => self.left = self.unread.len(),
+            }
         }
         if self.unread.is_empty() {
-            if self.state == State::WebSocket {
-                return self.tcp()?.poll_read(context, buffer);
-            }
-            let mut bytes = [0; READ_AT_ONCE];
-            let mut part = ReadBuf::new(&mut bytes);
-            ready!(self.tcp()?.poll_read(context, &mut part))?;
-            self.unread.extend_from_slice(part.filled());
+            ready!(self.poll_fill(context))?;
         }
-        let count = self.readable(buffer.remaining());
-        buffer.put_slice(self.unread.get(..count).unwrap_or_default());
-        self.unread.drain(..count);
-        self.release();
+        let count = self.left.min(self.unread.len()).min(buffer.remaining());
+        buffer.put_slice(&self.unread.split_to(count));
+        self.left -= count;
         Poll::Ready(Ok(()))
     }
 }
@@ -182,12 +189,13 @@ impl AsyncWrite for ClientStream {
     fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
         let written = self.tcp()?.poll_write(context, bytes);
         self.is_blocked = written.is_pending();
-        if let State::Body(left, _) = self.state {
-            self.state = State::Body(left, true);
-        }
         if self.state == State::Answer && written.is_ready() {
-            self.state = if bytes.starts_with(SWITCHING_PROTOCOLS) { State::WebSocket } else { State::Request };
-            self.release();
+            self.state = State::Request;
+            if bytes.starts_with(SWITCHING_PROTOCOLS) {
+                self.state = State::WebSocket;
+                // Thousands of WebSockets are open at a time, and most of them are idle.
+                self.unread = BytesMut::from(&*self.unread);
+            }
             context.waker().wake_by_ref();
         }
         written
@@ -195,11 +203,12 @@ impl AsyncWrite for ClientStream {
 
     /// actix calls this when all of an answer is written.
     fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
-        if self.upgrade.is_wanted()
+        if let Some(taker) = self.upgrade.take()
             && let Some((tcp, permit)) = self.connection.take()
         {
-            let read_buffer = std::mem::take(&mut self.unread);
-            self.upgrade.fulfil(Upgraded { tcp, read_buffer, permit });
+            let read_buffer = self.unread.split().freeze();
+            // Without a receiver the connection closes.
+            taker.send(Upgraded { tcp, read_buffer, permit }).ok();
             context.waker().wake_by_ref();
         }
         // A TCP connection has nothing to flush.

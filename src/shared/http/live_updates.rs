@@ -1,32 +1,33 @@
 //! Live pages: server-sent events with the parts of a page that change.
 //!
-//! While pages listen, one task per server renders these parts once per second, and publishes them if they have
-//! changed. Each page receives the latest version; a slow one skips versions.
+//! While pages listen, one of them renders these parts for all once per second. Each page receives the latest version if
+//! it has changed; a slow one skips versions.
 
 use std::collections::BTreeMap;
+use std::convert::Infallible;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
+use actix_rt::time::sleep;
 use actix_web::HttpResponse;
 use actix_web::http::header;
 use actix_web::web::Bytes;
 use futures_util::stream::{self, StreamExt};
-use parking_lot::Mutex;
 use serde::Serialize;
-use tokio::sync::watch;
+use tokio::sync::{Mutex, watch};
 
 use super::connections::ConnectionPermit;
 use crate::shared::run::{Phase, closing};
 
 /// Interval between two renderings.
 const PERIOD: Duration = Duration::from_secs(1);
-/// After an event, the next rendering waits one more period per this many bytes, so that a hundred pages of a large
-/// fleet do not keep the server busy.
+/// The next rendering waits one more period per this many bytes of the event, so that a hundred pages of a large fleet do
+/// not keep the server busy.
 const LARGE: usize = 32 * 1024;
 /// Longest interval between two renderings, in periods.
 const MAX_PERIODS: usize = 5;
-/// Interval of empty events while nothing changes, which show a page that the server is alive.
-const KEEP_ALIVE: Duration = Duration::from_secs(15);
+/// Interval of empty events while nothing changes, which show a page that the server is alive, in periods.
+const KEEP_ALIVE: u32 = 15;
 /// Bytes that are written to a connection at once. All connections share the bytes of an event; only a chunk is copied,
 /// so that a page that does not read costs little memory.
 const CHUNK: usize = 8 * 1024;
@@ -60,11 +61,16 @@ struct Event<'view> {
     view: &'view PageView,
 }
 
-/// The live pages of a server.
+/// The live pages of a server. Clones share the latest event.
 #[derive(Clone, Default)]
-pub struct LiveUpdates {
-    /// The events of the rendering task; `None` if no page listens.
-    events: Arc<Mutex<Option<watch::Receiver<Bytes>>>>,
+pub struct LiveUpdates(Arc<Mutex<Latest>>);
+
+/// The latest event.
+#[derive(Default)]
+struct Latest {
+    event: Bytes,
+    /// When it was rendered; `None` before the first.
+    at: Option<Instant>,
 }
 
 impl LiveUpdates {
@@ -74,18 +80,8 @@ impl LiveUpdates {
         R: Fn() -> F + 'static,
         F: Future<Output = Option<PageView>> + 'static,
     {
-        let mut running = self.events.lock();
-        // A task that has panicked has dropped its sender.
-        let events = running.clone().filter(|events| events.has_changed().is_ok());
-        let mut events = events.unwrap_or_else(|| {
-            let (sender, events) = watch::channel(Bytes::from_static(b"retry: 2000\n\n"));
-            *running = Some(events.clone());
-            actix_rt::spawn(self.clone().render_each_period(sender, render));
-            events
-        });
-        drop(running);
-        events.mark_changed();
-        let page = EventStream { events, unsent: Bytes::new(), _permit: permit };
+        let unsent = Bytes::from_static(b"retry: 2000\n\n");
+        let page = EventStream { live: self.clone(), render, unsent, last: Bytes::new(), _permit: permit };
         HttpResponse::Ok()
             .content_type("text/event-stream")
             .insert_header((header::CACHE_CONTROL, "no-store"))
@@ -94,109 +90,55 @@ impl LiveUpdates {
             .streaming(stream::unfold(page, EventStream::next).take_until(Box::pin(closing(phase))))
     }
 
-    async fn render_each_period<R, F>(self, events: watch::Sender<Bytes>, render: R)
-    where
-        R: Fn() -> F,
-        F: Future<Output = Option<PageView>>,
-    {
-        loop {
-            let periods = render().await.map_or(1, |view| publish(&events, &view));
-            actix_rt::time::sleep(PERIOD * periods).await;
-            let mut running = self.events.lock();
-            // The last receiver is the one in `self.events`.
-            if events.receiver_count() == 1 {
-                *running = None;
-                return;
+    /// Returns the latest event, after rendering it again if it is old.
+    async fn latest<F: Future<Output = Option<PageView>>>(&self, render: impl Fn() -> F) -> Bytes {
+        let mut latest = self.0.lock().await;
+        let periods = u32::try_from((1 + latest.event.len() / LARGE).min(MAX_PERIODS)).unwrap_or(1);
+        if latest.at.is_none_or(|at| at.elapsed() >= PERIOD * periods) {
+            if let Some(view) = render().await {
+                let event = Event { version: env!("CARGO_PKG_VERSION"), view: &view };
+                let event = format!("data: {}\n\n", serde_json::to_string(&event).unwrap_or_default());
+                // Bytes that stay the same are the same allocation, which pages compare.
+                if latest.event != event.as_bytes() {
+                    latest.event = event.into();
+                }
             }
+            latest.at = Some(Instant::now());
         }
+        latest.event.clone()
     }
 }
 
-/// Publishes a view if it has changed. Returns the number of periods until the next rendering.
-fn publish(events: &watch::Sender<Bytes>, view: &PageView) -> u32 {
-    let json = serde_json::to_string(&Event { version: env!("CARGO_PKG_VERSION"), view }).unwrap_or_default();
-    let event = Bytes::from(format!("data: {json}\n\n"));
-    let size = event.len();
-    let has_changed = events.send_if_modified(|last| {
-        let has_changed = *last != event;
-        *last = event;
-        has_changed
-    });
-    if has_changed { u32::try_from((1 + size / LARGE).min(MAX_PERIODS)).unwrap_or(1) } else { 1 }
-}
-
 /// The connection of a page.
-struct EventStream {
-    events: watch::Receiver<Bytes>,
+struct EventStream<R> {
+    live: LiveUpdates,
+    render: R,
     /// The rest of an event.
     unsent: Bytes,
+    /// The event that was sent last.
+    last: Bytes,
     _permit: ConnectionPermit,
 }
 
-impl EventStream {
-    /// Returns the next bytes for the page; `None` if the rendering task has panicked.
-    async fn next(mut self) -> Option<(Result<Bytes, std::convert::Infallible>, Self)> {
+impl<R: Fn() -> F, F: Future<Output = Option<PageView>>> EventStream<R> {
+    /// Returns the next bytes for the page.
+    async fn next(mut self) -> Option<(Result<Bytes, Infallible>, Self)> {
         if self.unsent.is_empty() {
-            self.unsent = match actix_rt::time::timeout(KEEP_ALIVE, self.events.changed()).await {
-                Ok(Ok(())) => self.events.borrow_and_update().clone(),
-                Ok(Err(_)) => return None,
-                Err(_) => Bytes::from_static(b"data: {}\n\n"),
-            };
+            self.unsent = self.next_event().await;
         }
         let chunk = self.unsent.split_to(CHUNK.min(self.unsent.len()));
         Some((Ok(chunk), self))
     }
-}
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::shared::http::connections::{ConnectionKind, ConnectionLimiter};
-    use crate::shared::http::peer::Peer;
-
-    fn view(glance: &str) -> PageView {
-        PageView { parts: [("glance", glance.to_owned())].into(), ..PageView::default() }
-    }
-
-    fn permit() -> ConnectionPermit {
-        ConnectionLimiter::new(1, 1, Some(1)).admit(ConnectionKind::Page, Peer::Unknown).unwrap()
-    }
-
-    #[test]
-    fn after_a_large_event_the_pause_is_longer() {
-        let (events, pages) = watch::channel(Bytes::new());
-        let large = |letter: &str| view(&letter.repeat(LARGE));
-        for (view, pause) in [(large("a"), 2), (large("a"), 1), (large("b"), 2), (view("small"), 1)] {
-            assert_eq!(publish(&events, &view), pause);
+    async fn next_event(&mut self) -> Bytes {
+        for _ in 0..KEEP_ALIVE {
+            let event = self.live.latest(&self.render).await;
+            if event.as_ptr() != self.last.as_ptr() {
+                self.last = event.clone();
+                return event;
+            }
+            sleep(PERIOD).await;
         }
-        assert_eq!(publish(&events, &view(&"c".repeat(100 * LARGE))), 5);
-        drop(pages);
-    }
-
-    #[actix_rt::test]
-    async fn the_task_runs_only_while_somebody_listens() {
-        let live = LiveUpdates::default();
-        let (_sender, phase) = watch::channel(Phase::Open);
-        let response = live.listen(permit(), phase, || async { Some(PageView::default()) });
-        assert!(live.events.lock().is_some());
-        drop(response);
-        let deadline = std::time::Instant::now() + Duration::from_secs(10);
-        while live.events.lock().is_some() {
-            assert!(std::time::Instant::now() < deadline, "it runs for nobody");
-            actix_rt::time::sleep(Duration::from_millis(20)).await;
-        }
-    }
-
-    #[actix_rt::test]
-    async fn a_page_whose_task_has_failed_is_sent_away_and_may_come_back() {
-        let live = LiveUpdates::default();
-        let (_sender, phase) = watch::channel(Phase::Open);
-        let page = live.listen(permit(), phase.clone(), || async { panic!("this panic is part of a test") });
-        let end = actix_web::body::to_bytes(page.into_body());
-        assert!(actix_rt::time::timeout(Duration::from_secs(10), end).await.is_ok(), "it waits for ever");
-        let again = live.listen(permit(), phase, || async { Some(view("well")) });
-        let mut body = Box::pin(again.into_body());
-        let heard = std::future::poll_fn(|context| actix_web::body::MessageBody::poll_next(body.as_mut(), context));
-        assert!(actix_rt::time::timeout(Duration::from_secs(10), heard).await.unwrap().is_some());
+        Bytes::from_static(b"data: {}\n\n")
     }
 }

@@ -15,14 +15,14 @@ mod peer;
 pub mod routing;
 pub mod server;
 pub mod tls;
-pub mod upgrade;
 pub mod websocket;
 
 pub use address_quota::{AddressQuota, share};
 pub use auth::{AuthError, BasicAuth, refuse_action, require_administrator};
+pub use client_stream::upgrade;
 pub use connections::{ConnectionKind, ConnectionLimiter, ConnectionPermit, STREAMS_PER_CLIENT, TCP_PER_CLIENT};
 pub use live_updates::{LiveUpdates, PageView, TableRow};
 pub use metrics::{CONTENT_TYPE, Gauge, Metrics};
 pub use origin::Origin;
-pub use page::{ContentSecurityPolicy, any_host, fleet_sources, heat, html, own_sources, width};
+pub use page::{OWN_FILES, VIEWER, any_host, fleet_sources, foreign_scripts, heat, html, width};
 pub use peer::{Peer, TrustedProxies, UserHeader};

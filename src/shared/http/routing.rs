@@ -4,7 +4,7 @@ use actix_web::dev::HttpServiceFactory;
 use actix_web::http::header::{self, HeaderName, HeaderValue};
 use actix_web::http::{Method, StatusCode};
 use actix_web::middleware::DefaultHeaders;
-use actix_web::{FromRequest, Handler, HttpRequest, HttpResponse, Resource, Responder, guard, web};
+use actix_web::{FromRequest, Handler, HttpResponse, Resource, Responder, guard, web};
 use rand::RngExt;
 
 /// Range of `Retry-After`, in seconds.
@@ -37,22 +37,6 @@ fn wrong_method(methods: &[Method]) -> HttpResponse {
     HttpResponse::MethodNotAllowed().insert_header((header::ALLOW, allowed)).body(words)
 }
 
-/// Refuses a request from a page of another site (CSRF): the browser would add the stored password.
-///
-/// Browsers send the origin of a request in `Sec-Fetch-Site`, older ones in `Origin`; other programs send neither.
-pub fn reject_cross_site(request: &HttpRequest) -> Option<HttpResponse> {
-    let header = |name: HeaderName| request.headers().get(name).map(|value| value.to_str().unwrap_or_default());
-    let same_site =
-        header(HeaderName::from_static("sec-fetch-site")).is_none_or(|site| matches!(site, "same-origin" | "none"));
-    let host = header(header::HOST).unwrap_or_default();
-    let same_host = header(header::ORIGIN).is_none_or(|origin| {
-        let of_page = origin.split_once("://").map_or(origin, |(_, authority)| authority);
-        of_page.eq_ignore_ascii_case(host)
-    });
-    let refusal = || HttpResponse::Forbidden().body("Error: this request comes from a page of another site.");
-    (!same_site || !same_host).then(refusal)
-}
-
 /// The header `Retry-After`, in seconds. Random, so that a class that was refused at once does not retry at once.
 pub fn retry_after() -> (HeaderName, HeaderValue) {
     (header::RETRY_AFTER, HeaderValue::from(rand::rng().random_range(RETRY_AFTER)))
@@ -75,35 +59,4 @@ pub fn all(configure: fn(&mut web::ServiceConfig), hint: &'static str) -> impl H
             let words = format!("Error: there is nothing here. Try {hint}.");
             HttpResponse::build(StatusCode::NOT_FOUND).body(words)
         }))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use actix_web::test::TestRequest;
-
-    #[test]
-    fn only_pages_of_the_same_site_and_other_programs_change_something() {
-        for (site, origin, allowed) in [
-            (None, None, true),
-            (Some("same-origin"), Some("https://lab.org:2000"), true),
-            (Some("none"), None, true),
-            (None, Some("http://LAB.org:2000"), true),
-            (Some("cross-site"), None, false),
-            (Some("same-site"), Some("https://lab.org:2000"), false),
-            (None, Some("https://lab.org"), false),
-            (None, Some("https://lab.org:2000.evil.example"), false),
-            (None, Some("null"), false),
-        ] {
-            let mut request = TestRequest::post().insert_header((header::HOST, "lab.org:2000"));
-            if let Some(site) = site {
-                request = request.insert_header(("sec-fetch-site", site));
-            }
-            if let Some(origin) = origin {
-                request = request.insert_header((header::ORIGIN, origin));
-            }
-            let refusal = reject_cross_site(&request.to_http_request());
-            assert_eq!(refusal.is_none(), allowed, "{site:?} {origin:?}");
-        }
-    }
 }

@@ -7,7 +7,7 @@
 use std::fmt::Debug;
 use std::future::ready;
 use std::io;
-use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, TcpListener};
+use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr, TcpListener};
 use std::thread::available_parallelism;
 use std::time::Duration;
 
@@ -17,10 +17,7 @@ use actix_http::{HttpService, Request, Response};
 use actix_service::{IntoServiceFactory, ServiceFactory, ServiceFactoryExt, fn_service, map_config};
 use actix_web::dev::{AppConfig, Server};
 use actix_web::rt::net::TcpStream;
-use nix::errno::Errno;
-use nix::sys::socket::{setsockopt, sockopt};
-use socket2::{Domain, Protocol, Socket, Type};
-use tokio_util::sync::CancellationToken;
+use socket2::{Domain, SockRef, Socket, TcpKeepalive, Type};
 
 use super::client_stream::ClientStream;
 use super::connections::{ConnectionKind, ConnectionLimiter};
@@ -36,16 +33,12 @@ const BACKLOG: i32 = i32::MAX;
 /// # Errors
 /// When the address is taken, or may not be used.
 pub fn listen(address: SocketAddr) -> io::Result<TcpListener> {
-    let is_everywhere = address.ip() == IpAddr::V6(Ipv6Addr::UNSPECIFIED);
-    let socket = match Socket::new(Domain::for_address(address), Type::STREAM, Some(Protocol::TCP)) {
-        Err(error) if is_everywhere && error.raw_os_error() == Some(Errno::EAFNOSUPPORT as i32) => {
+    let socket = match Socket::new(Domain::for_address(address), Type::STREAM, None) {
+        Err(_) if address.ip() == Ipv6Addr::UNSPECIFIED => {
             return listen((Ipv4Addr::UNSPECIFIED, address.port()).into());
         }
         socket => socket?,
     };
-    if is_everywhere {
-        socket.set_only_v6(false)?;
-    }
     socket.set_reuse_address(true)?;
     socket.bind(&address.into())?;
     socket.listen(BACKLOG)?;
@@ -89,20 +82,19 @@ where
     let server =
         Server::build().workers(threads).max_concurrent_connections((options.max_connections / threads).max(1));
     let server = server.disable_signals().shutdown_timeout(options.stop.as_secs());
-    // When the server stops, idle connections end at once.
-    let (stops, stopping) = (server.graceful_shutdown_signal(), CancellationToken::new());
-    let told = stopping.clone();
-    actix_web::rt::spawn(async move {
-        stops.notified().await;
-        told.cancel();
-    });
+    let stops = server.graceful_shutdown_signal();
     let server = server.listen("http", port, move || {
         let app = app().into_factory().map_err(|error| error.into().error_response());
+        let (connections, options, stops) = (connections.clone(), options.clone(), stops.clone());
         let http = HttpService::build()
+            // When the server stops, idle connections end at once.
+            .graceful_shutdown_signal(move || {
+                let stops = stops.clone();
+                async move { stops.notified().await }
+            })
             .on_connect_ext(ClientStream::on_connect)
             .h1(map_config(app, |()| AppConfig::default()));
-        let (connections, options, stopping) = (connections.clone(), options.clone(), stopping.clone());
-        fn_service(move |tcp| ready(accept(tcp, &connections, &options, &stopping))).and_then(http)
+        fn_service(move |tcp| ready(accept(tcp, &connections, &options))).and_then(http)
     })?;
     Ok(server.run())
 }
@@ -112,7 +104,6 @@ fn accept(
     tcp: TcpStream,
     connections: &ConnectionLimiter,
     options: &HttpServerOptions,
-    stopping: &CancellationToken,
 ) -> Result<(ClientStream, Option<SocketAddr>), DispatchError> {
     let address = tcp.peer_addr()?;
     let peer = options.trusted_proxies.of_connection(address.ip());
@@ -122,16 +113,12 @@ fn accept(
     })?;
     // Messages are small, and must not wait for the acknowledgement of the one before.
     tcp.set_nodelay(true)?;
+    let socket = SockRef::from(&tcp);
     // RFC 5482; on Linux it also covers a client that does not read (tcp(7)).
-    let silence = u32::try_from(options.silence.as_millis()).unwrap_or(u32::MAX);
+    socket.set_tcp_user_timeout(Some(options.silence))?;
     // A peer that has vanished while nothing is sent, as on the stream of a paused simulation, is noticed by probes.
-    let seconds = u32::try_from(options.silence.as_secs()).unwrap_or(u32::MAX).clamp(1, 3600);
-    let limited = setsockopt(&tcp, sockopt::TcpUserTimeout, &silence)
-        .and_then(|()| setsockopt(&tcp, sockopt::KeepAlive, &true))
-        .and_then(|()| setsockopt(&tcp, sockopt::TcpKeepIdle, &seconds))
-        .and_then(|()| setsockopt(&tcp, sockopt::TcpKeepInterval, &seconds.div_ceil(3)));
-    if let Err(error) = limited {
-        log::warn!("a connection has no time limit for its answers: {error}");
-    }
-    Ok((ClientStream::new(tcp, permit, stopping.clone()), Some(address)))
+    let seconds = options.silence.as_secs().clamp(1, 3600);
+    let probes = TcpKeepalive::new().with_time(Duration::from_secs(seconds));
+    socket.set_tcp_keepalive(&probes.with_interval(Duration::from_secs(seconds.div_ceil(3))))?;
+    Ok((ClientStream::new(tcp, permit), Some(address)))
 }

@@ -1,7 +1,7 @@
 //! The commit that a world's URL means, and its contents: arguments for git, and parsers of its answers. Pure.
 
 use super::repository::REMOTE;
-use crate::shared::domain::{ProjectUrl, Reading, RefKind};
+use crate::shared::domain::{ProjectUrl, Reading};
 
 /// One commit that a world's URL may mean.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -35,9 +35,8 @@ pub const LIST_TIPS: [&str; 6] = ["ls-remote", "--quiet", "--heads", "--tags", "
 /// do, or only one that is in a branch or tag.
 pub fn commit_of(world: &ProjectUrl, allow_any: bool) -> Option<Revision> {
     let Reading { reference, folder } = world.candidates().into_iter().next()?;
-    let is_commit = is_hash(&reference) && matches!(world.kind(), RefKind::Any | RefKind::Commit);
     let trust = if allow_any { TrustSource::AnyCommit } else { TrustSource::Url };
-    is_commit.then(|| Revision { commit: reference.to_ascii_lowercase(), name: reference, folder, trust })
+    is_hash(&reference).then(|| Revision { commit: reference.to_ascii_lowercase(), name: reference, folder, trust })
 }
 
 fn is_hash(text: &str) -> bool {
@@ -62,19 +61,12 @@ fn fetch(options: &[&str], references: &[&str]) -> Vec<String> {
 
 /// Asks the remote for all branches and tags that a URL may mean.
 pub fn search_arguments(world: &ProjectUrl) -> Vec<String> {
-    let names = world.candidates().into_iter().flat_map(|reading| full_names(world, &reading));
+    let names = world.candidates().into_iter().flat_map(|reading| full_names(&reading));
     ["ls-remote", "--quiet", "--", REMOTE].map(str::to_owned).into_iter().chain(names).collect()
 }
 
-fn full_names(world: &ProjectUrl, reading: &Reading) -> Vec<String> {
-    let branch = format!("refs/heads/{}", reading.reference);
-    let tag = format!("refs/tags/{}", reading.reference);
-    match world.kind() {
-        RefKind::Any => vec![branch, tag],
-        RefKind::Branch => vec![branch],
-        RefKind::Tag => vec![tag],
-        RefKind::Commit => Vec::new(),
-    }
+fn full_names(reading: &Reading) -> [String; 2] {
+    [format!("refs/heads/{}", reading.reference), format!("refs/tags/{}", reading.reference)]
 }
 
 /// What the remote has of what was asked for: the longest names first, branches before tags.
@@ -82,7 +74,7 @@ pub fn found(world: &ProjectUrl, answer: &str) -> Vec<Revision> {
     let known: Vec<(&str, &str)> = answer.lines().filter_map(|line| line.split_once('\t')).collect();
     let readings = world.candidates().into_iter().rev();
     readings
-        .flat_map(|reading| full_names(world, &reading).into_iter().map(move |name| (name, reading.clone())))
+        .flat_map(|reading| full_names(&reading).into_iter().map(move |name| (name, reading.clone())))
         .filter_map(|(name, reading)| {
             let (commit, _) = known.iter().find(|(_, known)| *known == name)?;
             is_hash(commit).then(|| Revision {

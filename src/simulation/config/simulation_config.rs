@@ -15,8 +15,8 @@ use super::timing::Timing;
 use super::urls::Streaming;
 use crate::shared::config::keys::keys;
 use crate::shared::config::{
-    Configuration, ExpandedPath, Secret, choice, expanded, folder, is_web_url, local_address, minutes_or_zero, object,
-    one_or_many, optional_expanded, optional_whole, percent, require, seconds, whole,
+    Configuration, ExpandedPath, Secret, expanded, is_web_url, minutes_or_zero, one_or_many, optional_whole, percent,
+    require, seconds, whole,
 };
 use crate::shared::domain::{PublicUrl, UrlPrefix, complete_host};
 use crate::shared::http::{Origin, TrustedProxies, UserHeader};
@@ -36,19 +36,15 @@ pub struct SimulationConfig {
     #[serde(deserialize_with = "whole::<1, 65000, _, _>")]
     pub port: u16 = 2000,
     /// Local address to listen on. Default: `::`, all addresses of IPv4 and IPv6.
-    #[serde(deserialize_with = "local_address")]
     pub bind: IpAddr = Ipv6Addr::UNSPECIFIED.into(),
     /// Whether a reverse proxy rewrites ports in URLs: HOST/PORT, not HOST:PORT. Default: true.
     pub port_rewrite: bool = true,
     /// How clients reach this server and its simulations through one reverse proxy: a URL with the placeholders
     /// `{host}` (that is `server`) and `{port}`. Default: none, and they are reached under their own addresses.
-    #[serde(deserialize_with = "optional_expanded")]
     pub public_url: Option<PublicUrl> = None,
     /// How clients reach the streams of simulations: at the ports of their Webots, or through this server. Default: `direct`.
-    #[serde(deserialize_with = "choice")]
     pub streaming: Streaming = Streaming::default(),
     /// Folder of `simulation/output.log`, `simulation/monitor.csv` and the instances' output. Default: `log`.
-    #[serde(deserialize_with = "folder")]
     pub log_dir: ExpandedPath = ExpandedPath("log".into()),
     /// Log to standard output. Default: false.
     pub debug: bool = false,
@@ -63,19 +59,15 @@ pub struct SimulationConfig {
     /// Directory of local projects. Accepted for existing files; not used.
     pub projects_dir: Option<ExpandedPath> = None,
     /// The isolation level of simulations. Default: `auto`.
-    #[serde(deserialize_with = "choice")]
     pub isolation: IsolationSetting = IsolationSetting::default(),
     /// What a sandbox mounts besides the system and Webots.
-    #[serde(deserialize_with = "object")]
     pub sandbox: SandboxFolders = SandboxFolders::default(),
     /// How simulations run in containers.
-    #[serde(deserialize_with = "object")]
     pub container: ContainerSettings = ContainerSettings::default(),
     /// Environment variables that simulations get besides those that Webots needs. Default: none.
     #[serde(deserialize_with = "one_or_many")]
     pub environment: Vec<VariableName> = Vec::new(),
     /// The resource limits of one simulation.
-    #[serde(deserialize_with = "object")]
     pub limits: ResourceLimits = ResourceLimits::default(),
     /// Run Webots in containers: the original's key for `isolation: "container"`. Default: false.
     pub docker: bool = false,
@@ -138,7 +130,6 @@ pub struct SimulationConfig {
     /// Default: none.
     pub git_config: Option<ExpandedPath> = None,
     /// Directory of cached repositories and of the projects of running simulations. Default: `cache`.
-    #[serde(deserialize_with = "folder")]
     pub cache_dir: ExpandedPath = ExpandedPath("cache".into()),
     /// Size limit of all cached repositories, in MiB. Default: 10240.
     #[serde(deserialize_with = "whole::<1, 100_000_000, _, _>")]
@@ -169,7 +160,6 @@ pub struct SimulationConfig {
     /// Password for actions such as `/drain`. Default: none, and actions are off.
     pub admin_password: Option<Secret> = None,
     /// All other durations.
-    #[serde(deserialize_with = "object")]
     pub timing: Timing = Timing::default(),
     /// The file that this was read from; empty if there is none.
     #[serde(skip)]

@@ -26,13 +26,13 @@ pub async fn connect(
         Ok(Err(_)) => return HttpResponse::BadGateway().body("Error: the simulation does not answer."),
         Err(_) => return HttpResponse::GatewayTimeout().body("Error: the simulation does not answer."),
     };
-    let upgraded = upgrade::on(request);
+    let upgraded = upgrade(request);
     let stream_thread = upstream.stream_thread.clone();
     actix_rt::spawn(async move {
         // An error: the client has left before the answer.
         let Ok(client) = upgraded.await else { return };
         let (Ok(to_client), Ok(to_webots)) = (client.tcp.into_std(), webots.into_std()) else { return };
-        let client_end = (to_client, client.read_buffer.into());
+        let client_end = (to_client, client.read_buffer);
         let stream = Stream::new(client_end, (to_webots, from_webots), read_only, Box::new((held, client.permit)));
         // An error: what the client has sent with its request ends the stream.
         let Ok(stream) = stream else { return };

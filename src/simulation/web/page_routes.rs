@@ -16,7 +16,7 @@ use super::webots_viewer;
 use crate::asset;
 use crate::shared::http::assets::{self, Asset};
 use crate::shared::http::routing::{GET, READ, path};
-use crate::shared::http::{ConnectionKind, ContentSecurityPolicy, PageView, html, own_sources, require_administrator};
+use crate::shared::http::{ConnectionKind, OWN_FILES, PageView, VIEWER, foreign_scripts, html, require_administrator};
 use crate::simulation::container;
 use crate::simulation::ends::{last_lines, output_file};
 use crate::simulation::machine::{Tree, Usages};
@@ -67,7 +67,7 @@ pub fn configure(app: &mut web::ServiceConfig) {
 async fn monitor(request: HttpRequest, server: web::Data<AppState>) -> actix_web::Result<HttpResponse> {
     let visitor = Visitor::of(&request, &server)?;
     let page = view(&server, visitor).await.and_then(|view| pages::monitor(&server, &view, visitor));
-    Ok(html(page, &ContentSecurityPolicy::own()))
+    Ok(html(page, OWN_FILES))
 }
 
 async fn view(server: &AppState, visitor: Visitor) -> Result<PageView, askama::Error> {
@@ -176,11 +176,11 @@ async fn watch(
     let installed = webots_viewer::folder(&server.config).map(|_| webots_viewer::PATH);
     let (stream, script) = (format!("stream/{}", token.reveal()), installed.filter(|_| which.viewer != "small"));
     let page = Watch { one, stream, script };
-    Ok(html(page.render(), &ContentSecurityPolicy::viewer(&request, &[])))
+    Ok(html(page.render(), VIEWER))
 }
 
 /// Webots' own viewer shows what worlds bring: it runs in an embedded page with an origin of its own.
-async fn viewer(request: HttpRequest) -> HttpResponse {
+async fn viewer() -> HttpResponse {
     let page = WebotsViewer { version: env!("CARGO_PKG_VERSION") };
-    html(page.render(), &ContentSecurityPolicy::foreign(&own_sources(&request)))
+    html(page.render(), &foreign_scripts(&[]))
 }
