@@ -1,21 +1,21 @@
 //! A client's own copy of a project: its checkout by git.
 
-use std::ffi::{OsStr, OsString};
+use std::ffi::OsString;
 use std::io;
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::Ordering::Relaxed;
 
 use rustix::process::Resource;
 
-use super::checkout_error::{CheckoutError, git_failed, machine, refused, too_large};
+use super::checkout_error::{CheckoutError, refused};
 use super::commit_resolver::ResolvedCommit;
 use super::disk;
 use super::git::LITTLE_MEMORY;
 use super::lfs;
-use super::project::Project;
+use super::project::{Project, WorldFile};
 use super::repository::Repository;
 use super::revision::Revision;
-use super::world_file::WorldFile;
 use crate::shared::domain::ProjectUrl;
 use crate::simulation::process::{InstanceDir, Run};
 
@@ -33,14 +33,15 @@ pub fn checkout_command(
 ) -> io::Result<Run> {
     let (list, reference) = (scratch.join("paths"), OsString::from(revision.reference()));
     std::fs::write(&list, paths)?;
-    let with = |option: &str, path: &Path| [OsStr::new(option), path.as_os_str()].join(OsStr::new(""));
-    let mut arguments = vec![with("--work-tree=", into)];
-    arguments.extend(["checkout", "--force", "--progress", "--pathspec-file-nul"].map(OsString::from));
-    arguments.extend([with("--pathspec-from-file=", &list), reference.clone()]);
-    let mut call = repository.configured(settings, &arguments);
+    let words = ["checkout", "--force", "--progress", "--pathspec-file-nul", "--pathspec-from-file"];
+    let arguments = words.map(OsString::from).into_iter().chain([list.into(), reference.clone()]);
+    let mut call = repository.configured(settings, &arguments.collect::<Vec<_>>());
     call.limits.push((Resource::Data, LITTLE_MEMORY));
-    let index = scratch.join("index").into_os_string();
-    call.spec.environment.extend([("GIT_INDEX_FILE".into(), index), ("GIT_ATTR_SOURCE".into(), reference)]);
+    call.spec.environment.extend([
+        ("GIT_WORK_TREE".into(), into.into()),
+        ("GIT_INDEX_FILE".into(), scratch.join("index").into()),
+        ("GIT_ATTR_SOURCE".into(), reference),
+    ]);
     Ok(call)
 }
 
@@ -60,38 +61,31 @@ pub async fn write(
     let folder = if revision.folder.is_empty() { "." } else { &revision.folder };
     let paths = [folder.as_bytes(), b"\0", above].concat();
     let (root, most) = (instance.project(), limit << 20);
-    let settings = if has_lfs { lfs::settings(&repository.remote()) } else { Vec::new() };
-    let call = checkout_command(repository, revision, &paths, (instance.path(), &root), &settings);
-    let mut call = call.map_err(|error| machine(world, &error))?;
+    let settings = if has_lfs { lfs::settings(&repository.remote.lock()) } else { Vec::new() };
+    let mut call = checkout_command(repository, revision, &paths, (instance.path(), &root), &settings)?;
     call.may_block = true;
     // git-lfs stores its downloads here, shared with concurrent checkouts, and copies them into the project.
     let kept = repository.path.join("lfs");
-    let before = if has_lfs { disk::room_of(&kept) } else { 0 };
-    let mut growing = vec![(root.clone(), most)];
-    if has_lfs {
-        growing.push((kept.clone(), before.saturating_add(most.saturating_mul(2))));
-    }
+    let before = disk::room_of(&kept);
+    let growing = vec![(root.clone(), most), (kept.clone(), before.saturating_add(most.saturating_mul(2)))];
     let written = tokio::select! {
-        written = repository.run(call, on_line) => written.map(|_| true),
+        written = repository.git.run(call, on_line) => written.map(|_| true),
         () = disk::outgrown(growing) => Ok(false),
     };
-    if has_lfs && disk::room_of(&kept) > before {
-        repository.growth.notify_one();
+    if disk::room_of(&kept) > before {
+        repository.has_grown.store(true, Relaxed);
     }
     let size = disk::room_of(&root);
     // git's attributes may make it larger than the commit, and a Git host may send more than it should.
-    if !written.map_err(|source| git_failed(world, &source))? || size > most {
-        return Err(too_large("The project", limit));
+    if !written? || size > most {
+        return Err(refused(format!("The project is larger than {limit} MiB")));
     }
-    let folder = root.join(&revision.folder);
-    let pointers = lfs::pointers(&folder);
     Ok(Project {
         world: WorldFile::open(&root, &root.join(revision.world_path(world))).map_err(refused)?,
         size,
-        warning: (pointers > 0).then(|| lfs::warning(pointers, has_lfs)),
         url: world.clone(),
         revision: revision.clone(),
-        folder,
+        folder: root.join(&revision.folder),
         instance: Arc::clone(instance),
     })
 }

@@ -104,9 +104,6 @@ impl Session {
         log::info!("{}: {} is for Webots {}", self.name(), project.world.path.display(), project.world.version);
         let version = project.world.version.clone();
         slot.lease.update(|one| one.version = Some(version));
-        if let Some(warning) = &project.warning {
-            self.text(protocol::loading(warning));
-        }
         self.text(protocol::loading("webots is starting"));
         let gpu = self.take_gpu(&slot.lease);
         let spec = LaunchSpec {

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use actix_rt::task::spawn_blocking;
+use tokio::runtime::Handle;
 use tokio::sync::Semaphore;
 use tokio_util::task::AbortOnDropHandle;
 
@@ -13,13 +14,11 @@ use super::compose_project::{ComposeProject, ContainerRequest};
 use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
 use super::image::Images;
 use super::image_export::export;
-use super::orphan_cleanup::{ActiveProjects, run_cleanup};
-use super::owned_resources::{ResourceOwner, sweep_all};
+use super::owned_resources::{ProjectGuard, ResourceOwner, sweep_all};
 use super::packet_filter;
 use super::project_paths::participant_folder;
 use super::simulation_containers::SimulationContainers;
 use super::start_error::{StartError, blame};
-use super::steps;
 use super::templates;
 use super::webots_yml::ProjectKind;
 use crate::simulation::checkout::OnProgress;
@@ -32,13 +31,14 @@ pub struct ContainerService {
     /// The owner of these containers, for a process that removes them after the server's end.
     pub run: ResourceOwner,
     images: Arc<Images>,
-    active: ActiveProjects,
+    /// Removes containers.
+    runtime: Handle,
     /// What containers can do because the packet filter is missing; `None` if it is loaded.
     pub shortcoming: Option<String>,
     /// Limits concurrent runs of compose.
     turns: Semaphore,
     config: Arc<SimulationConfig>,
-    _keeper: AbortOnDropHandle<()>,
+    _removes_old_images: AbortOnDropHandle<()>,
 }
 
 /// The option by which containers in a network can't reach each other.
@@ -64,20 +64,18 @@ impl ContainerService {
         for fault in templates::faults(&config.container) {
             log::error!("{fault}");
         }
-        let images = Images::new(docker.clone(), owner.clone(), Arc::clone(&config));
-        let (images, active) = (Arc::new(images), ActiveProjects::default());
-        let keeper = run_cleanup(owner.clone(), active.clone(), Arc::clone(&images), Arc::clone(&config));
-        let keeper = AbortOnDropHandle::new(actix_rt::spawn(keeper));
+        let images = Arc::new(Images::new(docker.clone(), owner.clone(), Arc::clone(&config)));
+        let remover = AbortOnDropHandle::new(actix_rt::spawn(Arc::clone(&images).remove_old()));
         Ok(Self {
             docker,
             owner,
             run: this_run,
             images,
-            active,
+            runtime: Handle::current(),
             shortcoming,
             turns: Semaphore::new(2 * std::thread::available_parallelism().map_or(2, usize::from)),
             config,
-            _keeper: keeper,
+            _removes_old_images: remover,
         })
     }
 
@@ -96,7 +94,7 @@ impl ContainerService {
         let (folder, config, owner) = (project.folder.clone(), Arc::clone(&self.config), self.owner.clone());
         let plan = spawn_blocking(move || BuildPlan::read(&folder, &config.container, &owner.0)).await??;
         let BuildPlan { yml, template, image, controller } = plan;
-        let guard = self.active.insert(self.run.project(request.port));
+        let guard = ProjectGuard::new(self.run.project(request.port), self.runtime.clone());
         join_network(docker, self.config.container.network.name()).await?;
         let is_projects = image.folder.is_some() || controller.is_some();
         let made = async |build: ImageBuild, from: &Path, to: &Path| {
@@ -125,7 +123,7 @@ impl ContainerService {
         let ((options, variables), ComposeProject { yml, template, .. }) = (written?, compose);
         // More concurrent runs would only be slower.
         let turn = self.turns.acquire().await.map_err(|error| StartError::Server(error.to_string()))?;
-        progress(steps::CREATING.to_owned());
+        progress("Creating network and containers".to_owned());
         let up = ["up", "--no-start", "--no-build"].map(str::to_owned);
         let words = self.docker.compose.iter().map(|word| (*word).to_owned()).chain(options).chain(up);
         let created = self.docker.follow(words.map(Into::into).collect(), variables, CREATE_TIMEOUT, |_| ()).await;
@@ -146,10 +144,11 @@ async fn join_network(docker: &Docker, name: &str) -> Result<(), DockerError> {
     let interface = format!("com.docker.network.bridge.name={name}");
     let create = ["network", "create", "--driver", "bridge", "--opt", &interface, "--opt", ALONE, name];
     match docker.run(&create, SHORT_TIMEOUT).await {
-        Err(DockerError::Failed { message, .. }) if message.contains("already exists") => Ok(()),
         // Two that are created at the same time would have the same interface, which Docker refuses.
-        Err(DockerError::Failed { message, .. }) if message.contains("have same bridge name") => {
-            docker.run(&["network", "inspect", name], SHORT_TIMEOUT).await.map(drop)
+        Err(DockerError::Failed { message, .. })
+            if message.contains("already exists") || message.contains("have same bridge name") =>
+        {
+            Ok(())
         }
         created => created.map(drop),
     }

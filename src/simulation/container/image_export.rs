@@ -7,7 +7,7 @@ use std::time::Duration;
 use actix_rt::task::spawn_blocking;
 
 use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
-use super::owned_resources;
+use super::owned_resources::REMOVE;
 use super::start_error::{StartError, blame};
 use crate::simulation::checkout::{Project, outgrown};
 use crate::simulation::process::remove_tree;
@@ -40,7 +40,7 @@ pub async fn export(
             return Err(format!("The project in its image is larger than {size} MiB (projectSize)").into());
         }
     }
-    owned_resources::remove(docker, &[name]).await?;
+    docker.run(&[&REMOVE[..], &[&name]].concat(), SHORT_TIMEOUT).await?;
     let to = to.to_owned();
     Ok(spawn_blocking(move || remove_tree(&to).and_then(|()| std::fs::rename(&through, &to))).await??)
 }
@@ -54,31 +54,6 @@ fn not_copied(error: DockerError, from: &Path) -> StartError {
             format!("The image of this project has no folder {from}: its Dockerfile has to COPY the project there")
                 .into()
         }
-        DockerError::Failed { message, .. } if message.contains("invalid symlink") => {
-            let target = message.split_once(" -> ").map_or("elsewhere", |(_, target)| target);
-            let what = format!("{from} in the image of this project has a link to {target}");
-            format!("{what}, which leads out of it: `docker cp` refuses that").into()
-        }
         error => blame(true, error),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_link_that_leads_out_of_the_project_is_told_without_the_folders_of_the_machine() {
-        let message = "invalid symlink \"/var/cache/x/copied/link\" -> \"../../outside\"".to_owned();
-        let told = not_copied(
-            DockerError::Failed { command: "docker cp".to_owned(), message },
-            Path::new("/usr/local/webots-project"),
-        );
-        let told = told.to_string();
-        let device = "operation not permitted".to_owned();
-        let told_device =
-            not_copied(DockerError::Failed { command: "docker cp".to_owned(), message: device }, Path::new("/x"));
-        assert!(matches!(told_device, StartError::Project(_)), "{told_device:?}");
-        assert!(told.contains("a link to \"../../outside\"") && !told.contains("/var/cache"), "{told}");
     }
 }
