@@ -42,11 +42,9 @@ pub enum Cause {
 /// The first match counts. git asks for a user name if a Git host answers 'not found': Git hosts don't distinguish
 /// private from missing repositories.
 const MESSAGES: &[(Cause, &[&str])] = &[
-    (
-        Cause::Machine,
-        &["No space left on device", "Disk quota exceeded", "Read-only file system", "Input/output error"],
-    ),
-    (Cause::Machine, &["Too many open files", "Cannot allocate memory", "Resource temporarily unavailable"]),
+    (Cause::Machine, &["No space left on device", "Disk quota exceeded", "Read-only file system"]),
+    (Cause::Machine, &["Input/output error", "Too many open files", "Cannot allocate memory"]),
+    (Cause::Machine, &["Resource temporarily unavailable"]),
     // These hosts come from the configuration: URLs with other hosts are refused before.
     (Cause::Machine, &["Could not resolve host", "Failed to connect to", "Couldn't connect to"]),
     (Cause::Machine, &["SSL certificate", "certificate verification failed"]),
@@ -85,14 +83,6 @@ impl CheckoutError {
             |words: &[&str]| matches!(ending, ExitReason::Code(_)) && words.iter().any(|words| said.contains(words));
         let known = MESSAGES.iter().find(|(_, words)| is_of(words));
         Self::new(known.map_or(Cause::Other, |(cause, _)| *cause), format!("git {command} {ending}: {said}"))
-    }
-
-    /// The same for a command that only reads the cached repository.
-    pub(super) fn while_reading(mut self) -> Self {
-        if !matches!(self.cause, Cause::Machine | Cause::Slow(_) | Cause::TooLarge) {
-            self.cause = Cause::Damaged;
-        }
-        self
     }
 
     /// The same as text for a client that asks for this world.

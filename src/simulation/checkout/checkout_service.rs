@@ -10,7 +10,6 @@ use std::sync::Arc;
 use tokio::runtime::Handle;
 use tokio::sync::Semaphore;
 use tokio_util::task::AbortOnDropHandle;
-use which::which;
 
 use super::checkout_error::{Cause, CheckoutError, refused};
 use super::commit_resolver::CommitResolver;
@@ -33,8 +32,6 @@ pub struct CheckoutService {
     runtime: Handle,
     /// Limits the number of projects that are copied at a time.
     copies: Semaphore,
-    /// Whether git finds its part for LFS.
-    has_lfs: bool,
     _keeps_within_budget: AbortOnDropHandle<()>,
 }
 
@@ -53,8 +50,8 @@ impl CheckoutService {
         let resolver = Arc::new(CommitResolver::new(Arc::clone(&cache), Arc::clone(&config), rules));
         let runtime = Handle::current();
         let keeper = AbortOnDropHandle::new(runtime.spawn(cache.keep_within_budget()));
-        let (copies, has_lfs) = (Semaphore::new(COPIES), which("git-lfs").is_ok());
-        Ok(Self { resolver, config, runtime, copies, has_lfs, _keeps_within_budget: keeper })
+        let copies = Semaphore::new(COPIES);
+        Ok(Self { resolver, config, runtime, copies, _keeps_within_budget: keeper })
     }
 
     /// Starts to check a world out into a client's directory. `progress` receives each step as text.
@@ -112,7 +109,7 @@ impl CheckoutService {
         // It is never closed.
         let _turn = self.copies.acquire().await.ok();
         let (wanted, instance, progress) = (world.clone(), Arc::clone(instance), Arc::clone(progress));
-        let limits = (self.config.project_size, self.has_lfs);
+        let limit = self.config.project_size;
         let copy = async move || {
             let name = &found.revision.name;
             progress(steps::checking_out(name, ""));
@@ -121,7 +118,7 @@ impl CheckoutService {
                     progress(steps::checking_out(name, line));
                 }
             };
-            work_tree::write(&found, &wanted, &instance, limits, on_line).await
+            work_tree::write(&found, &wanted, &instance, limit, on_line).await
         };
         on_own_thread(copy).await?
     }
@@ -144,7 +141,7 @@ impl CheckoutService {
     async fn restore(&self, project: &Project, file: &str) -> Result<(), CheckoutError> {
         let Project { url, revision, .. } = project;
         let none = || refused(format!("{file:?} is no file below the project's controllers folder"));
-        let path = file_restore::controller(&revision.folder, file).ok_or_else(none)?;
+        let path = file_restore::controller(revision, file).ok_or_else(none)?;
         let repository = self.resolver.file(url, revision, &path).await?.ok_or_else(none)?;
         let is_there = file_restore::restore(&repository, project, &path).await?;
         is_there.then_some(()).ok_or_else(none)

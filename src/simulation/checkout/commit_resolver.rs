@@ -95,7 +95,7 @@ impl CommitResolver {
         let search = Search { resolver: self, world, repository: &repository, progress: &progress };
         let mut missing = CheckoutError::new(Cause::NoCommit, "");
         for revision in revisions {
-            let path = revision.world_path(world);
+            let path = revision.path_of(&format!("worlds/{}", world.world()));
             match search.read(&revision, &path).await {
                 Ok(Some(above)) => return Ok(ResolvedCommit { repository, revision, above }),
                 Ok(None) => missing = refused(format!("{path} in {} does not exist", revision.name)),
@@ -161,10 +161,12 @@ impl Search<'_> {
         }
         match listed {
             Ok(answer) => Ok(revision.files_above(&answer, path)),
+            Err(error) if matches!(error.cause, Cause::Machine | Cause::Slow(_) | Cause::TooLarge) => Err(error),
             Err(error) => {
                 let kind = repository.read(&["cat-file", "-t", &format!("{reference}^{{}}")]).await;
                 let is_file = kind.is_ok_and(|kind| kind.starts_with(b"blob"));
-                Err(if is_file { CheckoutError::new(Cause::NoCommit, "") } else { error.while_reading() })
+                let cause = if is_file { Cause::NoCommit } else { Cause::Damaged };
+                Err(CheckoutError::new(cause, error.to_string()))
             }
         }
     }

@@ -12,14 +12,13 @@ use nix::fcntl::{AT_FDCWD, OFlag, OpenHow, ResolveFlag, openat2, renameat};
 use super::checkout_error::CheckoutError;
 use super::project::Project;
 use super::repository::Repository;
+use super::revision::Revision;
 use super::work_tree::checkout_command;
 
-/// The path in its repository of a file below the `controllers` folder of the project in `folder`; nothing where its name
-/// leads elsewhere.
-pub fn controller(folder: &str, file: &str) -> Option<String> {
+/// The path in its repository of a file below the `controllers` folder of a project; nothing where its name leads elsewhere.
+pub fn controller(revision: &Revision, file: &str) -> Option<String> {
     let plain = |segment: &str| !segment.is_empty() && segment != "." && segment != ".." && !segment.contains('\0');
-    let slash = if folder.is_empty() { "" } else { "/" };
-    (file.contains('/') && file.split('/').all(plain)).then(|| format!("{folder}{slash}controllers/{file}"))
+    (file.contains('/') && file.split('/').all(plain)).then(|| revision.path_of(&format!("controllers/{file}")))
 }
 
 /// Restores the file at this path of the repository to its commit. Returns false if its directory is none any more, or a

@@ -131,10 +131,10 @@ impl Revision {
         is_there.then(|| paths.into_iter().flat_map(|path| path.iter().chain(&[0])).copied().collect())
     }
 
-    /// Where the world lies in the repository.
-    pub fn world_path(&self, world: &ProjectUrl) -> String {
+    /// The path in the repository of a file of the project.
+    pub fn path_of(&self, file: &str) -> String {
         let slash = if self.folder.is_empty() { "" } else { "/" };
-        format!("{}{slash}worlds/{}", self.folder, world.world())
+        format!("{}{slash}{file}", self.folder)
     }
 }
 

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
 
 use rustix::process::Resource;
+use which::which;
 
 use super::checkout_error::{CheckoutError, refused};
 use super::commit_resolver::ResolvedCommit;
@@ -45,8 +46,8 @@ pub fn checkout_command(
     Ok(call)
 }
 
-/// Writes a project with git, with its large files if git-lfs is there; `on_line` receives git's progress lines. Blocks its
-/// thread.
+/// Writes a project of at most so many MiB with git, with its large files if git-lfs is there; `on_line` receives git's
+/// progress lines. Blocks its thread.
 ///
 /// # Errors
 /// Why it can't be checked out.
@@ -54,14 +55,14 @@ pub async fn write(
     found: &ResolvedCommit,
     world: &ProjectUrl,
     instance: &Arc<InstanceDir>,
-    (limit, has_lfs): (u64, bool),
+    limit: u64,
     on_line: impl FnMut(&str),
 ) -> Result<Project, CheckoutError> {
     let ResolvedCommit { repository, revision, above } = found;
     let folder = if revision.folder.is_empty() { "." } else { &revision.folder };
     let paths = [folder.as_bytes(), b"\0", above].concat();
     let (root, most) = (instance.project(), limit << 20);
-    let settings = if has_lfs { lfs::settings(&repository.remote.lock()) } else { Vec::new() };
+    let settings = if which("git-lfs").is_ok() { lfs::settings(&repository.remote.lock()) } else { Vec::new() };
     let mut call = checkout_command(repository, revision, &paths, (instance.path(), &root), &settings)?;
     call.may_block = true;
     // git-lfs stores its downloads here, shared with concurrent checkouts, and copies them into the project.
@@ -81,7 +82,8 @@ pub async fn write(
         return Err(refused(format!("The project is larger than {limit} MiB")));
     }
     Ok(Project {
-        world: WorldFile::open(&root, &root.join(revision.world_path(world))).map_err(refused)?,
+        world: WorldFile::open(&root, &root.join(revision.path_of(&format!("worlds/{}", world.world()))))
+            .map_err(refused)?,
         size,
         url: world.clone(),
         revision: revision.clone(),

@@ -10,12 +10,10 @@ use tokio::sync::{Semaphore, SemaphorePermit, watch};
 
 use super::build_plan::{self, ImageBuild};
 use super::built_image::BuiltImage;
-use super::check::data_folder;
 use super::compose_project::DEFAULT_MEMORY;
-use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
+use super::docker::{Docker, DockerError, SHORT_TIMEOUT, StartError, data_folder, is_disk_full};
 use super::dockerfile::LABEL;
 use super::owned_resources::{ResourceOwner, digest};
-use super::start_error::{StartError, is_disk_full};
 use crate::simulation::checkout::{OnProgress, Project, SingleFlight};
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::process::DiskRoom;
@@ -63,7 +61,7 @@ impl Images {
             let _permit = this.permit(&sender).await;
             let on_line = |line: &str| drop(sender.send(format!("Step 1/{STEPS} : fetching {name}: {line}")));
             let command = ["docker", "pull", &name].map(OsString::from).to_vec();
-            let pulled = this.docker.follow(command, Vec::new(), this.config.timing.build, on_line).await;
+            let pulled = this.docker.follow(command, this.config.timing.build, on_line).await;
             pulled.map_err(|error| not_pulled(&name, error))
         };
         self.made(image, ID, progress, pull).await
@@ -152,7 +150,7 @@ impl Images {
                 sender.send(text).ok();
             }
         };
-        let done = self.docker.follow(words.collect(), Vec::new(), self.config.timing.build, on_line).await;
+        let done = self.docker.follow(words.collect(), self.config.timing.build, on_line).await;
         done.map_err(|error| not_built(&step, error))
     }
 

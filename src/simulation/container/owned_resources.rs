@@ -1,5 +1,4 @@
-//! What a server has in Docker: the containers of its simulations. There are no networks and no named volumes of theirs:
-//! templates that have some are refused.
+//! What a server has in Docker: the containers of its simulations, which have no networks and no named volumes of their own.
 //!
 //! The names of its compose projects, which those of their containers begin with, have a common prefix, so that the resources
 //! of a crashed server are found again.

@@ -6,11 +6,9 @@ use std::time::Duration;
 use tokio::sync::Notify;
 use tokio_util::task::AbortOnDropHandle;
 
-use super::compose_project::container_of;
-use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
+use super::compose_project::{CONTROLLER, WEBOTS, container_of};
+use super::docker::{Docker, DockerError, SHORT_TIMEOUT, StartError, blame};
 use super::owned_resources::ProjectGuard;
-use super::start_error::{StartError, blame};
-use super::templates::{CONTROLLER, WEBOTS};
 use crate::simulation::process::{ExitReason, SpawnSpec};
 
 /// The containers of one simulation.
@@ -21,7 +19,7 @@ pub struct SimulationContainers {
     /// The name of its compose project.
     pub(super) guard: ProjectGuard,
     /// Its services, each with a container.
-    pub(super) services: Vec<String>,
+    pub(super) services: Vec<&'static str>,
     /// Whether the project has defined one of their images, which may be why Docker can't start one.
     pub(super) is_projects: bool,
     /// Texts for its client, unchanged.
@@ -70,15 +68,24 @@ impl SimulationContainers {
     /// # Errors
     /// When Docker fails, with the project or this server as the cause.
     pub async fn start_others(&mut self) -> Result<(), StartError> {
-        let others = self.services.iter().filter(|service| *service != WEBOTS).map(|service| self.container(service));
+        let others = self.services.iter().filter(|service| **service != WEBOTS).map(|service| self.container(service));
         let words: Vec<String> = std::iter::once("start".to_owned()).chain(others).collect();
         if words.len() > 1 {
             self.docker.run(&words, SHORT_TIMEOUT).await.map_err(|error| blame(self.is_projects, error))?;
         }
-        if self.services.iter().any(|service| service == CONTROLLER) {
-            let controller = self.container(CONTROLLER);
-            let request = Arc::new(Notify::new());
-            let restarts = restart_on_request(self.docker.clone(), controller, Arc::clone(&request));
+        if self.services.contains(&CONTROLLER) {
+            let (docker, controller, request) =
+                (self.docker.clone(), self.container(CONTROLLER), Arc::new(Notify::new()));
+            let requested = Arc::clone(&request);
+            let restarts = async move {
+                loop {
+                    requested.notified().await;
+                    if let Err(error) = docker.run(&["restart", "--time", "0", &controller], SHORT_TIMEOUT).await {
+                        log::warn!("a participant's controller is not started anew: {error}");
+                    }
+                    actix_rt::time::sleep(RESTART_INTERVAL).await;
+                }
+            };
             self.restart = Some((request, AbortOnDropHandle::new(actix_rt::spawn(restarts))));
         }
         Ok(())
@@ -121,16 +128,5 @@ impl SimulationContainers {
     /// Removes everything of this simulation.
     pub async fn remove(self) {
         self.guard.remove().await;
-    }
-}
-
-/// Restarts a container on each notification, one restart at a time.
-async fn restart_on_request(docker: Docker, container: String, request: Arc<Notify>) {
-    loop {
-        request.notified().await;
-        if let Err(error) = docker.run(&["restart", "--time", "0", &container], SHORT_TIMEOUT).await {
-            log::warn!("a participant's controller is not started anew: {error}");
-        }
-        actix_rt::time::sleep(RESTART_INTERVAL).await;
     }
 }
