@@ -59,10 +59,9 @@ impl CheckoutService {
         self: &Arc<Self>,
         world: ProjectUrl,
         instance: InstanceDir,
-        progress: impl Fn(String) + Send + Sync + 'static,
+        progress: SharedProgress,
     ) -> AbortOnDropHandle<Result<Project, CheckoutError>> {
         let this = Arc::clone(self);
-        let progress: SharedProgress = Arc::new(progress);
         let job = async move {
             let (mut world, limit) = (world, this.config.timing.checkout);
             let done = actix_rt::time::timeout(limit, this.check_out(&mut world, instance, &progress)).await;
@@ -109,13 +108,12 @@ impl CheckoutService {
         // It is never closed.
         let _turn = self.copies.acquire().await.ok();
         let (wanted, instance, progress) = (world.clone(), Arc::clone(instance), Arc::clone(progress));
-        let limit = self.config.project_size;
+        let (limit, name) = (self.config.project_size, found.revision.name.clone());
         let copy = async move || {
-            let name = &found.revision.name;
-            progress(steps::checking_out(name, ""));
+            progress(steps::checking_out(&name, ""));
             let on_line = |line: &str| {
                 if line.contains('%') {
-                    progress(steps::checking_out(name, line));
+                    progress(steps::checking_out(&name, line));
                 }
             };
             work_tree::write(&found, &wanted, &instance, limit, on_line).await

@@ -186,7 +186,7 @@ impl Search<'_> {
 
     /// Whether a commit that is named by its hash is in a branch or tag. The history is fetched unless it is cached.
     async fn is_accepted(self, commit: &str) -> Result<bool, CheckoutError> {
-        if revision::is_tip(&self.repository.ask(&revision::LIST_TIPS).await?, commit) {
+        if self.repository.ask(&revision::LIST_TIPS).await?.lines().any(|tip| tip.starts_with(commit)) {
             return Ok(true);
         }
         let history = self.resolver.repository(self.world, HISTORY).await?;

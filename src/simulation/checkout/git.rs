@@ -82,15 +82,14 @@ impl Git {
         let words = ["git".into(), "--literal-pathspecs".into()].into_iter().chain(settings).chain([folder]);
         let mut run =
             Run::new(words.chain(arguments.iter().map(OsString::from)), &self.mark, self.config.timing.checkout);
-        let environment: [(&str, &OsStr); 6] = [
-            ("GIT_CONFIG_GLOBAL", self.settings.0.as_os_str()),
-            ("GIT_ALLOW_PROTOCOL", OsStr::new(protocol)),
-            ("GIT_TERMINAL_PROMPT", OsStr::new("0")),
-            ("GIT_ASKPASS", OsStr::new("/bin/false")),
-            ("GIT_NO_REPLACE_OBJECTS", OsStr::new("1")),
-            ("LC_ALL", OsStr::new("C")),
+        run.spec.environment = vec![
+            ("GIT_CONFIG_GLOBAL".into(), self.settings.0.clone().into()),
+            ("GIT_ALLOW_PROTOCOL".into(), protocol.into()),
+            ("GIT_TERMINAL_PROMPT".into(), "0".into()),
+            ("GIT_ASKPASS".into(), "/bin/false".into()),
+            ("GIT_NO_REPLACE_OBJECTS".into(), "1".into()),
+            ("LC_ALL".into(), "C".into()),
         ];
-        run.spec.environment = environment.map(|(name, value)| (name.into(), value.into())).into();
         (run.answer, run.line) = (MAX_ANSWER, MAX_LINE);
         run.limits.push((Resource::Data, MAX_MEMORY));
         run

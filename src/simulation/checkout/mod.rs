@@ -8,7 +8,6 @@ mod commit_resolver;
 mod disk;
 mod file_restore;
 mod git;
-mod lfs;
 mod project;
 mod redirect;
 mod repository;

@@ -84,42 +84,36 @@ impl Repository {
         progress: OnProgress<'_>,
     ) -> Result<(), CheckoutError> {
         let (this, key) = (Arc::clone(self), arguments.clone());
-        self.fetches.join(key, progress, |sender| async move { this.fetch_locked(&arguments, &sender).await }).await
-    }
-
-    async fn fetch_locked(
-        self: &Arc<Self>,
-        arguments: &[String],
-        sender: &watch::Sender<String>,
-    ) -> Result<(), CheckoutError> {
-        let lock = Arc::clone(&self.lock);
-        let guard = if let Ok(guard) = Arc::clone(&lock).try_lock_owned() {
-            guard
-        } else {
-            sender.send_replace("waiting for another fetch".to_owned());
-            lock.lock_owned().await
+        let fetch = |sender: watch::Sender<String>| async move {
+            let lock = Arc::clone(&this.lock);
+            let guard = if let Ok(guard) = Arc::clone(&lock).try_lock_owned() {
+                guard
+            } else {
+                sender.send_replace("waiting for another fetch".to_owned());
+                lock.lock_owned().await
+            };
+            this.has_grown.store(true, Relaxed);
+            this.create().await?;
+            let on_line = |line: &str| {
+                if line.contains('%') {
+                    sender.send_replace(line.trim_start_matches("remote: ").to_owned());
+                }
+            };
+            let mut call = this.call(&arguments);
+            // A larger write ends git with SIGXFSZ, which must not leave a core dump.
+            call.limits.extend([(Resource::Core, 0), (Resource::Fsize, this.git.config.project_size << 20)]);
+            this.git.run(call, on_line).await?;
+            // Packs it for some time at most. Only the next fetch waits for that.
+            tokio::spawn(async move {
+                let _guard = guard;
+                let call = Run { time: stall_timeout(&this.git.config), ..this.call(&["gc", "--auto", "--quiet"]) };
+                if let Err(error) = this.git.run(call, |_| ()).await {
+                    log::warn!("{} can't be packed: {error}", this.path.display());
+                }
+            });
+            Ok(())
         };
-        self.has_grown.store(true, Relaxed);
-        self.create().await?;
-        let on_line = |line: &str| {
-            if line.contains('%') {
-                sender.send_replace(line.trim_start_matches("remote: ").to_owned());
-            }
-        };
-        let mut call = self.call(arguments);
-        // A larger write ends git with SIGXFSZ, which must not leave a core dump.
-        call.limits.extend([(Resource::Core, 0), (Resource::Fsize, self.git.config.project_size << 20)]);
-        self.git.run(call, on_line).await?;
-        // Packs it for some time at most. Only the next fetch waits for that.
-        let this = Arc::clone(self);
-        tokio::spawn(async move {
-            let _guard = guard;
-            let call = Run { time: stall_timeout(&this.git.config), ..this.call(&["gc", "--auto", "--quiet"]) };
-            if let Err(error) = this.git.run(call, |_| ()).await {
-                log::warn!("{} can't be packed: {error}", this.path.display());
-            }
-        });
-        Ok(())
+        self.fetches.join(key, progress, fetch).await
     }
 
     /// Asks the remote. Returns its answer.

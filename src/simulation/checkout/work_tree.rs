@@ -13,11 +13,11 @@ use super::checkout_error::{CheckoutError, refused};
 use super::commit_resolver::ResolvedCommit;
 use super::disk;
 use super::git::LITTLE_MEMORY;
-use super::lfs;
 use super::project::{Project, WorldFile};
-use super::repository::Repository;
+use super::repository::{REMOTE, Repository};
 use super::revision::Revision;
 use crate::shared::domain::ProjectUrl;
+use crate::simulation::config::Remote;
 use crate::simulation::process::{InstanceDir, Run};
 
 /// A git command that writes these paths of a commit, each ended by a zero byte, into a directory, with these settings, each
@@ -62,7 +62,7 @@ pub async fn write(
     let folder = if revision.folder.is_empty() { "." } else { &revision.folder };
     let paths = [folder.as_bytes(), b"\0", above].concat();
     let (root, most) = (instance.project(), limit << 20);
-    let settings = if which("git-lfs").is_ok() { lfs::settings(&repository.remote.lock()) } else { Vec::new() };
+    let settings = if which("git-lfs").is_ok() { lfs_settings(&repository.remote.lock()) } else { Vec::new() };
     let mut call = checkout_command(repository, revision, &paths, (instance.path(), &root), &settings)?;
     call.may_block = true;
     // git-lfs stores its downloads here, shared with concurrent checkouts, and copies them into the project.
@@ -90,4 +90,40 @@ pub async fn write(
         folder: root.join(&revision.folder),
         instance: Arc::clone(instance),
     })
+}
+
+/// Settings with which a checkout loads large files from where the repository is, whatever the repository says.
+fn lfs_settings(remote: &Remote) -> Vec<String> {
+    let location = &remote.location;
+    let url = match remote.protocol {
+        "file" => format!("file://{location}"),
+        _ => format!("{}.git/info/lfs", location.trim_end_matches('/').trim_end_matches(".git")),
+    };
+    vec![
+        format!("lfs.url={url}"),
+        // For a local directory, git-lfs reads this.
+        format!("remote.{REMOTE}.url={url}"),
+        "filter.lfs.process=git-lfs filter-process".to_owned(),
+        "filter.lfs.smudge=git-lfs smudge -- %f".to_owned(),
+        "filter.lfs.clean=git-lfs clean -- %f".to_owned(),
+        "filter.lfs.required=false".to_owned(),
+        // A file that can't be loaded stays a pointer.
+        "lfs.skipdownloaderrors=true".to_owned(),
+    ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn large_files_come_from_where_the_repository_is() {
+        let first = |location: &str, protocol| {
+            let location = location.to_owned();
+            lfs_settings(&Remote { location, protocol })[0].clone()
+        };
+        assert_eq!(first("https://github.com/l/a.git", "https"), "lfs.url=https://github.com/l/a.git/info/lfs");
+        assert_eq!(first("https://forge.org/l/a", "https"), "lfs.url=https://forge.org/l/a.git/info/lfs");
+        assert_eq!(first("/mirror/l/a", "file"), "lfs.url=file:///mirror/l/a");
+    }
 }

@@ -80,7 +80,7 @@ impl Session {
         let me = ctx.address();
         // A full mailbox drops this line of progress.
         let progress = move |text: String| drop(me.try_send(WebotsEvent::Progress(text)));
-        let job = self.server.checkouts.start(world, instance, progress);
+        let job = self.server.checkouts.start(world, instance, Arc::new(progress));
         job.into_actor(self)
             .map(|result, this, ctx| match result {
                 Ok(Ok(project)) => this.launch(project, ctx),

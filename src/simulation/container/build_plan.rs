@@ -176,9 +176,7 @@ fn world_in(root: &Path, project: &Project) -> Result<String, String> {
     let path = root.join("worlds").join(&*name).canonicalize().ok().filter(|path| path.is_file());
     let path = path.ok_or_else(|| format!("The image of this project has no worlds/{name}"))?;
     let inside = path.strip_prefix(root).ok().and_then(Path::to_str).map(str::to_owned);
-    inside.ok_or_else(|| {
-        "The world is behind a link that leads out of its project, which containers don't have".to_owned()
-    })
+    inside.ok_or_else(|| "The world is behind a link that leads out of its project".to_owned())
 }
 
 /// Checks that compose can mount a directory: `:` would end its path, and a line break its variable.

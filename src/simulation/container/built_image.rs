@@ -71,37 +71,37 @@ impl BuiltImage {
     pub fn command(&self) -> Vec<String> {
         self.cmd.clone().unwrap_or_default()
     }
+}
 
-    /// Copies one of its directories to `to`, where containers can change it: its build may have created files in it. `to` is
-    /// created or replaced, by a temporary directory of the project's instance. `name` is the compose project, which the
-    /// container for this is named after; `size` the limit, in MiB.
-    ///
-    /// # Errors
-    /// Why not, as text for the client.
-    pub async fn export(
-        &self,
-        docker: &Docker,
-        name: &str,
-        from: &Path,
-        project: &Project,
-        (to, size): (&Path, u64),
-    ) -> Result<(), StartError> {
-        let name = format!("{name}-{:08x}", rand::random::<u32>());
-        let create = ["create", "--name", &name, "--network", "none", &self.name, "true"];
-        docker.run(&create, SHORT_TIMEOUT).await.map_err(|error| blame(true, error))?;
-        let through = project.instance.path().join("copied");
-        let source = format!("{name}:{}/.", from.display());
-        let words = ["cp", &source, &through.to_string_lossy()].map(str::to_owned);
-        tokio::select! {
-            copied = docker.run(&words, COPY_TIMEOUT) => drop(copied.map_err(|error| not_copied(error, from))?),
-            () = outgrown(vec![(through.clone(), size << 20)]) => {
-                return Err(format!("The project in its image is larger than {size} MiB (projectSize)").into());
-            }
+/// Copies a directory of an image to `to`, where containers can change it: the build may have created files in it. `to` is
+/// created or replaced, by a temporary directory of the project's instance. `name` is the compose project, which the
+/// container for this is named after; `size` the limit, in MiB.
+///
+/// # Errors
+/// Why not, as text for the client.
+pub async fn export(
+    image: &BuiltImage,
+    docker: &Docker,
+    name: &str,
+    from: &Path,
+    project: &Project,
+    (to, size): (&Path, u64),
+) -> Result<(), StartError> {
+    let name = format!("{name}-{:08x}", rand::random::<u32>());
+    let create = ["create", "--name", &name, "--network", "none", &image.name, "true"];
+    docker.run(&create, SHORT_TIMEOUT).await.map_err(|error| blame(true, error))?;
+    let through = project.instance.path().join("copied");
+    let source = format!("{name}:{}/.", from.display());
+    let words = ["cp", &source, &through.to_string_lossy()].map(str::to_owned);
+    tokio::select! {
+        copied = docker.run(&words, COPY_TIMEOUT) => drop(copied.map_err(|error| not_copied(error, from))?),
+        () = outgrown(vec![(through.clone(), size << 20)]) => {
+            return Err(format!("The project in its image is larger than {size} MiB (projectSize)").into());
         }
-        docker.run(&[&REMOVE[..], &[&name]].concat(), SHORT_TIMEOUT).await?;
-        let to = to.to_owned();
-        Ok(spawn_blocking(move || remove_tree(&to).and_then(|()| std::fs::rename(&through, &to))).await??)
     }
+    docker.run(&[&REMOVE[..], &[&name]].concat(), SHORT_TIMEOUT).await?;
+    let to = to.to_owned();
+    Ok(spawn_blocking(move || remove_tree(&to).and_then(|()| std::fs::rename(&through, &to))).await??)
 }
 
 fn not_copied(error: DockerError, from: &Path) -> StartError {

@@ -61,10 +61,6 @@ pub const WEBOTS: &str = "webots";
 pub const CONTROLLER: &str = "controller";
 /// The service of an editor, and the port that it listens on.
 const EDITOR: (&str, u16) = ("theia", 3000);
-/// The directory that an editor shows.
-const EDITED: &str = "/home/project/webots-project";
-/// Size of shared memory: what a browser's engine inside of Webots needs.
-const SHARED_MEMORY: &str = "256m";
 /// Runs a program on a virtual display; part of the images of Webots.
 const VIRTUAL_DISPLAY: [&str; 2] = ["xvfb-run", "--auto-servernum"];
 /// The directory with the sockets of the machine's displays.
@@ -140,7 +136,8 @@ impl ComposeProject {
             services.insert(CONTROLLER, controller);
         }
         if self.yml.kind != ProjectKind::Default {
-            let mut editor = service(EDITOR.0, &config.container.editor_image, vec![mount(&paths.edited, EDITED)], &[]);
+            let shown = vec![mount(&paths.edited, "/home/project/webots-project")];
+            let mut editor = service(EDITOR.0, &config.container.editor_image, shown, &[]);
             editor.insert("ports", published(port + EDITOR_PORT, EDITOR.1));
             services.insert(EDITOR.0, editor);
         }
@@ -167,12 +164,6 @@ impl GpuAccess {
     }
 }
 
-/// The display of the machine, where that is asked for.
-fn display(config: &SimulationConfig, gpu: Option<&Gpu>) -> Option<String> {
-    let is_machine = config.container.display == ContainerDisplay::Machine;
-    is_machine.then(|| config.display_on(gpu.map(|gpu| gpu.index)))
-}
-
 /// The settings of the service with this name, with these mounts and variables.
 fn protected(
     name: &str,
@@ -196,7 +187,8 @@ fn protected(
         ("security_opt", json!([format!("no-new-privileges:{}", !settings.new_privileges)])),
         ("user", json!(format!("{}:{}", nix::unistd::getuid(), nix::unistd::getgid()))),
         ("tmpfs", json!(in_memory)),
-        ("shm_size", json!(SHARED_MEMORY)),
+        // What a browser's engine inside of Webots needs.
+        ("shm_size", json!("256m")),
         ("mem_limit", json!(memory)),
         ("memswap_limit", json!(memory)),
         ("pids_limit", json!(limits.processes)),
@@ -208,15 +200,15 @@ fn protected(
         ("healthcheck", json!({ "disable": true })),
     ]);
     service.extend(limits.cores.map(|cores| ("cpus", json!(cores))));
-    let mut environment = BTreeMap::from_iter(environment.iter().cloned());
+    let mut environment: BTreeMap<_, _> = environment.iter().cloned().collect();
     environment.extend(ENVIRONMENT.map(|(name, value)| (name, value.to_owned())));
     // The entry points of the images of Webots and of controllers create it.
     let home = if [WEBOTS, CONTROLLER].contains(&name) { "/tmp/home" } else { "/tmp" };
     environment.insert("HOME", home.to_owned());
     if name == WEBOTS {
         volumes.extend(settings.mounts.clone());
-        if let Some(display) = display(config, gpu) {
-            environment.insert("DISPLAY", display);
+        if settings.display == ContainerDisplay::Machine {
+            environment.insert("DISPLAY", config.display_on(gpu.map(|gpu| gpu.index)));
             volumes.push(format!("{DISPLAYS}:{DISPLAYS}"));
             if let Some(authority) = std::env::var_os("XAUTHORITY") {
                 let authority = authority.to_string_lossy().into_owned();

@@ -10,6 +10,7 @@ use tokio::sync::Semaphore;
 use tokio_util::task::AbortOnDropHandle;
 
 use super::build_plan::{BuildPlan, ImageBuild, PROJECT_PATH, participant_folder};
+use super::built_image::export;
 use super::compose_project::{ComposeProject, ContainerRequest};
 use super::docker::{Docker, DockerError, SHORT_TIMEOUT, StartError, blame, daemon_fault};
 use super::image::Images;
@@ -23,7 +24,6 @@ use crate::simulation::config::SimulationConfig;
 /// Creates the containers of simulations.
 pub struct ContainerService {
     docker: Docker,
-    owner: ResourceOwner,
     /// The owner of these containers, for a process that removes them after the server's end.
     pub run: ResourceOwner,
     images: Arc<Images>,
@@ -52,7 +52,6 @@ impl ContainerService {
         let docker = Docker::find(run)?;
         let owner = ResourceOwner::of(&config.cache_dir.0);
         sweep_all(&owner);
-        let this_run = owner.run();
         let shortcoming = packet_filter::missing();
         if let Some(why) = &shortcoming {
             log::warn!("{why}");
@@ -61,8 +60,7 @@ impl ContainerService {
         let remover = AbortOnDropHandle::new(actix_rt::spawn(Arc::clone(&images).remove_old()));
         Ok(Self {
             docker,
-            owner,
-            run: this_run,
+            run: owner.run(),
             images,
             runtime: Handle::current(),
             shortcoming,
@@ -84,16 +82,16 @@ impl ContainerService {
         progress: OnProgress<'_>,
     ) -> Result<SimulationContainers, StartError> {
         let (project, docker, size) = (&request.project, &self.docker, self.config.project_size);
-        let (folder, owner) = (project.folder.clone(), self.owner.clone());
+        let (folder, owner) = (project.folder.clone(), self.images.owner.clone());
         let BuildPlan { yml, image, controller } = spawn_blocking(move || BuildPlan::read(&folder, &owner.0)).await??;
-        let guard = ProjectGuard::new(self.run.project(request.port), self.runtime.clone());
+        let guard = ProjectGuard { name: self.run.project(request.port), runtime: self.runtime.clone() };
         join_network(docker, self.config.container.network.name()).await?;
         let is_projects = image.folder.is_some() || controller.is_some();
         let made = async |build: ImageBuild, from: &Path, to: &Path| {
             let has_project = build.folder.is_some();
             let image = self.images.build(project, build, progress).await?;
             if has_project {
-                image.export(docker, &guard.name, from, project, (to, size)).await?;
+                export(&image, docker, &guard.name, from, project, (to, size)).await?;
             }
             Ok::<_, StartError>(image)
         };

@@ -190,7 +190,6 @@ fn result(command: String, ran: Result<Ran, RunError>, reason: String) -> Result
         Ok(_) if has_no_daemon(&reason) => {
             Err(DockerError::Unavailable(format!("Docker does not answer on this simulation server: {reason}")))
         }
-        Ok(_) if reason.is_empty() => Err(DockerError::Failed { command, message: "it says nothing".to_owned() }),
         Ok(_) => Err(DockerError::Failed { command, message: reason }),
         Err(RunError::Slow(limit)) => Err(DockerError::Slow { command, limit }),
         Err(error @ RunError::TooLong) => Err(DockerError::Failed { command, message: error.to_string() }),

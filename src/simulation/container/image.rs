@@ -21,7 +21,8 @@ use crate::simulation::process::DiskRoom;
 /// The images of this server.
 pub struct Images {
     docker: Docker,
-    owner: ResourceOwner,
+    /// Who has built them.
+    pub owner: ResourceOwner,
     config: Arc<SimulationConfig>,
     /// Limits concurrent builds.
     builds: Semaphore,

@@ -10,7 +10,7 @@ use actix_rt::task::spawn_blocking;
 use sha2::{Digest, Sha256};
 use tokio::runtime::Handle;
 
-use super::docker::{DockerError, blocking};
+use super::docker::{DockerError, SHORT_TIMEOUT, blocking};
 
 /// The owner of compose projects and images: a server, or one run of it. Their names have a common prefix: that of the owner
 /// is 12 hexadecimal digits; of a run also `-` and 8 more.
@@ -22,12 +22,10 @@ pub struct ResourceOwner(pub String);
 pub struct ProjectGuard {
     /// The name; unique on this machine.
     pub name: String,
-    /// Removes them.
-    runtime: Handle,
+    /// The runtime that removes them.
+    pub runtime: Handle,
 }
 
-/// How long each command of a sweep may take.
-const SWEEP_TIMEOUT: Duration = Duration::from_secs(20);
 /// How containers are removed, whatever they do.
 pub const REMOVE: [&str; 3] = ["rm", "--force", "--volumes"];
 /// Attempts to remove the containers of a project before they are left to the next start, and the pause before each: Docker
@@ -65,11 +63,6 @@ impl ResourceOwner {
 }
 
 impl ProjectGuard {
-    /// The containers of this project are removed on this runtime.
-    pub fn new(name: String, runtime: Handle) -> Self {
-        Self { name, runtime }
-    }
-
     /// Removes the containers now, if Docker can.
     pub async fn remove(self) {
         let name = self.name.clone();
@@ -107,10 +100,10 @@ pub fn sweep_all(owner: &ResourceOwner) {
 
 /// Removes the containers whose names begin like this. Blocks.
 fn sweep(prefix: &str) -> Result<(), DockerError> {
-    let list = blocking(&["ps", "--all", "--filter", "name=webots-fleet-", "--format", "{{.Names}}"], SWEEP_TIMEOUT)?;
+    let list = blocking(&["ps", "--all", "--filter", "name=webots-fleet-", "--format", "{{.Names}}"], SHORT_TIMEOUT)?;
     let names: Vec<&str> = list.lines().filter(|name| name.starts_with(prefix)).collect();
     if !names.is_empty() {
-        blocking(&[&REMOVE, names.as_slice()].concat(), SWEEP_TIMEOUT)?;
+        blocking(&[&REMOVE, names.as_slice()].concat(), SHORT_TIMEOUT)?;
     }
     Ok(())
 }

@@ -1,21 +1,17 @@
 //! The resource usage of the containers of simulations, from `docker stats` once for all.
 
 use std::collections::BTreeMap;
-use std::time::Duration;
 
-use super::docker::blocking;
+use super::docker::{SHORT_TIMEOUT, blocking};
 use super::owned_resources::ResourceOwner;
 use crate::simulation::machine::Usages;
-
-/// Timeout of the command.
-const TIMEOUT: Duration = Duration::from_secs(20);
 
 /// Measures the simulations of an owner: those on these ports, whose processes are named for each. Blocks for two
 /// seconds, which `docker stats` takes.
 pub fn measure(owner: &ResourceOwner, roots: &BTreeMap<u16, i32>) -> Usages {
     let format = "{{.Name}}\t{{.CPUPerc}}\t{{.MemUsage}}";
     // Of all that run: one that is named and has ended meanwhile would fail all.
-    let printed = blocking(&["stats", "--no-stream", "--format", format], TIMEOUT);
+    let printed = blocking(&["stats", "--no-stream", "--format", format], SHORT_TIMEOUT);
     let mut all = Usages::new();
     for (name, cpu, memory) in printed.unwrap_or_default().lines().filter_map(columns) {
         let Some(root) = owner.port_of(name).and_then(|port| roots.get(&port)) else { continue };
