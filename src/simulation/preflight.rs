@@ -14,7 +14,7 @@ use crate::simulation::machine::sensors::{GpuReading, GpuSensor};
 /// runs programs and connects to the display, so it can take some seconds.
 pub fn check(config: &SimulationConfig) -> Vec<String> {
     let mut findings = if config.isolation == IsolationSetting::Container {
-        vec![("docker", container::check(config)), ("templates", container::check_templates(config))]
+        vec![("docker", container::check(config))]
     } else {
         vec![("webots", webots(config)), ("display", display(config))]
     };

@@ -14,7 +14,7 @@ use which::which;
 
 use super::config::{IsolationSetting, SimulationConfig};
 use super::failed_starts::FailedStarts;
-use crate::simulation::container::{daemon_fault, data_folder, init_fault};
+use crate::simulation::container::{daemon_fault, data_folder};
 use crate::simulation::machine::Readings;
 use crate::simulation::machine::display;
 use crate::simulation::machine::sensors::Gpu;
@@ -40,16 +40,15 @@ pub fn watch(
     failed_starts: Arc<FailedStarts>,
 ) -> watch::Receiver<Option<String>> {
     // The first check comes before the first client; GPUs are not read yet.
-    let first = check(&config, &run, None, false).err();
+    let first = check(&config, &run, None).err();
     let (sender, problem) = watch::channel(None);
     publish(&sender, first, &failed_starts);
     actix_rt::spawn(async move {
-        let mut has_init = sender.borrow().is_none();
         while !sender.is_closed() {
             let pause = if sender.borrow().is_some() { PERIOD_WHILE_NOT_READY } else { PERIOD };
             actix_rt::time::sleep(pause).await;
             let (config, run, readings) = (Arc::clone(&config), run.clone(), Arc::clone(&readings.borrow()));
-            let all = move || check(&config, &run, Some(&readings), has_init).err();
+            let all = move || check(&config, &run, Some(&readings)).err();
             let mut checked = actix_rt::task::spawn_blocking(all);
             let found = if let Ok(found) = actix_rt::time::timeout(HUNG, &mut checked).await {
                 found
@@ -59,7 +58,6 @@ pub fn watch(
                 checked.await
             };
             if let Ok(found) = found {
-                has_init |= found.is_none();
                 publish(&sender, found, &failed_starts);
             }
         }
@@ -84,9 +82,8 @@ fn publish(sender: &watch::Sender<Option<String>>, found: Option<String>, failed
     });
 }
 
-/// Checks everything that each simulation needs; whether containers have an init process is known once they had. Blocks for
-/// two seconds for each display, and for as long as the disk does.
-fn check(config: &SimulationConfig, run: &Path, readings: Option<&Readings>, has_init: bool) -> Result<(), String> {
+/// Checks everything that each simulation needs. Blocks for two seconds for each display, and for as long as the disk does.
+fn check(config: &SimulationConfig, run: &Path, readings: Option<&Readings>) -> Result<(), String> {
     let in_container = config.isolation == IsolationSetting::Container;
     readings.map_or(Ok(()), |readings| check_gpus(config, readings))?;
     if in_container {
@@ -107,8 +104,7 @@ fn check(config: &SimulationConfig, run: &Path, readings: Option<&Readings>, has
             display::check(&display).map_err(|error| format!("Webots can't open its window: {error}"))?;
         }
     }
-    // That starts a container.
-    if in_container && !has_init { init_fault().map_or(Ok(()), Err) } else { Ok(()) }
+    Ok(())
 }
 
 /// The displays that simulations may be given: those of GPUs that answer, where each has its own.

@@ -53,7 +53,7 @@ fn start() -> Option<Daemon> {
     // Unless another daemon of the machine uses it.
     Command::new("ip").args(["link", "del", INTERFACE]).stderr(Stdio::null()).status().unwrap();
     let daemon = Daemon { folder };
-    daemon.launch(&[]);
+    daemon.launch();
     image::make(&daemon.folder);
     Some(daemon)
 }
@@ -87,7 +87,7 @@ impl Daemon {
     }
 
     /// Starts the daemon as the first process of a namespace: with it everything inside ends.
-    fn launch(&self, options: &'static [&str]) {
+    fn launch(&self) {
         let folder = self.folder.clone();
         // What one that was killed has left.
         std::fs::remove_file(folder.join("pid")).ok();
@@ -103,7 +103,7 @@ impl Daemon {
             command.args(["--pidfile", &path("pid"), "--bridge=none", "--ip-masq=false"]);
             command.args(["--iptables=false", "--ip6tables=false"]);
             // Two halves.
-            command.arg("--default-address-pool=base=10.213.0.0/16,size=17").args(options).process_group(0);
+            command.arg("--default-address-pool=base=10.213.0.0/16,size=17").process_group(0);
             let outputs = command.stdin(Stdio::null()).stdout(log.try_clone().unwrap()).stderr(log);
             let mut child = outputs.spawn().unwrap();
             std::fs::write(folder.join("keeper"), child.id().to_string()).unwrap();
@@ -286,7 +286,7 @@ pub fn kill() {
     }
 }
 
-/// Starts it again, with more options.
-pub fn start_again(options: &'static [&str]) {
-    daemon().launch(options);
+/// Starts it again.
+pub fn start_again() {
+    daemon().launch();
 }

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::Signal;
 
 use super::daemon::{self, alone, ask, check, containers, docker, refused, running, server, server_running};
-use crate::support::{Client, Server, arm, is_told, until};
+use crate::support::{Client, Server, arm, until};
 
 /// All of a simulation has to be gone by then.
 const GONE: Duration = Duration::from_secs(10);
@@ -78,7 +78,7 @@ async fn a_server_that_is_started_again_at_once_keeps_what_it_starts() {
 }
 
 #[actix_rt::test]
-async fn a_docker_that_is_stopped_or_has_no_init_process_is_told_and_all_goes_on_when_it_is_back() {
+async fn a_docker_that_is_stopped_is_told_and_all_goes_on_when_it_is_back() {
     let Some(_docker) = alone().await else { return };
     let (server, mut client) = running(server(2)).await;
     daemon::kill();
@@ -93,18 +93,11 @@ async fn a_docker_that_is_stopped_or_has_no_init_process_is_told_and_all_goes_on
         assert_eq!(code, Some(1013));
     }
     until("it says so", async || !takes_clients(&server).await).await;
-    daemon::start_again(&["--init-path", "/nowhere/docker-init"]);
-    let second = daemon::server(1).start().await;
-    until("it takes no client", async || !takes_clients(&second).await).await;
-    is_told(&second, &arm(), "docker-init: on Debian and Ubuntu the packages docker.io and tini").await;
-    let checked = check(&second);
-    assert!(checked.contains("can't give containers an init process"), "{checked}");
-    daemon::kill();
-    daemon::start_again(&[]);
-    for server in [&server, &second] {
-        until("it takes clients again", async || takes_clients(server).await).await;
-        Client::start(server, &arm()).await.patiently("webots:").await;
-    }
+    let checked = check(&server);
+    assert!(checked.contains("warning: docker: Docker does not answer"), "{checked}");
+    daemon::start_again();
+    until("it takes clients again", async || takes_clients(&server).await).await;
+    Client::start(&server, &arm()).await.patiently("webots:").await;
     until("what the daemon has kept is gone", async || containers(&server).len() <= 1).await;
 }
 
@@ -118,16 +111,6 @@ async fn a_world_that_ends_like_one_of_a_stopped_docker_is_not_taken_for_that() 
         assert_eq!(code, Some(1000));
         assert_eq!(server.status().await["failedStarts"], 0);
     }
-}
-
-#[actix_rt::test]
-async fn a_container_that_docker_is_told_to_stop_is_not_the_worlds_fault() {
-    let Some(_docker) = docker().await else { return };
-    let (server, mut client) = running(server(1)).await;
-    ask(&["stop", &daemon::of_service(&server, "webots")[0]]);
-    let told = client.patiently("loading: Error:").await;
-    assert!(told.contains("Docker has stopped"), "{told}");
-    assert_eq!(client.closed().await, Some(1013));
 }
 
 #[actix_rt::test]

@@ -5,29 +5,23 @@ use std::path::Path;
 use super::git_wrapper::GitWrapper;
 use super::opened::reader;
 use crate::support::git::git;
-use crate::support::{Client, Forge, Webots, arm, is_told, make_program, needs, outcome, programs, simulation_server};
+use crate::support::{Forge, Webots, arm, is_told, make_program, needs, outcome, programs, simulation_server};
 
 const POINTER: &str = "version https://git-lfs.github.com/spec/v1\noid sha256:0000000000000000000000000000000000000000000000000000000000000000\nsize 12345\n";
 
 #[actix_rt::test]
-async fn files_that_are_missing_from_git_lfs_are_told() {
+async fn a_world_whose_large_files_are_missing_opens_without_them() {
     let (forge, webots) = (Forge::with_arm(), reader());
     forge.commit(
         "lab/arm",
         "main",
         &[("meshes/a.dae", POINTER), (".gitattributes", "*.dae filter=lfs diff=lfs merge=lfs -text\n")],
     );
-    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    let told = client.until("loading: Warning:").await;
-    assert!(told.starts_with("loading: Warning: 1 files of this project are kept in Git LFS and c"), "{told}");
-    client.until("loading: Error: Webots ended with exit code 1").await;
-    // Without git-lfs it is told that this is what is missing.
+    is_told(&simulation_server(&webots.path(), forge.path(), 1).start().await, &arm(), "opened").await;
+    // The same without git-lfs.
     let bin = programs(&["git", "bash", "sed", "env", "sh", "rm"]);
     let builder = simulation_server(&webots.path(), forge.path(), 1);
-    let server = builder.env("PATH", bin.path().to_str().unwrap()).start().await;
-    let told = Client::start(&server, &arm()).await.until("loading: Warning:").await;
-    assert!(told.ends_with("can't be loaded: this server has no git-lfs"), "{told}");
+    is_told(&builder.env("PATH", bin.path().to_str().unwrap()).start().await, &arm(), "opened").await;
 }
 
 #[actix_rt::test]

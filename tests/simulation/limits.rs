@@ -18,7 +18,7 @@ async fn sizes_are_limited() {
     let told = outcome(&server, &arm()).await;
     assert!(told.ends_with("is larger than 1 MiB"), "{told}");
     let told = outcome(&server, &arm_at(old.trim())).await;
-    assert_eq!(told, "loading: Error: The history of https://github.com/lab/arm is larger than 1 MiB");
+    assert_eq!(told, "loading: Error: https://github.com/lab/arm with its history is larger than 1 MiB");
     // What was broken off leaves nothing.
     let cache = server.folder.join("cache/git");
     until("the cache is within its budget", async || size_of(&cache) < 1 << 20).await;

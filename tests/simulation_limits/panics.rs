@@ -144,7 +144,8 @@ async fn launch(server: &AppState) -> (Addr<Webots>, UnboundedReceiver<WebotsExi
     let world = ProjectUrl::parse(&arm()).unwrap();
     let lease = lease(server, &listener, &world);
     let port = granted.recv().await.unwrap();
-    let project = server.checkouts.start(world, server.run.instance().unwrap(), |_| ()).await.unwrap().unwrap();
+    let project =
+        server.checkouts.start(world, server.run.instance().unwrap(), Arc::new(|_| ())).await.unwrap().unwrap();
     let spec = LaunchSpec {
         config: Arc::clone(&server.config),
         containers: None,

@@ -10,20 +10,17 @@ use std::sync::Arc;
 use tokio::runtime::Handle;
 use tokio::sync::Semaphore;
 use tokio_util::task::AbortOnDropHandle;
-use which::which;
 
-use super::cache_dir::CacheDir;
-use super::checkout_error::{CheckoutError, git_failed, machine, refused, too_slow};
+use super::checkout_error::{Cause, CheckoutError, refused};
 use super::commit_resolver::CommitResolver;
 use super::file_restore;
 use super::git::Git;
-use super::git_error::Cause;
 use super::project::Project;
 use super::redirect;
-use super::repository_cache::RepositoryCache;
+use super::repository_cache::{CacheDir, RepositoryCache};
 use super::single_flight::SharedProgress;
 use super::steps;
-use super::work_tree::{self, checkout_command};
+use super::work_tree;
 use crate::shared::domain::{AdmissionRules, ProjectUrl};
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::process::{InstanceDir, on_own_thread};
@@ -35,8 +32,6 @@ pub struct CheckoutService {
     runtime: Handle,
     /// Limits the number of projects that are copied at a time.
     copies: Semaphore,
-    /// Whether git finds its part for LFS.
-    has_lfs: bool,
     _keeps_within_budget: AbortOnDropHandle<()>,
 }
 
@@ -50,13 +45,13 @@ impl CheckoutService {
     /// # Errors
     /// When the cache can't be created.
     pub fn open(dir: CacheDir, run: &Path, config: Arc<SimulationConfig>, rules: AdmissionRules) -> io::Result<Self> {
-        let git = Arc::new(Git::new(run, &config));
-        let cache = Arc::new(RepositoryCache::open(dir, git, Arc::clone(&config))?);
+        let git = Arc::new(Git::new(run, Arc::clone(&config)));
+        let cache = Arc::new(RepositoryCache::open(dir, git)?);
         let resolver = Arc::new(CommitResolver::new(Arc::clone(&cache), Arc::clone(&config), rules));
         let runtime = Handle::current();
         let keeper = AbortOnDropHandle::new(runtime.spawn(cache.keep_within_budget()));
-        let (copies, has_lfs) = (Semaphore::new(COPIES), which("git-lfs").is_ok());
-        Ok(Self { resolver, config, runtime, copies, has_lfs, _keeps_within_budget: keeper })
+        let copies = Semaphore::new(COPIES);
+        Ok(Self { resolver, config, runtime, copies, _keeps_within_budget: keeper })
     }
 
     /// Starts to check a world out into a client's directory. `progress` receives each step as text.
@@ -64,35 +59,36 @@ impl CheckoutService {
         self: &Arc<Self>,
         world: ProjectUrl,
         instance: InstanceDir,
-        progress: impl Fn(String) + Send + Sync + 'static,
+        progress: SharedProgress,
     ) -> AbortOnDropHandle<Result<Project, CheckoutError>> {
         let this = Arc::clone(self);
-        let progress: SharedProgress = Arc::new(progress);
         let job = async move {
-            let limit = this.config.timing.checkout;
-            let done = actix_rt::time::timeout(limit, this.check_out(&world, instance, &progress)).await;
-            done.unwrap_or_else(|_| Err(too_slow(&world, limit)))
+            let (mut world, limit) = (world, this.config.timing.checkout);
+            let done = actix_rt::time::timeout(limit, this.check_out(&mut world, instance, &progress)).await;
+            let done = done.unwrap_or_else(|_| Err(CheckoutError::new(Cause::Slow(limit), "")));
+            done.map_err(|error| error.about(&world))
         };
         AbortOnDropHandle::new(self.runtime.spawn(job))
     }
 
+    /// Checks a world out, which is then where its Git host has redirected to.
     async fn check_out(
         &self,
-        world: &ProjectUrl,
+        world: &mut ProjectUrl,
         instance: InstanceDir,
         progress: &SharedProgress,
     ) -> Result<Project, CheckoutError> {
         let instance = Arc::new(instance);
-        let (mut world, mut redirects, mut is_mended) = (world.clone(), 0, false);
+        let (mut redirects, mut is_mended) = (0, false);
         let project = loop {
-            match self.attempt(&world, &instance, progress).await {
+            match self.attempt(world, &instance, progress).await {
                 Err(error) if error.cause == Cause::Moved && redirects < redirect::MAX_REDIRECTS => {
                     redirects += 1;
-                    world = self.resolver.moved(&world).await?;
+                    *world = self.resolver.moved(world).await?;
                 }
                 Err(error) if error.cause == Cause::Damaged && !is_mended => {
                     is_mended = true;
-                    self.resolver.discard(&world, &error).await?;
+                    self.resolver.discard(world, &error).await?;
                 }
                 done => break done?,
             }
@@ -112,18 +108,17 @@ impl CheckoutService {
         // It is never closed.
         let _turn = self.copies.acquire().await.ok();
         let (wanted, instance, progress) = (world.clone(), Arc::clone(instance), Arc::clone(progress));
-        let limits = (self.config.project_size, self.has_lfs);
+        let (limit, name) = (self.config.project_size, found.revision.name.clone());
         let copy = async move || {
-            let name = &found.revision.name;
-            progress(steps::checking_out(name, None));
+            progress(steps::checking_out(&name, ""));
             let on_line = |line: &str| {
                 if line.contains('%') {
-                    progress(steps::checking_out(name, Some(line)));
+                    progress(steps::checking_out(&name, line));
                 }
             };
-            work_tree::write(&found, &wanted, &instance, limits, on_line).await
+            work_tree::write(&found, &wanted, &instance, limit, on_line).await
         };
-        on_own_thread(copy).await.map_err(|error| machine(world, &error))?
+        on_own_thread(copy).await?
     }
 
     /// Restores a file below the project's `controllers` directory to the state of the checkout.
@@ -131,30 +126,22 @@ impl CheckoutService {
     /// # Errors
     /// When it is not a file of the checkout there, or git fails.
     pub async fn restore_controller(&self, project: &Project, file: &str) -> Result<(), CheckoutError> {
-        let refused = || refused(format!("{file:?} is no file below the project's controllers folder"));
-        let path = file_restore::controller(&project.revision.folder, file).ok_or_else(refused)?;
-        let restored = match self.restore(project, &path).await {
-            Err(error) if error.cause == Cause::Damaged => {
-                self.resolver.discard(&project.url, &error).await?;
-                self.restore(project, &path).await?
-            }
-            restored => restored?,
-        };
-        restored.then_some(()).ok_or_else(refused)
+        let mut restored = self.restore(project, file).await;
+        if let Err(error) = &restored
+            && error.cause == Cause::Damaged
+        {
+            self.resolver.discard(&project.url, error).await?;
+            restored = self.restore(project, file).await;
+        }
+        restored.map_err(|error| error.about(&project.url))
     }
 
-    /// Restores a file of a project's repository. Returns whether it exists.
-    async fn restore(&self, project: &Project, path: &str) -> Result<bool, CheckoutError> {
-        let Project { url, revision, instance, .. } = project;
-        let Some(repository) = self.resolver.file(url, revision, path).await? else {
-            return Ok(false);
-        };
-        let failed = |error| machine(url, &error);
-        let restored = file_restore::prepare(instance.path()).map_err(failed)?;
-        let paths = [path.as_bytes(), b"\0"].concat();
-        let folders = (restored.path(), &*restored.path().join("files"));
-        let call = checkout_command(&repository, revision, &paths, folders, &[]);
-        repository.run(call.map_err(failed)?, |_| ()).await.map_err(|source| git_failed(url, &source))?;
-        file_restore::install(restored, instance.project(), path.to_owned()).await.map_err(failed)
+    async fn restore(&self, project: &Project, file: &str) -> Result<(), CheckoutError> {
+        let Project { url, revision, .. } = project;
+        let none = || refused(format!("{file:?} is no file below the project's controllers folder"));
+        let path = file_restore::controller(revision, file).ok_or_else(none)?;
+        let repository = self.resolver.file(url, revision, &path).await?.ok_or_else(none)?;
+        let is_there = file_restore::restore(&repository, project, &path).await?;
+        is_there.then_some(()).ok_or_else(none)
     }
 }

@@ -1,16 +1,12 @@
 //! Resolves a world's URL to a commit, and fetches it into the cache: once for all clients that wait for it.
 
 use std::collections::HashMap;
-use std::ffi::OsStr;
 use std::sync::Arc;
 
 use parking_lot::Mutex;
 use tokio::sync::watch;
 
-use super::checkout_error::{
-    CheckoutError, damaged, git_failed, machine, no_reference, not_reachable, refused, too_large,
-};
-use super::git_error::Cause;
+use super::checkout_error::{Cause, CheckoutError, refused};
 use super::redirect;
 use super::repository::Repository;
 use super::repository_cache::{COMMITS, HISTORY, RepositoryCache};
@@ -92,19 +88,22 @@ impl CommitResolver {
         let progress = |step| drop(sender.send_replace(step));
         progress(steps::looking_for(&world.repository()));
         let repository = self.repository(world, COMMITS).await?;
+        let revisions = match revision::commit_of(world, self.config.any_commit) {
+            Some(commit) => vec![commit],
+            None => revision::found(world, &repository.ask(&revision::search_arguments(world)).await?),
+        };
         let search = Search { resolver: self, world, repository: &repository, progress: &progress };
-        let mut missing = None;
-        for revision in search.revisions().await? {
-            let path = revision.world_path(world);
-            let Some(answer) = search.read(&revision, &path).await? else {
-                continue;
-            };
-            if let Some(above) = revision.files_above(&answer, &path) {
-                return Ok(ResolvedCommit { repository, revision, above });
+        let mut missing = CheckoutError::new(Cause::NoCommit, "");
+        for revision in revisions {
+            let path = revision.path_of(&format!("worlds/{}", world.world()));
+            match search.read(&revision, &path).await {
+                Ok(Some(above)) => return Ok(ResolvedCommit { repository, revision, above }),
+                Ok(None) => missing = refused(format!("{path} in {} does not exist", revision.name)),
+                Err(error) if error.cause == Cause::NoCommit => {}
+                Err(error) => return Err(error),
             }
-            missing = Some(refused(format!("{path} in {} does not exist", revision.name)));
         }
-        Err(missing.unwrap_or_else(|| no_reference(world)))
+        Err(missing)
     }
 
     /// The cached repository of a world with this content.
@@ -117,7 +116,7 @@ impl CommitResolver {
             ))
         })?;
         let remote = self.redirected.lock().get(&remote.key()).cloned().unwrap_or(remote);
-        self.cache.repository(&remote, content).await.map_err(|error| machine(world, &error))
+        Ok(self.cache.repository(&remote, content).await?)
     }
 
     /// Checks that a file exists at a path of a commit that was found before. The commit is fetched again if it was
@@ -133,9 +132,7 @@ impl CommitResolver {
     ) -> Result<Option<Arc<Repository>>, CheckoutError> {
         let repository = self.repository(world, COMMITS).await?;
         let search = Search { resolver: self, world, repository: &repository, progress: &drop };
-        let answer = search.read(revision, path).await?;
-        let is_file = answer.is_some_and(|answer| revision.files_above(&answer, path).is_some());
-        Ok(is_file.then_some(repository))
+        Ok(search.read(revision, path).await?.map(|_| repository))
     }
 
     /// Discards what is cached of a world's repository, which has turned out to be corrupt.
@@ -143,41 +140,33 @@ impl CommitResolver {
     /// # Errors
     /// When it can't be removed.
     pub async fn discard(&self, world: &ProjectUrl, failure: &CheckoutError) -> Result<(), CheckoutError> {
-        log::warn!("{failure}. The cached repository is broken: it is fetched anew");
+        log::warn!("{world}: {failure}. The cached repository is broken: it is fetched anew");
         for content in [COMMITS, HISTORY] {
-            let repository = self.repository(world, content).await?;
-            repository.discard().await.map_err(|error| machine(world, &error))?;
+            self.repository(world, content).await?.discard().await?;
         }
         Ok(())
     }
 }
 
 impl Search<'_> {
-    /// The commits that a URL may mean, the most likely first.
-    async fn revisions(self) -> Result<Vec<Revision>, CheckoutError> {
-        if let Some(commit) = revision::commit_of(self.world, self.resolver.config.any_commit) {
-            return Ok(vec![commit]);
-        }
-        let answer = self.ask(&revision::search_arguments(self.world)).await?;
-        Ok(revision::found(self.world, &answer))
-    }
-
-    /// Lists a path of a commit with git; the commit is fetched first if it is not in the cache. Returns `None` if the
-    /// revision is a single file.
+    /// Looks for a file at this path of a commit, which is fetched first if it is not in the cache. Returns the files of the
+    /// directories above the project's, each path ended by a zero byte.
     async fn read(self, revision: &Revision, path: &str) -> Result<Option<Vec<u8>>, CheckoutError> {
-        let Search { world, repository, .. } = self;
-        let (reference, arguments) = (revision.reference(), revision.list_arguments(path));
+        let (repository, reference) = (self.repository, revision.reference());
+        let arguments = revision.list_arguments(path);
         let mut listed = repository.read(&arguments).await;
         if listed.is_err() && repository.read(&["rev-parse", "--quiet", "--verify", &reference]).await.is_err() {
             self.fetch_commit(revision).await?;
             listed = repository.read(&arguments).await;
         }
         match listed {
-            Ok(text) => Ok(Some(text)),
-            Err(source) => {
+            Ok(answer) => Ok(revision.files_above(&answer, path)),
+            Err(error) if matches!(error.cause, Cause::Machine | Cause::Slow(_) | Cause::TooLarge) => Err(error),
+            Err(error) => {
                 let kind = repository.read(&["cat-file", "-t", &format!("{reference}^{{}}")]).await;
                 let is_file = kind.is_ok_and(|kind| kind.starts_with(b"blob"));
-                if is_file { Ok(None) } else { Err(damaged(world, &source)) }
+                let cause = if is_file { Cause::NoCommit } else { Cause::Damaged };
+                Err(CheckoutError::new(cause, error.to_string()))
             }
         }
     }
@@ -186,51 +175,44 @@ impl Search<'_> {
     async fn fetch_commit(self, revision: &Revision) -> Result<(), CheckoutError> {
         let name = self.world.repository();
         if revision.trust == TrustSource::Url && !self.is_accepted(&revision.commit).await? {
-            return Err(not_reachable(&name, &revision.name));
+            return Err(refused(format!(
+                "{} is in no branch or tag of {name}. Forges also hand out commits that a repository's owner never \
+                 accepted; this simulation server runs them only if its administrator sets anyCommit",
+                revision.name
+            )));
         }
-        self.fetch(self.repository, revision.fetch_arguments(), (&name, &format!("{name} (at depth 1)"))).await
+        self.fetch(self.repository, revision.fetch_arguments(), &name).await
     }
 
     /// Whether a commit that is named by its hash is in a branch or tag. The history is fetched unless it is cached.
     async fn is_accepted(self, commit: &str) -> Result<bool, CheckoutError> {
-        if revision::is_tip(&self.ask(&revision::LIST_TIPS).await?, commit) {
+        if self.repository.ask(&revision::LIST_TIPS).await?.lines().any(|tip| tip.starts_with(commit)) {
             return Ok(true);
         }
         let history = self.resolver.repository(self.world, HISTORY).await?;
-        if self.is_reachable(&history, commit).await? {
+        if is_reachable(&history, commit).await? {
             return Ok(true);
         }
-        let name = self.world.repository();
-        let names = (&*format!("the history of {name}"), &*format!("The history of {name}"));
-        self.fetch(&history, revision::fetch_history(), names).await?;
-        self.is_reachable(&history, commit).await
+        let name = format!("{} with its history", self.world.repository());
+        self.fetch(&history, revision::fetch_history(), &name).await?;
+        is_reachable(&history, commit).await
     }
 
-    async fn ask(self, arguments: &[impl AsRef<OsStr>]) -> Result<String, CheckoutError> {
-        self.repository.ask(arguments).await.map_err(|source| git_failed(self.world, &source))
-    }
-
-    /// Fetches into a repository. The first of the names is for the client's progress, the second for what is too large.
-    async fn fetch(
-        self,
-        into: &Arc<Repository>,
-        arguments: Vec<String>,
-        (name, whole): (&str, &str),
-    ) -> Result<(), CheckoutError> {
+    /// Fetches into a repository what has this name.
+    async fn fetch(self, into: &Arc<Repository>, arguments: Vec<String>, name: &str) -> Result<(), CheckoutError> {
         let on_line = |line: String| (self.progress)(steps::fetching(name, &line));
         into.fetch(arguments, &on_line).await.map_err(|error| match error.cause {
-            Cause::TooLarge => too_large(whole, self.resolver.config.project_size),
-            _ => git_failed(self.world, &error),
+            Cause::TooLarge => refused(format!("{name} is larger than {} MiB", self.resolver.config.project_size)),
+            _ => error,
         })
     }
+}
 
-    /// Whether a commit is part of a branch or tag of a history.
-    async fn is_reachable(self, history: &Repository, commit: &str) -> Result<bool, CheckoutError> {
-        if history.read(&["cat-file", "-e", commit]).await.is_err() {
-            return Ok(false);
-        }
-        let branches = ["for-each-ref", "--count=1", "--contains", commit, "refs/heads", "refs/tags"];
-        let branches = history.read(&branches).await;
-        branches.map(|answer| !answer.is_empty()).map_err(|error| git_failed(self.world, &error))
+/// Whether a commit is part of a branch or tag of a history.
+async fn is_reachable(history: &Repository, commit: &str) -> Result<bool, CheckoutError> {
+    if history.read(&["cat-file", "-e", commit]).await.is_err() {
+        return Ok(false);
     }
+    let branches = ["for-each-ref", "--count=1", "--contains", commit, "refs/heads", "refs/tags"];
+    Ok(!history.read(&branches).await?.is_empty())
 }

@@ -34,16 +34,14 @@ pub async fn outgrown(folders: Vec<(PathBuf, u64)>) {
     loop {
         actix_rt::time::sleep(CHECK_INTERVAL).await;
         let looked_at = folders.clone();
-        let is_one = move || Ok(looked_at.iter().any(|(folder, most)| is_beyond(folder, *most)));
-        if blocking(is_one).await.is_ok_and(|is_one| is_one) {
+        let is_beyond = |(folder, most): &(PathBuf, u64)| {
+            let mut size = DiskUsage::new(measure, *most);
+            !size.add_folder(folder) || size.total() > *most
+        };
+        if blocking(move || Ok(looked_at.iter().any(is_beyond))).await.is_ok_and(|is_one| is_one) {
             return;
         }
     }
-}
-
-fn is_beyond(folder: &Path, most: u64) -> bool {
-    let mut size = DiskUsage::new(measure, most);
-    !size.add_folder(folder) || size.total() > most
 }
 
 /// What everything below a folder takes, each file and folder at least what a name takes of a disk.

@@ -6,44 +6,36 @@
 //! resolves without symlinks.
 
 use std::fs::File;
-use std::io;
-use std::path::{Path, PathBuf};
 
 use nix::fcntl::{AT_FDCWD, OFlag, OpenHow, ResolveFlag, openat2, renameat};
-use tempfile::TempDir;
 
-use super::disk::blocking;
+use super::checkout_error::CheckoutError;
+use super::project::Project;
+use super::repository::Repository;
+use super::revision::Revision;
+use super::work_tree::checkout_command;
 
-/// The path in its repository of a file below the `controllers` folder of the project in `folder`; nothing where its name
-/// leads elsewhere.
-pub fn controller(folder: &str, file: &str) -> Option<String> {
+/// The path in its repository of a file below the `controllers` folder of a project; nothing where its name leads elsewhere.
+pub fn controller(revision: &Revision, file: &str) -> Option<String> {
     let plain = |segment: &str| !segment.is_empty() && segment != "." && segment != ".." && !segment.contains('\0');
-    let slash = if folder.is_empty() { "" } else { "/" };
-    (file.contains('/') && file.split('/').all(plain)).then(|| format!("{folder}{slash}controllers/{file}"))
+    (file.contains('/') && file.split('/').all(plain)).then(|| revision.path_of(&format!("controllers/{file}")))
 }
 
-/// Creates a directory in that of an instance, with scratch files of git and `files`, into which git writes the file.
+/// Restores the file at this path of the repository to its commit. Returns false if its directory is none any more, or a
+/// directory has replaced the file.
 ///
 /// # Errors
-/// When that can't be done.
-pub fn prepare(instance: &Path) -> io::Result<TempDir> {
-    let folder = tempfile::Builder::new().prefix("restored-").tempdir_in(instance)?;
-    std::fs::create_dir(folder.path().join("files"))?;
-    Ok(folder)
-}
-
-/// Moves the file at this path of the repository to the same path of the project. Returns false if its parent is no
-/// longer a directory, or a directory has replaced the file.
-///
-/// # Errors
-/// When the project can't be opened.
-pub async fn install(restored: TempDir, project: PathBuf, path: String) -> io::Result<bool> {
-    blocking(move || {
-        let (above, name) = path.rsplit_once('/').unwrap_or((".", &path));
-        let how = OpenHow::new().flags(OFlag::O_PATH | OFlag::O_DIRECTORY | OFlag::O_CLOEXEC);
-        let how = how.resolve(ResolveFlag::RESOLVE_BENEATH | ResolveFlag::RESOLVE_NO_SYMLINKS);
-        let (folder, file) = (openat2(File::open(project)?, above, how), restored.path().join("files").join(&path));
-        Ok(folder.is_ok_and(|folder| renameat(AT_FDCWD, &file, folder, name).is_ok()))
-    })
-    .await
+/// When git or the disk fails.
+pub async fn restore(repository: &Repository, project: &Project, path: &str) -> Result<bool, CheckoutError> {
+    let scratch = tempfile::Builder::new().prefix("restored-").tempdir_in(project.instance.path())?;
+    let files = scratch.path().join("files");
+    std::fs::create_dir(&files)?;
+    let paths = [path.as_bytes(), b"\0"].concat();
+    let call = checkout_command(repository, &project.revision, &paths, (scratch.path(), &files), &[])?;
+    repository.git.run(call, |_| ()).await?;
+    let (above, name) = path.rsplit_once('/').unwrap_or((".", path));
+    let how = OpenHow::new().flags(OFlag::O_PATH | OFlag::O_DIRECTORY | OFlag::O_CLOEXEC);
+    let how = how.resolve(ResolveFlag::RESOLVE_BENEATH | ResolveFlag::RESOLVE_NO_SYMLINKS);
+    let folder = openat2(File::open(project.instance.project())?, above, how);
+    Ok(folder.is_ok_and(|folder| renameat(AT_FDCWD, &files.join(path), folder, name).is_ok()))
 }

@@ -2,11 +2,12 @@
 
 use std::ffi::{OsStr, OsString};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 
 use rustix::process::Resource;
 
-use super::git_error::GitError;
+use super::checkout_error::{Cause, CheckoutError};
 use crate::shared::config::ExpandedPath;
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::process::{ExitReason, Ran, Run};
@@ -16,8 +17,8 @@ pub struct Git {
     /// The file with git's settings, and its text.
     settings: (PathBuf, String),
     mark: PathBuf,
-    /// Timeout of a command.
-    time: Duration,
+    /// The configuration.
+    pub config: Arc<SimulationConfig>,
 }
 
 /// git reads this instead of the settings of the server's user, because a world's program could have written those. The
@@ -44,16 +45,16 @@ const MAX_LINE: usize = 500;
 
 impl Git {
     /// Prepares git for the server whose run has this folder.
-    pub fn new(run: &Path, config: &SimulationConfig) -> Self {
+    pub fn new(run: &Path, config: Arc<SimulationConfig>) -> Self {
         let include = config.git_config.as_ref().map(|ExpandedPath(file)| {
             let file = std::path::absolute(file).unwrap_or_else(|_| file.clone());
             let quoted = file.to_string_lossy().replace('\\', "\\\\").replace('"', "\\\"");
             format!("[include]\n\tpath = \"{quoted}\"\n")
         });
-        let silence = stall_timeout(config).as_secs().max(1);
+        let silence = stall_timeout(&config).as_secs().max(1);
         let silence = format!("[http]\n\tlowSpeedLimit = 1\n\tlowSpeedTime = {silence}\n");
         let settings = (run.join("gitconfig"), include.unwrap_or_default() + SETTINGS + &silence);
-        Self { settings, mark: run.to_owned(), time: config.timing.checkout }
+        Self { settings, mark: run.to_owned(), config }
     }
 
     /// Writes the file of settings, unless it is there.
@@ -79,16 +80,16 @@ impl Git {
         let folder = [OsStr::new(GIT_DIR), repository.as_os_str()].join(OsStr::new(""));
         let settings = settings.iter().flat_map(|setting| ["-c".into(), setting.into()]);
         let words = ["git".into(), "--literal-pathspecs".into()].into_iter().chain(settings).chain([folder]);
-        let mut run = Run::new(words.chain(arguments.iter().map(OsString::from)), &self.mark, self.time);
-        let environment: [(&str, &OsStr); 6] = [
-            ("GIT_CONFIG_GLOBAL", self.settings.0.as_os_str()),
-            ("GIT_ALLOW_PROTOCOL", OsStr::new(protocol)),
-            ("GIT_TERMINAL_PROMPT", OsStr::new("0")),
-            ("GIT_ASKPASS", OsStr::new("/bin/false")),
-            ("GIT_NO_REPLACE_OBJECTS", OsStr::new("1")),
-            ("LC_ALL", OsStr::new("C")),
+        let mut run =
+            Run::new(words.chain(arguments.iter().map(OsString::from)), &self.mark, self.config.timing.checkout);
+        run.spec.environment = vec![
+            ("GIT_CONFIG_GLOBAL".into(), self.settings.0.clone().into()),
+            ("GIT_ALLOW_PROTOCOL".into(), protocol.into()),
+            ("GIT_TERMINAL_PROMPT".into(), "0".into()),
+            ("GIT_ASKPASS".into(), "/bin/false".into()),
+            ("GIT_NO_REPLACE_OBJECTS".into(), "1".into()),
+            ("LC_ALL".into(), "C".into()),
         ];
-        run.spec.environment = environment.map(|(name, value)| (name.into(), value.into())).into();
         (run.answer, run.line) = (MAX_ANSWER, MAX_LINE);
         run.limits.push((Resource::Data, MAX_MEMORY));
         run
@@ -100,11 +101,9 @@ impl Git {
     ///
     /// # Errors
     /// When git can't be started, fails, or takes too long.
-    pub async fn run(&self, mut run: Run, mut progress: impl FnMut(&str)) -> Result<Vec<u8>, GitError> {
-        let is = |word: &OsString, start: &str| word.as_encoded_bytes().starts_with(start.as_bytes());
-        let mut words = run.spec.command.iter().skip_while(|word| !is(word, GIT_DIR));
-        let command =
-            words.find(|word| !is(word, "-")).map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+    pub async fn run(&self, mut run: Run, mut progress: impl FnMut(&str)) -> Result<Vec<u8>, CheckoutError> {
+        let words = run.spec.command.iter().map(|word| word.to_string_lossy());
+        let command = words.skip_while(|word| !word.starts_with(GIT_DIR)).nth(1).unwrap_or_default().into_owned();
         run.niceness = if HEAVY.contains(&command.as_str()) { NICENESS } else { 0 };
         self.write_settings()?;
         let mut cause = String::new();
@@ -116,9 +115,9 @@ impl Git {
         };
         match run.run(on_line).await {
             Ok(Ran { ending: ExitReason::Code(0), answer }) => Ok(answer),
-            Ok(Ran { ending: ExitReason::NotStarted, .. }) => Err(GitError::machine(cause)),
-            Ok(Ran { ending, .. }) => Err(GitError::ended(&command, ending, &cause)),
-            Err(error) => Err(GitError::not_ended(&command, &error)),
+            Ok(Ran { ending: ExitReason::NotStarted, .. }) => Err(CheckoutError::new(Cause::Machine, cause)),
+            Ok(Ran { ending, .. }) => Err(CheckoutError::ended(&command, ending, &cause)),
+            Err(error) => Err(CheckoutError::not_ended(&command, &error)),
         }
     }
 }

@@ -2,15 +2,12 @@
 //!
 //! For git's settings see [`git`].
 
-mod cache_dir;
 mod checkout_error;
 mod checkout_service;
 mod commit_resolver;
 mod disk;
 mod file_restore;
 mod git;
-mod git_error;
-mod lfs;
 mod project;
 mod redirect;
 mod repository;
@@ -19,11 +16,10 @@ mod revision;
 mod single_flight;
 mod steps;
 mod work_tree;
-mod world_file;
 
-pub use cache_dir::CacheDir;
 pub use checkout_error::CheckoutError;
 pub use checkout_service::CheckoutService;
 pub use disk::outgrown;
 pub use project::Project;
+pub use repository_cache::CacheDir;
 pub use single_flight::{OnProgress, SingleFlight};

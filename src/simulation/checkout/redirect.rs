@@ -6,7 +6,7 @@
 
 use url::Url;
 
-use super::checkout_error::{CheckoutError, moved};
+use super::checkout_error::{CheckoutError, refused};
 use super::repository::{REMOTE, Repository};
 use crate::shared::domain::{AdmissionRules, Load, ProjectUrl};
 use crate::simulation::config::{Mirrors, Remote};
@@ -30,7 +30,7 @@ pub async fn follow(
         Some(location) => target(mirrors, rules, world, &location),
         None => Err("to where its forge does not say".to_owned()),
     };
-    let target = target.map_err(|why| moved(world, &why))?;
+    let target = target.map_err(|why| refused(format!("{} has moved {why}", world.repository())))?;
     log::info!("{} is at {}", world.repository(), target.1.location);
     Ok(target)
 }
@@ -40,17 +40,14 @@ async fn location(repository: &Repository) -> Option<String> {
     let mut location = None;
     let on_line = |line: &str| {
         let header = line.split_once("Recv header: ").and_then(|(_, header)| header.split_once(": "));
-        if let Some((name, value)) = header
-            && name.eq_ignore_ascii_case("location")
-        {
-            location = Some(value.to_owned());
-        }
+        let header = header.filter(|(name, _)| name.eq_ignore_ascii_case("location"));
+        location = header.map(|(_, value)| value.to_owned()).or(location.take());
     };
     let mut call = repository.call(&["ls-remote", "--quiet", "--", REMOTE, "HEAD"]);
     let trace = ["GIT_TRACE_CURL", "GIT_TRACE_CURL_NO_DATA"];
     call.spec.environment.extend(trace.map(|name| (name.into(), "1".into())));
     // It fails again, since the forge sends it elsewhere.
-    repository.run(call, on_line).await.ok();
+    repository.git.run(call, on_line).await.ok();
     location
 }
 

@@ -43,11 +43,6 @@ fn is_hash(text: &str) -> bool {
     text.len() == 40 && text.bytes().all(|byte| byte.is_ascii_hexdigit())
 }
 
-/// Whether a commit is the newest of a branch or tag in the answer to [`LIST_TIPS`].
-pub fn is_tip(answer: &str, commit: &str) -> bool {
-    answer.lines().filter_map(|line| line.split_once('\t')).any(|(tip, _)| tip == commit)
-}
-
 /// Fetches all branches and tags: only their commits where the remote can do that, else everything.
 pub fn fetch_history() -> Vec<String> {
     fetch(&["--filter=tree:0", "--prune"], &["+refs/heads/*:refs/heads/*", "+refs/tags/*:refs/tags/*"])
@@ -123,10 +118,10 @@ impl Revision {
         is_there.then(|| paths.into_iter().flat_map(|path| path.iter().chain(&[0])).copied().collect())
     }
 
-    /// Where the world lies in the repository.
-    pub fn world_path(&self, world: &ProjectUrl) -> String {
+    /// The path in the repository of a file of the project.
+    pub fn path_of(&self, file: &str) -> String {
         let slash = if self.folder.is_empty() { "" } else { "/" };
-        format!("{}{slash}worlds/{}", self.folder, world.world())
+        format!("{}{slash}{file}", self.folder)
     }
 }
 

@@ -7,10 +7,10 @@ use std::collections::HashMap;
 use std::future::Future;
 use std::hash::Hash;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use futures_util::FutureExt;
-use futures_util::future::{BoxFuture, WeakShared};
+use futures_util::future::{BoxFuture, WeakShared, pending};
 use parking_lot::Mutex;
 use tokio::sync::watch;
 
@@ -37,7 +37,7 @@ impl<K: Eq + Hash, T: Clone + Send + Sync + 'static> SingleFlight<K, T> {
     where
         F: Future<Output = T> + Send + 'static,
     {
-        let (mut result, mut steps) = {
+        let (result, mut steps) = {
             let mut jobs = self.0.lock();
             jobs.retain(|_, job| job.result.upgrade().is_some_and(|result| result.peek().is_none()));
             let known = jobs.get(&key).and_then(|job| Some((job.result.upgrade()?, job.progress.clone())));
@@ -50,20 +50,17 @@ impl<K: Eq + Hash, T: Clone + Send + Sync + 'static> SingleFlight<K, T> {
                 (result, progress)
             })
         };
-        let mut sent = Instant::now().checked_sub(STEP_INTERVAL).unwrap_or_else(Instant::now);
-        loop {
-            let step = async {
-                // Throttled: within `STEP_INTERVAL` only the newest step is sent.
-                actix_rt::time::sleep_until((sent + STEP_INTERVAL).into()).await;
-                steps.changed().await.map(|()| steps.borrow_and_update().clone())
-            };
-            tokio::select! {
-                done = &mut result => return done,
-                Ok(step) = step => {
-                    sent = Instant::now();
-                    progress(step);
-                }
+        let send_steps = async {
+            while steps.changed().await.is_ok() {
+                progress(steps.borrow_and_update().clone());
+                // Within this time only the newest step is sent.
+                actix_rt::time::sleep(STEP_INTERVAL).await;
             }
+            pending().await
+        };
+        tokio::select! {
+            done = result => done,
+            never = send_steps => never,
         }
     }
 }

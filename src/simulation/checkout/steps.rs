@@ -24,8 +24,9 @@ pub fn looking_for(repository: &str) -> String {
 /// git fetches, and says this.
 pub fn fetching(what: &str, line: &str) -> String {
     let (first, last) = FETCH;
+    let percent = |text: &str| text.split_once('%')?.0.trim().parse::<u64>().ok();
     let number = match line.split_once(':') {
-        Some(("Receiving objects", rest)) => first + (last - first) * percent(rest) / 100,
+        Some(("Receiving objects", rest)) => first + (last - first) * percent(rest).unwrap_or(0).min(100) / 100,
         Some(("Resolving deltas", _)) => last,
         _ => first,
     };
@@ -33,12 +34,6 @@ pub fn fetching(what: &str, line: &str) -> String {
 }
 
 /// git writes the files of a branch, tag or commit, and says this.
-pub fn checking_out(name: &str, line: Option<&str>) -> String {
-    let line = line.map_or_else(String::new, |line| format!(": {line}"));
-    step(8, &format!("checking {name} out{line}"))
-}
-
-fn percent(text: &str) -> u64 {
-    let percent = text.split_once('%').and_then(|(percent, _)| percent.trim().parse().ok());
-    percent.unwrap_or(0).min(100)
+pub fn checking_out(name: &str, line: &str) -> String {
+    step(8, format!("checking {name} out {line}").trim_end())
 }

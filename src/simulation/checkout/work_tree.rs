@@ -1,22 +1,23 @@
 //! A client's own copy of a project: its checkout by git.
 
-use std::ffi::{OsStr, OsString};
+use std::ffi::OsString;
 use std::io;
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::Ordering::Relaxed;
 
 use rustix::process::Resource;
+use which::which;
 
-use super::checkout_error::{CheckoutError, git_failed, machine, refused, too_large};
+use super::checkout_error::{CheckoutError, refused};
 use super::commit_resolver::ResolvedCommit;
 use super::disk;
 use super::git::LITTLE_MEMORY;
-use super::lfs;
-use super::project::Project;
-use super::repository::Repository;
+use super::project::{Project, WorldFile};
+use super::repository::{REMOTE, Repository};
 use super::revision::Revision;
-use super::world_file::WorldFile;
 use crate::shared::domain::ProjectUrl;
+use crate::simulation::config::Remote;
 use crate::simulation::process::{InstanceDir, Run};
 
 /// A git command that writes these paths of a commit, each ended by a zero byte, into a directory, with these settings, each
@@ -33,19 +34,20 @@ pub fn checkout_command(
 ) -> io::Result<Run> {
     let (list, reference) = (scratch.join("paths"), OsString::from(revision.reference()));
     std::fs::write(&list, paths)?;
-    let with = |option: &str, path: &Path| [OsStr::new(option), path.as_os_str()].join(OsStr::new(""));
-    let mut arguments = vec![with("--work-tree=", into)];
-    arguments.extend(["checkout", "--force", "--progress", "--pathspec-file-nul"].map(OsString::from));
-    arguments.extend([with("--pathspec-from-file=", &list), reference.clone()]);
-    let mut call = repository.configured(settings, &arguments);
+    let words = ["checkout", "--force", "--progress", "--pathspec-file-nul", "--pathspec-from-file"];
+    let arguments = words.map(OsString::from).into_iter().chain([list.into(), reference.clone()]);
+    let mut call = repository.configured(settings, &arguments.collect::<Vec<_>>());
     call.limits.push((Resource::Data, LITTLE_MEMORY));
-    let index = scratch.join("index").into_os_string();
-    call.spec.environment.extend([("GIT_INDEX_FILE".into(), index), ("GIT_ATTR_SOURCE".into(), reference)]);
+    call.spec.environment.extend([
+        ("GIT_WORK_TREE".into(), into.into()),
+        ("GIT_INDEX_FILE".into(), scratch.join("index").into()),
+        ("GIT_ATTR_SOURCE".into(), reference),
+    ]);
     Ok(call)
 }
 
-/// Writes a project with git, with its large files if git-lfs is there; `on_line` receives git's progress lines. Blocks its
-/// thread.
+/// Writes a project of at most so many MiB with git, with its large files if git-lfs is there; `on_line` receives git's
+/// progress lines. Blocks its thread.
 ///
 /// # Errors
 /// Why it can't be checked out.
@@ -53,45 +55,75 @@ pub async fn write(
     found: &ResolvedCommit,
     world: &ProjectUrl,
     instance: &Arc<InstanceDir>,
-    (limit, has_lfs): (u64, bool),
+    limit: u64,
     on_line: impl FnMut(&str),
 ) -> Result<Project, CheckoutError> {
     let ResolvedCommit { repository, revision, above } = found;
     let folder = if revision.folder.is_empty() { "." } else { &revision.folder };
     let paths = [folder.as_bytes(), b"\0", above].concat();
     let (root, most) = (instance.project(), limit << 20);
-    let settings = if has_lfs { lfs::settings(&repository.remote()) } else { Vec::new() };
-    let call = checkout_command(repository, revision, &paths, (instance.path(), &root), &settings);
-    let mut call = call.map_err(|error| machine(world, &error))?;
+    let settings = if which("git-lfs").is_ok() { lfs_settings(&repository.remote.lock()) } else { Vec::new() };
+    let mut call = checkout_command(repository, revision, &paths, (instance.path(), &root), &settings)?;
     call.may_block = true;
     // git-lfs stores its downloads here, shared with concurrent checkouts, and copies them into the project.
     let kept = repository.path.join("lfs");
-    let before = if has_lfs { disk::room_of(&kept) } else { 0 };
-    let mut growing = vec![(root.clone(), most)];
-    if has_lfs {
-        growing.push((kept.clone(), before.saturating_add(most.saturating_mul(2))));
-    }
+    let before = disk::room_of(&kept);
+    let growing = vec![(root.clone(), most), (kept.clone(), before.saturating_add(most.saturating_mul(2)))];
     let written = tokio::select! {
-        written = repository.run(call, on_line) => written.map(|_| true),
+        written = repository.git.run(call, on_line) => written.map(|_| true),
         () = disk::outgrown(growing) => Ok(false),
     };
-    if has_lfs && disk::room_of(&kept) > before {
-        repository.growth.notify_one();
+    if disk::room_of(&kept) > before {
+        repository.has_grown.store(true, Relaxed);
     }
     let size = disk::room_of(&root);
     // git's attributes may make it larger than the commit, and a Git host may send more than it should.
-    if !written.map_err(|source| git_failed(world, &source))? || size > most {
-        return Err(too_large("The project", limit));
+    if !written? || size > most {
+        return Err(refused(format!("The project is larger than {limit} MiB")));
     }
-    let folder = root.join(&revision.folder);
-    let pointers = lfs::pointers(&folder);
     Ok(Project {
-        world: WorldFile::open(&root, &root.join(revision.world_path(world))).map_err(refused)?,
+        world: WorldFile::open(&root, &root.join(revision.path_of(&format!("worlds/{}", world.world()))))
+            .map_err(refused)?,
         size,
-        warning: (pointers > 0).then(|| lfs::warning(pointers, has_lfs)),
         url: world.clone(),
         revision: revision.clone(),
-        folder,
+        folder: root.join(&revision.folder),
         instance: Arc::clone(instance),
     })
+}
+
+/// Settings with which a checkout loads large files from where the repository is, whatever the repository says.
+fn lfs_settings(remote: &Remote) -> Vec<String> {
+    let location = &remote.location;
+    let url = match remote.protocol {
+        "file" => format!("file://{location}"),
+        _ => format!("{}.git/info/lfs", location.trim_end_matches('/').trim_end_matches(".git")),
+    };
+    vec![
+        format!("lfs.url={url}"),
+        // For a local directory, git-lfs reads this.
+        format!("remote.{REMOTE}.url={url}"),
+        "filter.lfs.process=git-lfs filter-process".to_owned(),
+        "filter.lfs.smudge=git-lfs smudge -- %f".to_owned(),
+        "filter.lfs.clean=git-lfs clean -- %f".to_owned(),
+        "filter.lfs.required=false".to_owned(),
+        // A file that can't be loaded stays a pointer.
+        "lfs.skipdownloaderrors=true".to_owned(),
+    ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn large_files_come_from_where_the_repository_is() {
+        let first = |location: &str, protocol| {
+            let location = location.to_owned();
+            lfs_settings(&Remote { location, protocol })[0].clone()
+        };
+        assert_eq!(first("https://github.com/l/a.git", "https"), "lfs.url=https://github.com/l/a.git/info/lfs");
+        assert_eq!(first("https://forge.org/l/a", "https"), "lfs.url=https://forge.org/l/a.git/info/lfs");
+        assert_eq!(first("/mirror/l/a", "file"), "lfs.url=file:///mirror/l/a");
+    }
 }

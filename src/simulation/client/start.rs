@@ -80,7 +80,7 @@ impl Session {
         let me = ctx.address();
         // A full mailbox drops this line of progress.
         let progress = move |text: String| drop(me.try_send(WebotsEvent::Progress(text)));
-        let job = self.server.checkouts.start(world, instance, progress);
+        let job = self.server.checkouts.start(world, instance, Arc::new(progress));
         job.into_actor(self)
             .map(|result, this, ctx| match result {
                 Ok(Ok(project)) => this.launch(project, ctx),
@@ -104,9 +104,6 @@ impl Session {
         log::info!("{}: {} is for Webots {}", self.name(), project.world.path.display(), project.world.version);
         let version = project.world.version.clone();
         slot.lease.update(|one| one.version = Some(version));
-        if let Some(warning) = &project.warning {
-            self.text(protocol::loading(warning));
-        }
         self.text(protocol::loading("webots is starting"));
         let gpu = self.take_gpu(&slot.lease);
         let spec = LaunchSpec {

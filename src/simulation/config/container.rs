@@ -3,15 +3,13 @@
 use serde::{Deserialize, Serialize};
 
 use crate::shared::config::keys::keys;
-use crate::shared::config::{ExpandedPath, one_or_many, whole};
+use crate::shared::config::{one_or_many, whole};
 
 keys! {
 /// How simulations run in containers.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", default, deny_unknown_fields)]
 pub struct ContainerSettings {
-    /// Directory of templates; the built-in template replaces a file that is missing there. Default: none.
-    pub templates: Option<ExpandedPath> = None,
     /// The image of Webots for a world whose project has no Dockerfile. `{version}` is that of the world, such as R2023b,
     /// `{ubuntu}` the Ubuntu that the image of that version has. Default: `cyberbotics/webots.cloud:{version}-ubuntu{ubuntu}`.
     pub image: String = "cyberbotics/webots.cloud:{version}-ubuntu{ubuntu}".to_owned(),
@@ -19,8 +17,6 @@ pub struct ContainerSettings {
     pub editor_image: String = "benjamindeleze/theia-test:test3".to_owned(),
     /// Webots' launcher in the image. Default: `webots`.
     pub program: String = "webots".to_owned(),
-    /// Whether to use the debug variants of the templates, which help to debug a project. Default: false.
-    pub debug: bool = false,
     /// The display of Webots: a virtual one inside (`xvfb-run` of its image), or that of the machine. Default: virtual.
     pub display: ContainerDisplay = ContainerDisplay::default(),
     /// The network that containers reach. Default: internet.

@@ -1,4 +1,4 @@
-//! The build plan of a checked-out project: its Dockerfiles, and the files that they need.
+//! The build plan of a checked-out project: its Dockerfiles, and the files that they need; and the paths of its parts.
 
 use std::fs::{File, OpenOptions};
 use std::io::{ErrorKind, Write};
@@ -7,11 +7,11 @@ use std::path::{Path, PathBuf};
 
 use nix::fcntl::OFlag;
 
+use super::docker::StartError;
 use super::dockerfile::Dockerfile;
-use super::start_error::StartError;
-use super::templates::{self, CONTROLLER_DOCKERFILE, DOCKERFILE, LAUNCHER, Template};
 use super::webots_yml::{ProjectKind, WebotsYml, text_of};
-use crate::simulation::config::ContainerSettings;
+use crate::shared::text::one_line;
+use crate::simulation::checkout::Project;
 
 /// The path of a project in its container, as existing Dockerfiles expect.
 pub const PROJECT_PATH: &str = "/usr/local/webots-project";
@@ -21,8 +21,6 @@ pub const PROJECT_PATH: &str = "/usr/local/webots-project";
 pub struct BuildPlan {
     /// What its `webots.yml` requests.
     pub yml: WebotsYml,
-    /// The template for that.
-    pub template: Template,
     /// The image of Webots.
     pub image: ImageBuild,
     /// The image of the controllers.
@@ -41,31 +39,40 @@ pub struct ImageBuild {
     pub arguments: Vec<String>,
 }
 
+/// The paths of the parts of a project.
+#[derive(Debug)]
+pub struct ProjectPaths {
+    /// Its world, in its directory.
+    pub world: String,
+    /// Its directory.
+    pub project: PathBuf,
+    /// The directory that an editor shows.
+    pub edited: PathBuf,
+}
+
 /// Arguments of the Dockerfile of a participant's controller.
 const PARTICIPANT: [&str; 2] = ["WEBOTS_CONTROLLER_URL=participant", "DEFAULT_CONTROLLER=participant"];
+/// The Dockerfile of a project with a Makefile that has none.
+const DOCKERFILE: &str = include_str!("../../../config/simulation/docker/Dockerfile.default");
+/// The Dockerfile of a competition's controllers that have none.
+const CONTROLLER_DOCKERFILE: &str = include_str!("../../../config/simulation/docker/Dockerfile.controller");
+/// The launcher of a participant's controller.
+const LAUNCHER: &str = "remote_controller_launcher.py";
+const LAUNCHER_TEXT: &str = include_str!("../../../config/simulation/docker/remote_controller_launcher.py");
 /// The Dockerfile for a project that has nothing to build.
 const NO_DOCKERFILE: &str = "ARG WEBOTS_DEFAULT_IMAGE\nFROM ${WEBOTS_DEFAULT_IMAGE}\n";
-/// Files with which a project would configure its containers itself.
-const IGNORED: [&str; 3] = ["docker-compose.yml", "docker-compose.yaml", ".env"];
 
 impl BuildPlan {
     /// Reads a project, and adds the files that a competition needs. Blocks.
     ///
     /// # Errors
-    /// The problem, in the project or in the administrator's template.
-    pub fn read(project: &Path, settings: &ContainerSettings, owner: &str) -> Result<Self, StartError> {
-        let mut yml = WebotsYml::read(project);
-        let ignored = IGNORED.iter().filter(|name| project.join(name).symlink_metadata().is_ok());
-        yml.warnings.extend(ignored.map(|name| format!("{name} of the project is not used here")));
+    /// The problem of the project.
+    pub fn read(project: &Path, owner: &str) -> Result<Self, StartError> {
+        let yml = WebotsYml::read(project);
         let has_makefile = project.join("Makefile").is_file();
-        let dockerfile = match text_of(&project.join("Dockerfile"))? {
-            None if has_makefile || templates::own(settings, DOCKERFILE).is_some() => {
-                Some(templates::text(settings, DOCKERFILE)?.into_owned())
-            }
-            own => own,
-        };
+        let dockerfile = text_of(&project.join("Dockerfile"))?.or_else(|| has_makefile.then(|| DOCKERFILE.to_owned()));
         let is_competition = yml.kind == ProjectKind::Competition;
-        let controller = is_competition.then(|| competition(project, settings)).transpose()?;
+        let controller = is_competition.then(|| competition(project)).transpose()?;
         let build = |text: &str, folder, more: &[&str]| {
             let mut arguments =
                 vec![format!("PROJECT_PATH={PROJECT_PATH}"), format!("MAKE={}", u8::from(has_makefile))];
@@ -77,27 +84,44 @@ impl BuildPlan {
             None => build(NO_DOCKERFILE, None, &[])?,
         };
         let controller = controller.map(|text| build(&text, Some("controllers"), &PARTICIPANT)).transpose()?;
-        let template = templates::compose(settings, yml.kind).map_err(StartError::Server)?;
-        Ok(Self { yml, template, image, controller })
+        Ok(Self { yml, image, controller })
+    }
+}
+
+impl ProjectPaths {
+    /// Finds the parts. Makes the participant of a competition an external controller.
+    ///
+    /// # Errors
+    /// When one does not exist or can't be mounted, as text for the client.
+    pub fn of(yml: &WebotsYml, project: &Project) -> Result<Self, StartError> {
+        let root = project.folder.canonicalize().map_err(|error| error.to_string())?;
+        let world = world_in(&root, project)?;
+        let edited = match yml.kind {
+            ProjectKind::Default => root.clone(),
+            ProjectKind::Editor => inside(&root, &yml.folder_in_project())?,
+            ProjectKind::Competition => {
+                open_participant(&root.join(&world))?;
+                participant_folder(project)
+            }
+        };
+        Ok(Self { world, project: mountable(root)?, edited: mountable(edited)? })
     }
 }
 
 /// The Dockerfile of a competition's controllers. Writes the launcher to the paths from which this one and the
 /// project's can copy it.
-fn competition(project: &Path, settings: &ContainerSettings) -> Result<String, String> {
+fn competition(project: &Path) -> Result<String, String> {
     let controllers = inside(project, Path::new("controllers"))?;
-    let launcher = templates::text(settings, LAUNCHER)?;
     for folder in [project, &controllers] {
         // The project's own file stays.
-        match File::create_new(folder.join(LAUNCHER)).and_then(|mut file| file.write_all(launcher.as_bytes())) {
+        match File::create_new(folder.join(LAUNCHER)).and_then(|mut file| file.write_all(LAUNCHER_TEXT.as_bytes())) {
             Err(error) if error.kind() != ErrorKind::AlreadyExists => {
                 return Err(format!("{LAUNCHER} can't be written: {error}"));
             }
             _ => {}
         }
     }
-    let own = text_of(&controllers.join("Dockerfile"))?;
-    own.map_or_else(|| templates::text(settings, CONTROLLER_DOCKERFILE).map(String::from), Ok)
+    Ok(text_of(&controllers.join("Dockerfile"))?.unwrap_or_else(|| CONTROLLER_DOCKERFILE.to_owned()))
 }
 
 /// A directory of the project, which must not be a symlink to a path outside.
@@ -117,7 +141,7 @@ pub fn inside(project: &Path, folder: &Path) -> Result<PathBuf, String> {
 ///
 /// # Errors
 /// When the file can't be read or written: the project's fault if it is no text, or its image has closed or replaced it.
-pub fn open_participant(world: &Path) -> Result<(), StartError> {
+fn open_participant(world: &Path) -> Result<(), StartError> {
     let open = || {
         let text = std::fs::read_to_string(world)?.replace("controller \"participant\"", "controller \"<extern>\"");
         let flags = OFlag::O_NOFOLLOW.bits();
@@ -135,6 +159,37 @@ pub fn open_participant(world: &Path) -> Result<(), StartError> {
 pub fn image_of(pattern: &str, version: &str) -> String {
     let ubuntu = if version < "R2023b" { "20.04" } else { "22.04" };
     pattern.replace("{version}", version).replace("{ubuntu}", ubuntu)
+}
+
+/// The directory of a competition's participant. It is not in the project, where a world's program could replace it by
+/// a symlink before the controller is restarted.
+pub fn participant_folder(project: &Project) -> PathBuf {
+    project.instance.path().join("edited")
+}
+
+/// The world's path in its project's directory.
+///
+/// # Errors
+/// When it does not exist, as text for the client.
+fn world_in(root: &Path, project: &Project) -> Result<String, String> {
+    let name = project.world.path.file_name().unwrap_or_default().to_string_lossy();
+    let path = root.join("worlds").join(&*name).canonicalize().ok().filter(|path| path.is_file());
+    let path = path.ok_or_else(|| format!("The image of this project has no worlds/{name}"))?;
+    let inside = path.strip_prefix(root).ok().and_then(Path::to_str).map(str::to_owned);
+    inside.ok_or_else(|| "The world is behind a link that leads out of its project".to_owned())
+}
+
+/// Checks that compose can mount a directory: `:` would end its path, and a line break its variable.
+///
+/// # Errors
+/// When not, as text for the client.
+fn mountable(folder: PathBuf) -> Result<PathBuf, String> {
+    let is_plain = |name: &str| !name.contains(|letter: char| letter == ':' || letter.is_control());
+    if folder.to_str().is_some_and(is_plain) {
+        return Ok(folder);
+    }
+    let name = one_line(&folder.file_name().unwrap_or_default().to_string_lossy());
+    Err(format!("The path of the folder {name} of this project has a ':' or a line break, which containers can't have"))
 }
 
 #[cfg(test)]
@@ -156,7 +211,7 @@ mod tests {
     }
 
     fn read(project: &Path) -> Result<BuildPlan, StartError> {
-        BuildPlan::read(project, &ContainerSettings::default(), "x")
+        BuildPlan::read(project, "x")
     }
 
     #[test]
@@ -169,14 +224,12 @@ mod tests {
                 && plan.yml.warnings.is_empty()
         );
         std::fs::write(project.path().join("Makefile"), "all:\n").unwrap();
-        std::fs::write(project.path().join(".env"), "A=b").unwrap();
         let plan = read(project.path()).unwrap();
         assert!(
             plan.image.arguments.contains(&"MAKE=1".to_owned())
                 && plan.image.folder == Some("")
                 && plan.image.dockerfile.text.contains("LABEL webots-fleet.owner=x")
         );
-        assert_eq!(plan.yml.warnings, [".env of the project is not used here"]);
         std::fs::write(project.path().join("Dockerfile"), "FROM mine\n").unwrap();
         let plan = read(project.path()).unwrap();
         assert!(plan.image.dockerfile.text.starts_with("FROM mine\nLABEL webots-fleet.owner=x\nRUN "));

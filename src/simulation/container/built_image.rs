@@ -1,15 +1,23 @@
-//! An image that this server has built, and how its containers start.
+//! An image that this server has built: how its containers start, and what they may change of it.
 //!
 //! Simulations run as the server's user, so that the server can read, measure and remove what they write, and so that
 //! no program in a directory of this machine ever runs as root. Official images of Webots keep assets and settings in
 //! the home directory of root, so each container begins with a home directory that has what that of the image's own
 //! user has.
 
+use std::path::Path;
+use std::time::Duration;
+
+use actix_rt::task::spawn_blocking;
 use serde::Deserialize;
 use serde_json::Value;
 
+use super::docker::{Docker, DockerError, SHORT_TIMEOUT, StartError, blame};
 use super::dockerfile::NO_VOLUME;
+use super::owned_resources::REMOVE;
 use crate::shared::text::one_line;
+use crate::simulation::checkout::{Project, outgrown};
+use crate::simulation::process::remove_tree;
 
 /// An image: its name, and the configuration of its programs, as Docker tells it.
 #[derive(Debug, Default, Deserialize)]
@@ -32,6 +40,8 @@ pub struct BuiltImage {
 
 /// The first output of a container when it runs: from then on its network has an address.
 pub const RUNS: &str = "webots-fleet: the container runs";
+/// Timeout of a copy out of an image.
+const COPY_TIMEOUT: Duration = Duration::from_mins(2);
 /// The first program of a container.
 const START_AT_HOME: &str = include_str!("../../../config/simulation/docker/start-at-home");
 
@@ -60,6 +70,50 @@ impl BuiltImage {
     /// The command of its containers if none is given.
     pub fn command(&self) -> Vec<String> {
         self.cmd.clone().unwrap_or_default()
+    }
+}
+
+/// Copies a directory of an image to `to`, where containers can change it: the build may have created files in it. `to` is
+/// created or replaced, by a temporary directory of the project's instance. `name` is the compose project, which the
+/// container for this is named after; `size` the limit, in MiB.
+///
+/// # Errors
+/// Why not, as text for the client.
+pub async fn export(
+    image: &BuiltImage,
+    docker: &Docker,
+    name: &str,
+    from: &Path,
+    project: &Project,
+    (to, size): (&Path, u64),
+) -> Result<(), StartError> {
+    let name = format!("{name}-{:08x}", rand::random::<u32>());
+    let create = ["create", "--name", &name, "--network", "none", &image.name, "true"];
+    docker.run(&create, SHORT_TIMEOUT).await.map_err(|error| blame(true, error))?;
+    let through = project.instance.path().join("copied");
+    let source = format!("{name}:{}/.", from.display());
+    let words = ["cp", &source, &through.to_string_lossy()].map(str::to_owned);
+    tokio::select! {
+        copied = docker.run(&words, COPY_TIMEOUT) => drop(copied.map_err(|error| not_copied(error, from))?),
+        () = outgrown(vec![(through.clone(), size << 20)]) => {
+            return Err(format!("The project in its image is larger than {size} MiB (projectSize)").into());
+        }
+    }
+    docker.run(&[&REMOVE[..], &[&name]].concat(), SHORT_TIMEOUT).await?;
+    let to = to.to_owned();
+    Ok(spawn_blocking(move || remove_tree(&to).and_then(|()| std::fs::rename(&through, &to))).await??)
+}
+
+fn not_copied(error: DockerError, from: &Path) -> StartError {
+    let from = from.display();
+    match error {
+        DockerError::Failed { message, .. }
+            if message.contains("ould not find") || message.contains("o such container:path") =>
+        {
+            format!("The image of this project has no folder {from}: its Dockerfile has to COPY the project there")
+                .into()
+        }
+        error => blame(true, error),
     }
 }
 

@@ -1,5 +1,4 @@
-//! The files of a compose project: the template, its variables, and the settings that override the template for each
-//! service.
+//! The compose project of a simulation: its services, and what each may do.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::os::unix::fs::MetadataExt;
@@ -9,12 +8,10 @@ use std::sync::Arc;
 use serde_json::{Value, json};
 use which::which;
 
-use super::build_plan::PROJECT_PATH;
+use super::build_plan::{PROJECT_PATH, ProjectPaths};
 use super::built_image::BuiltImage;
-use super::project_paths::ProjectPaths;
-use super::start_error::StartError;
-use super::templates::{CONTROLLER, Template, WEBOTS};
-use super::webots_yml::WebotsYml;
+use super::docker::StartError;
+use super::webots_yml::{ProjectKind, WebotsYml};
 use crate::simulation::checkout::Project;
 use crate::simulation::config::{ContainerDisplay, EDITOR_PORT, SimulationConfig};
 use crate::simulation::machine::sensors::Gpu;
@@ -41,8 +38,6 @@ pub struct ComposeProject {
     pub request: ContainerRequest,
     /// What its project's `webots.yml` requests.
     pub yml: WebotsYml,
-    /// The template for that.
-    pub template: Template,
     /// The image of Webots.
     pub image: BuiltImage,
     /// The image of a competition's controller.
@@ -60,11 +55,12 @@ pub struct GpuAccess {
     pub groups: Option<BTreeSet<u32>>,
 }
 
-/// Environment variables: names and values.
-pub type Variables = Vec<(&'static str, String)>;
-
-/// Size of shared memory: what a browser's engine inside of Webots needs.
-const SHARED_MEMORY: &str = "256m";
+/// The service of Webots.
+pub const WEBOTS: &str = "webots";
+/// The service of a participant's controller.
+pub const CONTROLLER: &str = "controller";
+/// The service of an editor, and the port that it listens on.
+const EDITOR: (&str, u16) = ("theia", 3000);
 /// Runs a program on a virtual display; part of the images of Webots.
 const VIRTUAL_DISPLAY: [&str; 2] = ["xvfb-run", "--auto-servernum"];
 /// The directory with the sockets of the machine's displays.
@@ -78,28 +74,21 @@ const NVIDIA: &str = "/dev/nvidiactl";
 const DRI: &str = "/dev/dri";
 
 impl ComposeProject {
-    /// Writes the files, and returns the options by which compose finds them, and the variables that it has to have: those of
-    /// this server's environment would count for more than a file of them. Blocks.
+    /// Writes the file of the project. Returns the options by which compose finds it, and the names of the services. Blocks.
     ///
     /// # Errors
     /// When a path of the project can't be used, or a file can't be written.
-    pub fn write(&self) -> Result<(Vec<String>, Variables), StartError> {
+    pub fn write(&self) -> Result<(Vec<String>, Vec<&'static str>), StartError> {
         let paths = ProjectPaths::of(&self.yml, &self.request.project)?;
-        let folder = self.request.project.instance.path().join("compose");
-        std::fs::create_dir_all(&folder)?;
         std::fs::create_dir_all(self.exchange())?;
-        let path = |name: &str| folder.join(name).to_string_lossy().into_owned();
-        let (template, overridden) = (path("docker-compose.yml"), path("override.json"));
-        let display = match self.config.container.display {
-            ContainerDisplay::Virtual => VIRTUAL_DISPLAY.map(str::to_owned).into(),
-            ContainerDisplay::Machine => Vec::new(),
-        };
-        let world = format!("{PROJECT_PATH}/{}", paths.world);
-        let command = [display, self.request.command.clone(), vec![world]].concat();
-        std::fs::write(&template, self.template.text.as_bytes())?;
-        std::fs::write(&overridden, self.overridden(&command).to_string())?;
-        let options = ["--file", &template, "--file", &overridden].map(str::to_owned);
-        Ok((options.into(), self.variables(&command, &paths)))
+        let services = self.services(&paths);
+        let network = json!({ "default": { "external": true, "name": self.config.container.network.name() } });
+        let project = json!({ "services": services, "networks": network });
+        let file = self.request.project.instance.path().join("compose.json");
+        // Compose would replace what looks like a variable.
+        std::fs::write(&file, project.to_string().replace('$', "$$"))?;
+        let options = ["--project-name", &self.name, "--file", &file.to_string_lossy()].map(str::to_owned);
+        Ok((options.into(), services.into_keys().collect()))
     }
 
     /// The directory through which Webots and a controller in another container communicate.
@@ -107,55 +96,61 @@ impl ComposeProject {
         self.request.project.instance.path().join("ipc")
     }
 
-    /// The variables of the template.
-    fn variables(&self, command: &[String], paths: &ProjectPaths) -> Variables {
-        let command = command.join(" ");
-        let plain = |letter: char| letter.is_alphanumeric() || " -_./=:+,".contains(letter);
-        // A template may pass it to a shell, which interprets quotes, dollars and backslashes.
-        let command = if command.chars().all(plain) { command } else { String::new() };
-        let path = |path: &Path| path.to_string_lossy().into_owned();
-        let (config, port) = (&self.config, self.request.port);
-        vec![
-            ("IMAGE", self.image.name.clone()),
-            ("CONTROLLER_IMAGE", self.controller.as_ref().map_or_else(String::new, |image| image.name.clone())),
-            ("PROJECT_PATH", PROJECT_PATH.to_owned()),
-            ("PROJECT", path(&paths.project)),
-            ("BIND", config.bind_of_containers().to_string()),
-            ("PORT", port.to_string()),
-            ("COMPOSE_PROJECT_NAME", self.name.clone()),
-            ("WEBOTS", command),
-            ("THEIA_IMAGE", config.container.editor_image.clone()),
-            ("THEIA_VOLUME", self.yml.folder.clone()),
-            ("THEIA_FOLDER", path(&paths.edited)),
-            ("THEIA_PORT", (port + EDITOR_PORT).to_string()),
-            ("IPC", path(&self.exchange())),
-            ("DISPLAY", display(config, self.request.gpu.as_ref()).unwrap_or_default()),
-        ]
+    /// The services. An editor sees nothing of the project but its directory; a controller also has that of Webots.
+    fn services(&self, paths: &ProjectPaths) -> BTreeMap<&'static str, Service> {
+        let (config, port, access) = (&self.config, self.request.port, GpuAccess::find());
+        let mount = |folder: &Path, to: &str| format!("{}:{to}", folder.display());
+        let published = |outside: u16, to: u16| json!([format!("{}:{outside}:{to}", config.bind_of_containers())]);
+        // Webots up to R2023a uses the first one, later ones make directories for users and ports in the second one.
+        let exchange =
+            || [format!("/tmp/webots-{port}"), "/tmp/webots".to_owned()].map(|to| mount(&self.exchange(), &to));
+        let service = |name, image: &str, volumes, environment: &[(&'static str, String)]| {
+            let mut service = protected(name, &access, self.request.gpu.as_ref(), config, volumes, environment);
+            service.insert("container_name", json!(container_of(&self.name, name)));
+            service.insert("image", json!(image));
+            service
+        };
+        let of_controller = self.controller.iter().flat_map(|_| exchange());
+        let volumes = of_controller.chain([mount(&paths.project, PROJECT_PATH)]).collect();
+        let mut webots = service(WEBOTS, &self.image.name, volumes, &[]);
+        webots.insert("working_dir", json!(PROJECT_PATH));
+        webots.insert("ports", published(port, port));
+        webots.insert("entrypoint", json!(self.image.entrypoint()));
+        webots.insert("command", json!(self.command(paths)));
+        let mut services = BTreeMap::from([(WEBOTS, webots)]);
+        if let Some(image) = &self.controller {
+            let participant = mount(&paths.edited, &format!("/usr/local/{}", self.yml.folder));
+            // webots-controller finds Webots by its port, and takes to Webots' console what the participant prints.
+            let environment = [
+                ("PORT", port.to_string()),
+                ("WEBOTS_CONTROLLER_URL", "participant".to_owned()),
+                ("WEBOTS_STDOUT_REDIRECT", "1".to_owned()),
+                ("WEBOTS_STDERR_REDIRECT", "1".to_owned()),
+            ];
+            let volumes = exchange().into_iter().chain([participant]).collect();
+            let mut controller = service(CONTROLLER, &image.name, volumes, &environment);
+            // A program that sees a terminal prints each line at once.
+            controller.insert("tty", json!(true));
+            controller.insert("entrypoint", json!(image.entrypoint()));
+            controller.insert("command", json!(image.command()));
+            services.insert(CONTROLLER, controller);
+        }
+        if self.yml.kind != ProjectKind::Default {
+            let shown = vec![mount(&paths.edited, "/home/project/webots-project")];
+            let mut editor = service(EDITOR.0, &config.container.editor_image, shown, &[]);
+            editor.insert("ports", published(port + EDITOR_PORT, EDITOR.1));
+            services.insert(EDITOR.0, editor);
+        }
+        services
     }
 
-    /// The settings of each service, which override the template.
-    fn overridden(&self, command: &[String]) -> Value {
-        let access = GpuAccess::find();
-        let service = |(name, has_command): (&String, &bool)| {
-            let mut service = protected(name, &access, self.request.gpu.as_ref(), &self.config);
-            service.insert("container_name", json!(container_of(&self.name, name)));
-            let built = match name.as_str() {
-                WEBOTS => Some((&self.image, command.to_vec())),
-                CONTROLLER => self.controller.as_ref().map(|image| (image, image.command())),
-                _ => None,
-            };
-            if let Some((image, command)) = built {
-                let plain =
-                    |words: Vec<String>| json!(words.iter().map(|word| word.replace('$', "$$")).collect::<Vec<_>>());
-                service.insert("entrypoint", plain(image.entrypoint()));
-                // With an entry point here the image's own command does not count.
-                service.extend((!has_command).then(|| ("command", plain(command))));
-            }
-            (name.clone(), json!(service))
+    /// The command of Webots.
+    fn command(&self, paths: &ProjectPaths) -> Vec<String> {
+        let display = match self.config.container.display {
+            ContainerDisplay::Virtual => VIRTUAL_DISPLAY.map(str::to_owned).into(),
+            ContainerDisplay::Machine => Vec::new(),
         };
-        let services: serde_json::Map<String, Value> = self.template.services.iter().map(service).collect();
-        let network = json!({ "default": { "external": true, "name": self.config.container.network.name() } });
-        json!({ "services": services, "networks": network })
+        [display, self.request.command.clone(), vec![format!("{PROJECT_PATH}/{}", paths.world)]].concat()
     }
 }
 
@@ -169,16 +164,20 @@ impl GpuAccess {
     }
 }
 
-/// The display of the machine, where that is asked for.
-fn display(config: &SimulationConfig, gpu: Option<&Gpu>) -> Option<String> {
-    let is_machine = config.container.display == ContainerDisplay::Machine;
-    is_machine.then(|| config.display_on(gpu.map(|gpu| gpu.index)))
-}
-
-/// The settings of the service with this name, whatever its template has.
-fn protected(name: &str, access: &GpuAccess, gpu: Option<&Gpu>, config: &SimulationConfig) -> Service {
+/// The settings of the service with this name, with these mounts and variables.
+fn protected(
+    name: &str,
+    access: &GpuAccess,
+    gpu: Option<&Gpu>,
+    config: &SimulationConfig,
+    mut volumes: Vec<String>,
+    environment: &[(&'static str, String)],
+) -> Service {
     let (settings, limits) = (&config.container, &config.limits);
     let memory = format!("{}m", limits.memory.unwrap_or(DEFAULT_MEMORY));
+    // Programs have to write there.
+    let in_memory = [("/tmp", limits.disk), ("/var/tmp", limits.disk), ("/run", 16)]
+        .map(|(path, size)| format!("{path}:rw,exec,nosuid,nodev,mode=1777,size={size}m"));
     let mut service = Service::from_iter([
         ("restart", json!("no")),
         ("privileged", json!(false)),
@@ -187,8 +186,9 @@ fn protected(name: &str, access: &GpuAccess, gpu: Option<&Gpu>, config: &Simulat
         ("cap_add", json!(settings.capabilities)),
         ("security_opt", json!([format!("no-new-privileges:{}", !settings.new_privileges)])),
         ("user", json!(format!("{}:{}", nix::unistd::getuid(), nix::unistd::getgid()))),
-        ("tmpfs", json!(memory_folders(limits.disk))),
-        ("shm_size", json!(SHARED_MEMORY)),
+        ("tmpfs", json!(in_memory)),
+        // What a browser's engine inside of Webots needs.
+        ("shm_size", json!("256m")),
         ("mem_limit", json!(memory)),
         ("memswap_limit", json!(memory)),
         ("pids_limit", json!(limits.processes)),
@@ -200,14 +200,15 @@ fn protected(name: &str, access: &GpuAccess, gpu: Option<&Gpu>, config: &Simulat
         ("healthcheck", json!({ "disable": true })),
     ]);
     service.extend(limits.cores.map(|cores| ("cpus", json!(cores))));
-    let mut environment = BTreeMap::from(ENVIRONMENT.map(|(name, value)| (name, value.to_owned())));
+    let mut environment: BTreeMap<_, _> = environment.iter().cloned().collect();
+    environment.extend(ENVIRONMENT.map(|(name, value)| (name, value.to_owned())));
     // The entry points of the images of Webots and of controllers create it.
     let home = if [WEBOTS, CONTROLLER].contains(&name) { "/tmp/home" } else { "/tmp" };
     environment.insert("HOME", home.to_owned());
     if name == WEBOTS {
-        let mut volumes: Vec<String> = settings.mounts.clone();
-        if let Some(display) = display(config, gpu) {
-            environment.insert("DISPLAY", display);
+        volumes.extend(settings.mounts.clone());
+        if settings.display == ContainerDisplay::Machine {
+            environment.insert("DISPLAY", config.display_on(gpu.map(|gpu| gpu.index)));
             volumes.push(format!("{DISPLAYS}:{DISPLAYS}"));
             if let Some(authority) = std::env::var_os("XAUTHORITY") {
                 let authority = authority.to_string_lossy().into_owned();
@@ -215,15 +216,15 @@ fn protected(name: &str, access: &GpuAccess, gpu: Option<&Gpu>, config: &Simulat
                 environment.insert("XAUTHORITY", authority);
             }
         }
-        service.insert("volumes", json!(volumes));
     }
+    service.insert("volumes", json!(volumes));
     if name == WEBOTS && settings.gpu {
         if let Some(groups) = &access.groups {
             service.insert("devices", json!(["/dev/dri:/dev/dri"]));
             service.insert("group_add", json!(groups.iter().map(u32::to_string).collect::<Vec<_>>()));
         }
         if access.nvidia {
-            // An image or a template may ask for all by this variable.
+            // An image may ask for all by this variable.
             environment.extend(gpu.map(|gpu| ("NVIDIA_VISIBLE_DEVICES", gpu.id.clone())));
             let (key, value) = gpu.map_or(("count", json!("all")), |gpu| ("device_ids", json!([gpu.id])));
             let devices = json!({ "driver": "nvidia", key: value, "capabilities": ["gpu"] });
@@ -233,12 +234,6 @@ fn protected(name: &str, access: &GpuAccess, gpu: Option<&Gpu>, config: &Simulat
     }
     service.insert("environment", json!(environment));
     service
-}
-
-/// Directories in memory with a size limit, into which programs must write.
-fn memory_folders(size: u64) -> [String; 3] {
-    [("/tmp", size), ("/var/tmp", size), ("/run", 16)]
-        .map(|(path, size)| format!("{path}:rw,exec,nosuid,nodev,mode=1777,size={size}m"))
 }
 
 /// The name of the container of a service of a compose project.
@@ -267,7 +262,7 @@ mod tests {
         config.container = ContainerSettings { display: ContainerDisplay::Machine, ..ContainerSettings::default() };
         let access = GpuAccess { nvidia: true, groups: None };
         let gpu = Gpu { index: 1, id: "GPU-b".to_owned(), ..Gpu::default() };
-        let service = |gpu: Option<&Gpu>, name: &str| json!(protected(name, &access, gpu, &config));
+        let service = |gpu: Option<&Gpu>, name: &str| json!(protected(name, &access, gpu, &config, Vec::new(), &[]));
         let devices = |service: &Value| service["deploy"]["resources"]["reservations"]["devices"].clone();
         let one = service(Some(&gpu), "webots");
         let expected = json!([{ "driver": "nvidia", "device_ids": ["GPU-b"], "capabilities": ["gpu"] }]);

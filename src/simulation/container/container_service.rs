@@ -5,22 +5,18 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use actix_rt::task::spawn_blocking;
+use tokio::runtime::Handle;
 use tokio::sync::Semaphore;
 use tokio_util::task::AbortOnDropHandle;
 
-use super::build_plan::{BuildPlan, ImageBuild, PROJECT_PATH};
+use super::build_plan::{BuildPlan, ImageBuild, PROJECT_PATH, participant_folder};
+use super::built_image::export;
 use super::compose_project::{ComposeProject, ContainerRequest};
-use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
+use super::docker::{Docker, DockerError, SHORT_TIMEOUT, StartError, blame, daemon_fault};
 use super::image::Images;
-use super::image_export::export;
-use super::orphan_cleanup::{ActiveProjects, run_cleanup};
-use super::owned_resources::{ResourceOwner, sweep_all};
+use super::owned_resources::{ProjectGuard, ResourceOwner, sweep_all};
 use super::packet_filter;
-use super::project_paths::participant_folder;
 use super::simulation_containers::SimulationContainers;
-use super::start_error::{StartError, blame};
-use super::steps;
-use super::templates;
 use super::webots_yml::ProjectKind;
 use crate::simulation::checkout::OnProgress;
 use crate::simulation::config::SimulationConfig;
@@ -28,17 +24,17 @@ use crate::simulation::config::SimulationConfig;
 /// Creates the containers of simulations.
 pub struct ContainerService {
     docker: Docker,
-    owner: ResourceOwner,
     /// The owner of these containers, for a process that removes them after the server's end.
     pub run: ResourceOwner,
     images: Arc<Images>,
-    active: ActiveProjects,
+    /// Removes containers.
+    runtime: Handle,
     /// What containers can do because the packet filter is missing; `None` if it is loaded.
     pub shortcoming: Option<String>,
     /// Limits concurrent runs of compose.
     turns: Semaphore,
     config: Arc<SimulationConfig>,
-    _keeper: AbortOnDropHandle<()>,
+    _removes_old_images: AbortOnDropHandle<()>,
 }
 
 /// The option by which containers in a network can't reach each other.
@@ -56,28 +52,21 @@ impl ContainerService {
         let docker = Docker::find(run)?;
         let owner = ResourceOwner::of(&config.cache_dir.0);
         sweep_all(&owner);
-        let this_run = owner.run();
         let shortcoming = packet_filter::missing();
         if let Some(why) = &shortcoming {
             log::warn!("{why}");
         }
-        for fault in templates::faults(&config.container) {
-            log::error!("{fault}");
-        }
-        let images = Images::new(docker.clone(), owner.clone(), Arc::clone(&config));
-        let (images, active) = (Arc::new(images), ActiveProjects::default());
-        let keeper = run_cleanup(owner.clone(), active.clone(), Arc::clone(&images), Arc::clone(&config));
-        let keeper = AbortOnDropHandle::new(actix_rt::spawn(keeper));
+        let images = Arc::new(Images::new(docker.clone(), owner.clone(), Arc::clone(&config)));
+        let remover = AbortOnDropHandle::new(actix_rt::spawn(Arc::clone(&images).remove_old()));
         Ok(Self {
             docker,
-            owner,
-            run: this_run,
+            run: owner.run(),
             images,
-            active,
+            runtime: Handle::current(),
             shortcoming,
             turns: Semaphore::new(2 * std::thread::available_parallelism().map_or(2, usize::from)),
             config,
-            _keeper: keeper,
+            _removes_old_images: remover,
         })
     }
 
@@ -93,17 +82,16 @@ impl ContainerService {
         progress: OnProgress<'_>,
     ) -> Result<SimulationContainers, StartError> {
         let (project, docker, size) = (&request.project, &self.docker, self.config.project_size);
-        let (folder, config, owner) = (project.folder.clone(), Arc::clone(&self.config), self.owner.clone());
-        let plan = spawn_blocking(move || BuildPlan::read(&folder, &config.container, &owner.0)).await??;
-        let BuildPlan { yml, template, image, controller } = plan;
-        let guard = self.active.insert(self.run.project(request.port));
+        let (folder, owner) = (project.folder.clone(), self.images.owner.clone());
+        let BuildPlan { yml, image, controller } = spawn_blocking(move || BuildPlan::read(&folder, &owner.0)).await??;
+        let guard = ProjectGuard { name: self.run.project(request.port), runtime: self.runtime.clone() };
         join_network(docker, self.config.container.network.name()).await?;
         let is_projects = image.folder.is_some() || controller.is_some();
         let made = async |build: ImageBuild, from: &Path, to: &Path| {
             let has_project = build.folder.is_some();
             let image = self.images.build(project, build, progress).await?;
             if has_project {
-                export(docker, &guard.name, (&image.name, from), project, to, size).await?;
+                export(&image, docker, &guard.name, from, project, (to, size)).await?;
             }
             Ok::<_, StartError>(image)
         };
@@ -120,23 +108,33 @@ impl ContainerService {
             self.images.pull(&self.config.container.editor_image, progress).await?;
         }
         let (name, config) = (guard.name.clone(), Arc::clone(&self.config));
-        let compose = ComposeProject { name, request, yml, template, image, controller, config };
-        let (written, compose) = spawn_blocking(move || (compose.write(), compose)).await?;
-        let ((options, variables), ComposeProject { yml, template, .. }) = (written?, compose);
-        // More concurrent runs would only be slower.
-        let turn = self.turns.acquire().await.map_err(|error| StartError::Server(error.to_string()))?;
-        progress(steps::CREATING.to_owned());
+        let compose = ComposeProject { name, request, yml, image, controller, config };
+        let (written, ComposeProject { yml, .. }) = spawn_blocking(move || (compose.write(), compose)).await?;
+        let (options, services) = written?;
+        // More concurrent runs would only be slower. It is never closed.
+        let turn = self.turns.acquire().await.ok();
+        progress("Creating network and containers".to_owned());
         let up = ["up", "--no-start", "--no-build"].map(str::to_owned);
         let words = self.docker.compose.iter().map(|word| (*word).to_owned()).chain(options).chain(up);
-        let created = self.docker.follow(words.map(Into::into).collect(), variables, CREATE_TIMEOUT, |_| ()).await;
+        let created = self.docker.follow(words.map(Into::into).collect(), CREATE_TIMEOUT, |_| ()).await;
         created.map_err(|error| blame(is_projects, error))?;
         drop(turn);
         // An editor has a port of its own, which the relay of streams does not reach.
         let ide = (has_editor && self.config.ports_are_public()).then(|| "ide: enable".to_owned());
         let texts = ide.into_iter().chain(yml.project_type).collect();
-        let (docker, services) = (self.docker.clone(), template.services.into_keys().collect());
-        Ok(SimulationContainers { docker, guard, services, is_projects, texts, warnings: yml.warnings, restart: None })
+        let (docker, warnings) = (self.docker.clone(), yml.warnings);
+        Ok(SimulationContainers { docker, guard, services, is_projects, texts, warnings, restart: None })
     }
+}
+
+/// Checks whether simulations can run in containers. Blocks for some seconds at most.
+///
+/// # Errors
+/// What is missing, as text for an administrator.
+pub fn check(config: &SimulationConfig) -> Result<String, String> {
+    Docker::find(Path::new("/"))?;
+    daemon_fault().or_else(packet_filter::missing).map_or(Ok(()), Err)?;
+    Ok(format!("it answers; worlds run in {}, or the image of their project's Dockerfile", config.container.image))
 }
 
 /// Creates the network of all containers, unless it exists. Its name is also that of its interface, which the packet filter
@@ -146,10 +144,11 @@ async fn join_network(docker: &Docker, name: &str) -> Result<(), DockerError> {
     let interface = format!("com.docker.network.bridge.name={name}");
     let create = ["network", "create", "--driver", "bridge", "--opt", &interface, "--opt", ALONE, name];
     match docker.run(&create, SHORT_TIMEOUT).await {
-        Err(DockerError::Failed { message, .. }) if message.contains("already exists") => Ok(()),
         // Two that are created at the same time would have the same interface, which Docker refuses.
-        Err(DockerError::Failed { message, .. }) if message.contains("have same bridge name") => {
-            docker.run(&["network", "inspect", name], SHORT_TIMEOUT).await.map(drop)
+        Err(DockerError::Failed { message, .. })
+            if message.contains("already exists") || message.contains("have same bridge name") =>
+        {
+            Ok(())
         }
         created => created.map(drop),
     }

@@ -1,9 +1,12 @@
 //! Runs the programs `docker` and `docker compose`: without a shell, with a timeout. Dropping the future ends them.
 
 use std::ffi::{OsStr, OsString};
+use std::io;
 use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
 use std::time::Duration;
 
+use tokio::task::JoinError;
 use which::which;
 
 use crate::simulation::process::{ExitReason, Ran, Run, RunError, SpawnSpec};
@@ -41,10 +44,21 @@ pub enum DockerError {
     },
 }
 
+/// Why the containers of a simulation could not be started, as text for the client.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum StartError {
+    /// The project is the cause: no other server could start it.
+    #[error("{0}")]
+    Project(String),
+    /// This server is the cause, its Docker or its disk: another one may accept the client.
+    #[error("{0}")]
+    Server(String),
+}
+
 /// Timeout of queries and of other short commands.
 pub const SHORT_TIMEOUT: Duration = Duration::from_secs(30);
-/// Timeout of the check which compose command exists.
-const FIND_TIMEOUT: Duration = Duration::from_secs(10);
+/// Timeout of the daemon's answer.
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 /// How lines begin that follow the reason: which containers were not started, and where to find help.
 const AFTER_REASON: [&str; 3] = ["Error: failed to start containers", "See 'docker", "Run 'docker"];
 /// How a message begins that says that nobody listens.
@@ -63,7 +77,7 @@ impl Docker {
     pub fn find(mark: &Path) -> Result<Self, String> {
         which("docker")
             .map_err(|_| "docker is not there; on Debian and Ubuntu the package docker.io has it".to_owned())?;
-        let compose: &[_] = if blocking(&["compose", "version"], FIND_TIMEOUT).is_ok() {
+        let compose: &[_] = if blocking(&["compose", "version"], SHORT_TIMEOUT).is_ok() {
             &["docker", "compose"]
         } else if which("docker-compose").is_ok() {
             &["docker-compose"]
@@ -82,32 +96,21 @@ impl Docker {
     pub async fn run<A: AsRef<OsStr>>(&self, arguments: &[A], limit: Duration) -> Result<String, DockerError> {
         let arguments = arguments.iter().map(|word| word.as_ref().to_owned());
         let command: Vec<OsString> = std::iter::once("docker".into()).chain(arguments).collect();
-        let (name, mut reason) = (name_of(&command), String::new());
-        let ran = Run::new(command, &self.mark, limit).run(|line| note(&mut reason, &line)).await;
-        result(name, ran, reason)
+        finish(Run::new(command, &self.mark, limit), |_| ()).await
     }
 
-    /// Runs a program with its arguments and these variables. `on_line` receives each line that it prints.
+    /// Runs a program with its arguments. `on_line` receives each line that it prints.
     ///
     /// # Errors
     /// When it fails or takes longer than the limit.
     pub async fn follow(
         &self,
         command: Vec<OsString>,
-        variables: Vec<(&'static str, String)>,
         limit: Duration,
-        mut on_line: impl FnMut(&str),
+        on_line: impl FnMut(&str),
     ) -> Result<(), DockerError> {
-        let (name, mut reason) = (name_of(&command), String::new());
         let spec = self.spec(command, Duration::ZERO);
-        let mut run = Run { spec, answer: 0, ..Run::new([""], &self.mark, limit) };
-        run.spec.environment.extend(variables.into_iter().map(|(name, value)| (name.into(), value.into())));
-        let line = |line: String| {
-            on_line(&line);
-            note(&mut reason, &line);
-        };
-        let ran = run.run(line).await;
-        result(name, ran, reason).map(drop)
+        finish(Run { spec, answer: 0, ..Run::new([""], &self.mark, limit) }, on_line).await.map(drop)
     }
 
     /// The specification of a client program of the daemon. Dropping its process group ends only that program.
@@ -116,6 +119,16 @@ impl Docker {
         let environment = vec![("DOCKER_BUILDKIT".into(), "0".into()), ("COMPOSE_ANSI".into(), "never".into())];
         SpawnSpec { environment, grace, ..SpawnSpec::new(command, &self.mark) }
     }
+}
+
+async fn finish(run: Run, mut on_line: impl FnMut(&str)) -> Result<String, DockerError> {
+    let (name, mut reason) = (name_of(&run.spec.command), String::new());
+    let line = |line: String| {
+        on_line(&line);
+        note(&mut reason, &line);
+    };
+    let ran = run.run(line).await;
+    result(name, ran, reason)
 }
 
 /// Runs `docker` with these arguments, and returns its standard output. Blocks.
@@ -127,6 +140,27 @@ pub fn blocking(arguments: &[&str], limit: Duration) -> Result<String, DockerErr
     let (name, mut reason) = (name_of(&command), String::new());
     let ran = Run::new(command, Path::new("/"), limit).blocking(|line| note(&mut reason, &line));
     result(name, ran, reason)
+}
+
+/// Why the daemon can't be used now, as text for clients and administrators. Blocks for five seconds at most.
+pub fn daemon_fault() -> Option<String> {
+    blocking(&["version", "--format", "{{.Server.Version}}"], ANSWER_TIMEOUT).err().map(|error| error.to_string())
+}
+
+/// The directory in which Docker keeps images and containers; `None` if it does not run on this machine. Cached after
+/// the first answer; blocks for five seconds at most.
+pub fn data_folder() -> Option<PathBuf> {
+    static FOLDER: OnceLock<PathBuf> = OnceLock::new();
+    if std::env::var("DOCKER_HOST").is_ok_and(|host| !host.starts_with("unix:")) {
+        return None;
+    }
+    if FOLDER.get().is_none() {
+        let output = blocking(&["info", "--format", "{{.DockerRootDir}}"], ANSWER_TIMEOUT).ok()?;
+        let folder = Some(PathBuf::from(output.trim())).filter(|folder| folder.is_absolute() && folder.exists())?;
+        // A concurrent check may have set it.
+        FOLDER.set(folder).ok();
+    }
+    FOLDER.get().cloned()
 }
 
 /// The program and its subcommand.
@@ -156,11 +190,50 @@ fn result(command: String, ran: Result<Ran, RunError>, reason: String) -> Result
         Ok(_) if has_no_daemon(&reason) => {
             Err(DockerError::Unavailable(format!("Docker does not answer on this simulation server: {reason}")))
         }
-        Ok(_) if reason.is_empty() => Err(DockerError::Failed { command, message: "it says nothing".to_owned() }),
         Ok(_) => Err(DockerError::Failed { command, message: reason }),
         Err(RunError::Slow(limit)) => Err(DockerError::Slow { command, limit }),
         Err(error @ RunError::TooLong) => Err(DockerError::Failed { command, message: error.to_string() }),
         Err(error) => Err(not_started(error.to_string())),
+    }
+}
+
+/// The cause if Docker fails with the containers of a simulation. `is_projects` tells whether the project has defined
+/// one of their images: then the project is the cause, unless the disk is full.
+pub fn blame(is_projects: bool, error: DockerError) -> StartError {
+    match &error {
+        DockerError::Failed { message, .. } if is_projects && !is_disk_full(message) => {
+            StartError::Project(error.to_string())
+        }
+        _ => error.into(),
+    }
+}
+
+/// Whether Docker reports a full disk. Only the end of the message counts, because it may contain names of the project.
+pub fn is_disk_full(message: &str) -> bool {
+    message.ends_with("no space left on device")
+}
+
+impl From<String> for StartError {
+    fn from(why: String) -> Self {
+        Self::Project(why)
+    }
+}
+
+impl From<DockerError> for StartError {
+    fn from(error: DockerError) -> Self {
+        Self::Server(error.to_string())
+    }
+}
+
+impl From<io::Error> for StartError {
+    fn from(error: io::Error) -> Self {
+        Self::Server(format!("This simulation server can't write in its cache: {error}"))
+    }
+}
+
+impl From<JoinError> for StartError {
+    fn from(error: JoinError) -> Self {
+        Self::Server(error.to_string())
     }
 }
 
@@ -187,5 +260,16 @@ mod tests {
             error.to_string().ends_with("failed: Error response from daemon: port is already allocated"),
             "{error}"
         );
+    }
+
+    #[test]
+    fn what_docker_answers_about_a_projects_image_is_the_projects_fault() {
+        let failed =
+            |message: &str| DockerError::Failed { command: "docker cp".to_owned(), message: message.to_owned() };
+        let is_own = |error| matches!(blame(true, error), StartError::Server(_));
+        assert!(!is_own(failed("mknod /x: operation not permitted")));
+        assert!(!is_own(failed("no space left on device: no such file")));
+        assert!(is_own(failed("write /x: no space left on device")));
+        assert!(is_own(DockerError::Unavailable("refused".to_owned())));
     }
 }

@@ -48,7 +48,9 @@ impl Dockerfile {
             found.text.push('\n');
             let words = line.trim();
             if words.is_empty() || words.starts_with('#') {
-                if is_other_escape(words) {
+                // It changes the character by which lines are continued. Docker knows two.
+                let comment = words.trim_start_matches('#').trim_start().to_lowercase();
+                if comment.starts_with("escape") && comment.contains('`') {
                     return Err(wrong(number, line, "the escape character has to be \\"));
                 }
                 continue;
@@ -114,11 +116,6 @@ fn wrong(number: usize, line: &str, why: &str) -> String {
         "The Dockerfile of this project can't be used, line {number}, `{}`: {why}",
         excerpt(line.trim(), MAX_EXCERPT)
     )
-}
-
-/// Whether a comment changes the character by which lines are continued. Docker knows two.
-fn is_other_escape(comment: &str) -> bool {
-    comment.trim_start_matches('#').trim_start().to_lowercase().starts_with("escape") && comment.contains('`')
 }
 
 #[cfg(test)]

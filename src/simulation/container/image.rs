@@ -1,8 +1,9 @@
-//! The images of simulations: pulled, and built once for all clients of the same project.
+//! The images of simulations: pulled, and built once for all clients of the same project; old ones are removed.
 
 use std::ffi::OsString;
 use std::path::Path;
 use std::sync::Arc;
+use std::time::Duration;
 
 use actix_rt::task::spawn_blocking;
 use tokio::sync::{Semaphore, SemaphorePermit, watch};
@@ -10,18 +11,18 @@ use tokio::sync::{Semaphore, SemaphorePermit, watch};
 use super::build_plan::{self, ImageBuild};
 use super::built_image::BuiltImage;
 use super::compose_project::DEFAULT_MEMORY;
-use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
+use super::docker::{Docker, DockerError, SHORT_TIMEOUT, StartError, data_folder, is_disk_full};
 use super::dockerfile::LABEL;
 use super::owned_resources::{ResourceOwner, digest};
-use super::start_error::{StartError, blame, is_disk_full};
-use super::steps;
 use crate::simulation::checkout::{OnProgress, Project, SingleFlight};
 use crate::simulation::config::SimulationConfig;
+use crate::simulation::process::DiskRoom;
 
 /// The images of this server.
 pub struct Images {
     docker: Docker,
-    owner: ResourceOwner,
+    /// Who has built them.
+    pub owner: ResourceOwner,
     config: Arc<SimulationConfig>,
     /// Limits concurrent builds.
     builds: Semaphore,
@@ -34,6 +35,14 @@ const DEFAULT_BASE: [&str; 2] = ["$WEBOTS_DEFAULT_IMAGE", "${WEBOTS_DEFAULT_IMAG
 /// configuration of its programs.
 const ID: &str = "{{.Id}}";
 const CONFIG: &str = "{{json .Config}}";
+/// The largest number of steps that Webots' page understands: each number has one digit.
+const STEPS: u64 = 9;
+/// Time between two removals of old images, and after one that failed: Docker prunes for one at a time, also of other servers.
+const PRUNE_INTERVAL: Duration = Duration::from_mins(5);
+const RETRY_INTERVAL: Duration = Duration::from_secs(5);
+/// How old an image is at least that is removed because the disk is full, in hours: one that was just built has no container
+/// yet.
+const MIN_AGE: u64 = 1;
 
 impl Images {
     /// The images of this owner.
@@ -50,13 +59,13 @@ impl Images {
     pub async fn pull(self: &Arc<Self>, image: &str, progress: OnProgress<'_>) -> Result<String, StartError> {
         let (this, name) = (Arc::clone(self), image.to_owned());
         let pull = move |sender: watch::Sender<String>| async move {
-            let _permit = this.permit(&sender).await?;
-            let on_line = |line: &str| drop(sender.send(steps::pulling(&name, line)));
+            let _permit = this.permit(&sender).await;
+            let on_line = |line: &str| drop(sender.send(format!("Step 1/{STEPS} : fetching {name}: {line}")));
             let command = ["docker", "pull", &name].map(OsString::from).to_vec();
-            let pulled = this.docker.follow(command, Vec::new(), this.config.timing.build, on_line).await;
+            let pulled = this.docker.follow(command, this.config.timing.build, on_line).await;
             pulled.map_err(|error| not_pulled(&name, error))
         };
-        self.made(image, ID, false, progress, pull).await
+        self.made(image, ID, progress, pull).await
     }
 
     /// Builds an image of a project unless it exists.
@@ -84,20 +93,17 @@ impl Images {
             });
         }
         let name = format!("webots-fleet/{}:{}", self.owner.0, digest(parts.join("\0").as_bytes()));
-        let is_projects = build.folder.is_some();
         let (this, project, tag) = (Arc::clone(self), Arc::clone(project), name.clone());
         let job = |sender| async move { this.build_now(&tag, &project, build, sender).await };
-        let config = self.made(&name, CONFIG, is_projects, progress, job).await?;
+        let config = self.made(&name, CONFIG, progress, job).await?;
         Ok(BuiltImage::read(name, &config)?)
     }
 
-    /// Makes an image by this job unless it exists. Returns what Docker says of it in this format. What a project's own
-    /// Dockerfile makes may have settings that are too large to be read.
+    /// Makes an image by this job unless it exists. Returns what Docker says of it in this format.
     async fn made<F: Future<Output = Result<(), StartError>> + Send + 'static>(
         &self,
         name: &str,
         format: &str,
-        is_projects: bool,
         progress: OnProgress<'_>,
         job: impl FnOnce(watch::Sender<String>) -> F,
     ) -> Result<String, StartError> {
@@ -105,9 +111,9 @@ impl Images {
             return Ok(found);
         }
         self.jobs.join(name.to_owned(), progress, job).await?;
-        let inspect = ["image", "inspect", "--format", format, name];
-        let found = self.docker.run(&inspect, SHORT_TIMEOUT).await.map_err(|error| blame(is_projects, error))?;
-        Ok(found.trim().to_owned())
+        // The settings that a project's Dockerfile makes may be too large to be read.
+        let unreadable = || StartError::Project(format!("The settings of the image {name} can't be read"));
+        self.inspect(name, format).await?.ok_or_else(unreadable)
     }
 
     async fn build_now(
@@ -118,7 +124,7 @@ impl Images {
         sender: watch::Sender<String>,
     ) -> Result<(), StartError> {
         // What has no step of a project takes seconds.
-        let _permit = if build.folder.is_some() { Some(self.permit(&sender).await?) } else { None };
+        let _permit = if build.folder.is_some() { self.permit(&sender).await } else { None };
         let ImageBuild { dockerfile, folder, arguments } = build;
         let (instance, root) = (project.instance.path().to_owned(), project.folder.clone());
         let prepare = move || {
@@ -140,26 +146,23 @@ impl Images {
         let words = words.chain(arguments).chain([context.into()]);
         let mut step = String::new();
         let on_line = |line: &str| {
-            if line.starts_with("Step ") {
+            if let Some(text) = scaled(line) {
                 line.clone_into(&mut step);
-            }
-            if let Some(text) = steps::building(line) {
                 sender.send(text).ok();
             }
         };
-        let done = self.docker.follow(words.collect(), Vec::new(), self.config.timing.build, on_line).await;
+        let done = self.docker.follow(words.collect(), self.config.timing.build, on_line).await;
         done.map_err(|error| not_built(&step, error))
     }
 
-    async fn permit(&self, sender: &watch::Sender<String>) -> Result<SemaphorePermit<'_>, StartError> {
+    /// Waits until it may be built.
+    async fn permit(&self, sender: &watch::Sender<String>) -> Option<SemaphorePermit<'_>> {
         if let Ok(permit) = self.builds.try_acquire() {
-            return Ok(permit);
+            return Some(permit);
         }
         sender.send("waiting for images of others to be built".to_owned()).ok();
-        let limit = self.config.timing.build;
-        let busy = || format!("Images of others were being built for {} seconds (timing.build)", limit.as_secs());
-        let permit = actix_rt::time::timeout(limit, self.builds.acquire()).await.ok().and_then(Result::ok);
-        permit.ok_or_else(|| StartError::Server(busy()))
+        // It is never closed.
+        self.builds.acquire().await.ok()
     }
 
     /// What Docker says of an image in this format; `None` if it does not exist.
@@ -171,39 +174,48 @@ impl Images {
         }
     }
 
-    /// Removes the images that this server has built more than so many hours ago and that no container uses, and what builds
-    /// that failed have left. Docker keeps the base images: it knows ours by their label.
-    ///
-    /// # Errors
-    /// When Docker fails.
-    pub async fn prune(&self, hours: u64) -> Result<(), DockerError> {
-        let (mine, old) = (format!("label={LABEL}={}", self.owner.0), format!("until={hours}h"));
-        let prune = ["image", "prune", "--all", "--force", "--filter", &mine, "--filter", &old];
-        self.docker.run(&prune, SHORT_TIMEOUT).await.map(drop)
+    /// Removes the old images that this server has built and that no container uses, and what builds that failed have left.
+    /// Docker keeps the base images: it knows ours by their label. Never returns.
+    pub async fn remove_old(self: Arc<Self>) {
+        let reserve = self.config.disk_reserve;
+        loop {
+            let room = || data_folder().and_then(|folder| DiskRoom::of(&folder).ok());
+            let room = spawn_blocking(room).await.ok().flatten();
+            let is_full = room.is_some_and(|room| room.shortage(reserve).is_some());
+            let hours = if is_full { MIN_AGE } else { 24 * self.config.container.images_age };
+            let (mine, old) = (format!("label={LABEL}={}", self.owner.0), format!("until={hours}h"));
+            let prune = ["image", "prune", "--all", "--force", "--filter", &mine, "--filter", &old];
+            let pruned = self.docker.run(&prune, SHORT_TIMEOUT).await;
+            actix_rt::time::sleep(if pruned.is_ok() { PRUNE_INTERVAL } else { RETRY_INTERVAL }).await;
+        }
     }
 }
 
-/// Why a configured image can't be pulled, as text for the client.
+/// The step of a build, from Docker's line about it, in at most nine steps; `None` for any other line.
+fn scaled(line: &str) -> Option<String> {
+    let (numbers, instruction) = line.strip_prefix("Step ")?.split_once(" : ")?;
+    let (step, of) = numbers.split_once('/')?;
+    let (step, of): (u64, u64) = (step.parse().ok()?, of.parse().ok()?);
+    let step = if of > STEPS { (step.saturating_mul(STEPS) / of).max(1) } else { step };
+    Some(format!("Step {step}/{} : {instruction}", of.min(STEPS)))
+}
+
+/// Why a configured image can't be pulled: the world's version has none, or this server can't have it.
 fn not_pulled(image: &str, error: DockerError) -> StartError {
-    let is_own = matches!(error, DockerError::Slow { .. }) || is_silent(&error.to_string());
-    match not_made(Some(image), |message| format!("The image {image} can't be fetched: {message}"), error) {
-        StartError::Project(why) if is_own => StartError::Server(why),
-        error => error,
+    match error {
+        DockerError::Failed { message, .. } if is_unknown(&message) => no_image(image),
+        error => error.into(),
     }
 }
 
-/// Why an image was not built in this step, as text for the client. Only a `FROM` step can fail because of a missing image.
+/// Why an image was not built in this step. Only a `FROM` step can fail because of a missing image.
 fn not_built(step: &str, error: DockerError) -> StartError {
     let base = step.split_once(" : FROM ").and_then(|(_, image)| image.split(' ').next());
-    not_made(base, |message| format!("The image of this project can't be built: {message} ({step})"), error)
-}
-
-/// Why an image with this base was not made, as text for the client.
-fn not_made(base: Option<&str>, tell: impl Fn(&str) -> String, error: DockerError) -> StartError {
     match (base, error) {
         (Some(image), DockerError::Failed { message, .. }) if is_unknown(&message) => no_image(image),
-        (_, DockerError::Failed { message, .. }) if is_disk_full(&message) => StartError::Server(tell(&message)),
-        (_, DockerError::Failed { message, .. }) => StartError::Project(tell(&message)),
+        (_, DockerError::Failed { message, .. }) if !is_disk_full(&message) => {
+            StartError::Project(format!("The image of this project can't be built: {message} ({step})"))
+        }
         (_, DockerError::Slow { limit, .. }) => {
             StartError::Project(format!("Its image was not ready within {} seconds (timing.build)", limit.as_secs()))
         }
@@ -218,17 +230,10 @@ fn no_image(image: &str) -> StartError {
     ))
 }
 
-/// Whether a registry reports that there is no such image.
+/// Whether a registry reports that there is no such image, or Docker that there can be none of this name.
 fn is_unknown(message: &str) -> bool {
-    ["not found", "pull access denied", "manifest unknown", "repository does not exist"]
-        .iter()
-        .any(|words| message.contains(words))
-}
-
-/// Whether a registry does not answer, or not now. Image names contain no spaces.
-fn is_silent(message: &str) -> bool {
-    let message = message.to_lowercase();
-    let words = ["toomanyrequests: ", "i/o timeout", "handshake timeout", "timeout exceeded", "deadline exceeded"];
+    let words =
+        ["not found", "pull access denied", "manifest unknown", "repository does not exist", "invalid reference"];
     words.iter().any(|words| message.contains(words))
 }
 
@@ -266,5 +271,18 @@ mod tests {
         assert!(matches!(not_pulled("a", failed("invalid reference format")), StartError::Project(_)));
         let full = failed("failed to register layer: write /x: no space left on device");
         assert!(matches!(not_built("Step 1/4 : FROM a", full), StartError::Server(_)));
+    }
+
+    #[test]
+    fn steps_have_one_digit() {
+        for (said, told) in [
+            ("Step 2/4 : RUN make", Some("Step 2/4 : RUN make")),
+            ("Step 10/20 : COPY . /x", Some("Step 4/9 : COPY . /x")),
+            ("Step 1/20 : FROM a", Some("Step 1/9 : FROM a")),
+            ("Step into the light", None),
+            (" ---> Running in 0123", None),
+        ] {
+            assert_eq!(scaled(said).as_deref(), told);
+        }
     }
 }

@@ -2,30 +2,22 @@
 
 mod build_plan;
 mod built_image;
-mod check;
 mod compose_project;
 mod container_service;
 mod docker;
 mod dockerfile;
 mod image;
-mod image_export;
-mod orphan_cleanup;
 mod owned_resources;
 pub mod packet_filter;
-mod project_paths;
 mod simulation_containers;
-mod start_error;
-mod steps;
-mod templates;
 mod usage;
 mod webots_yml;
 
 pub use built_image::RUNS;
-pub use check::{check, check_templates, daemon_fault, data_folder, init_fault};
 pub use compose_project::ContainerRequest;
-pub use container_service::ContainerService;
+pub use container_service::{ContainerService, check};
+pub use docker::{StartError, daemon_fault, data_folder};
 pub use owned_resources::{ResourceOwner, sweep_all};
 pub use simulation_containers::{Cause, SimulationContainers};
-pub use start_error::StartError;
 pub use usage::measure;
 pub use webots_yml::{ProjectKind, WebotsYml};

@@ -1,5 +1,4 @@
-//! What a server has in Docker: the containers of its simulations. There are no networks and no named volumes of theirs:
-//! templates that have some are refused.
+//! What a server has in Docker: the containers of its simulations, which have no networks and no named volumes of their own.
 //!
 //! The names of its compose projects, which those of their containers begin with, have a common prefix, so that the resources
 //! of a crashed server are found again.
@@ -7,19 +6,32 @@
 use std::path::Path;
 use std::time::Duration;
 
+use actix_rt::task::spawn_blocking;
 use sha2::{Digest, Sha256};
+use tokio::runtime::Handle;
 
-use super::docker::{self, Docker, DockerError, SHORT_TIMEOUT};
+use super::docker::{DockerError, SHORT_TIMEOUT, blocking};
 
 /// The owner of compose projects and images: a server, or one run of it. Their names have a common prefix: that of the owner
 /// is 12 hexadecimal digits; of a run also `-` and 8 more.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ResourceOwner(pub String);
 
-/// How long each command of a sweep may take.
-const SWEEP_TIMEOUT: Duration = Duration::from_secs(20);
+/// The name of a compose project. Dropping it removes its containers, as soon as Docker can.
+#[derive(Debug)]
+pub struct ProjectGuard {
+    /// The name; unique on this machine.
+    pub name: String,
+    /// The runtime that removes them.
+    pub runtime: Handle,
+}
+
 /// How containers are removed, whatever they do.
-const REMOVE: [&str; 3] = ["rm", "--force", "--volumes"];
+pub const REMOVE: [&str; 3] = ["rm", "--force", "--volumes"];
+/// Attempts to remove the containers of a project before they are left to the next start, and the pause before each: Docker
+/// may still be creating one.
+const TRIES: u32 = 60;
+const PAUSE: Duration = Duration::from_secs(2);
 
 impl ResourceOwner {
     /// The server with this cache directory, which only one server uses.
@@ -50,47 +62,50 @@ impl ResourceOwner {
     }
 }
 
+impl ProjectGuard {
+    /// Removes the containers now, if Docker can.
+    pub async fn remove(self) {
+        let name = self.name.clone();
+        spawn_blocking(move || sweep(&name).ok()).await.ok();
+    }
+}
+
+impl Drop for ProjectGuard {
+    fn drop(&mut self) {
+        let name = std::mem::take(&mut self.name);
+        self.runtime.spawn(async move {
+            for _ in 0..TRIES {
+                actix_rt::time::sleep(PAUSE).await;
+                let project = name.clone();
+                if matches!(spawn_blocking(move || sweep(&project)).await, Ok(Ok(()))) {
+                    return;
+                }
+            }
+            log::warn!("the containers of {name} are left to the next start");
+        });
+    }
+}
+
 /// The SHA-256 of a text, in hexadecimal digits.
 pub fn digest(text: &[u8]) -> String {
     let digest = Sha256::digest(text);
     digest.iter().fold(String::new(), |text, byte| format!("{text}{byte:02x}"))
 }
 
-/// Removes containers.
-///
-/// # Errors
-/// When Docker fails; then some may remain.
-pub async fn remove(docker: &Docker, containers: &[String]) -> Result<(), DockerError> {
-    let words: Vec<&str> = REMOVE.into_iter().chain(containers.iter().map(String::as_str)).collect();
-    match docker.run(&words, SHORT_TIMEOUT).await {
-        // Another process may remove it.
-        Err(DockerError::Failed { message, .. })
-            if message.contains("o such container") || message.contains("already in progress") =>
-        {
-            Ok(())
-        }
-        done => done.map(drop),
-    }
-}
-
-/// Removes the containers of an owner, except those in use. Returns the names of those that it has removed. Blocks.
-///
-/// # Errors
-/// When Docker fails; then some may remain.
-pub fn sweep(owner: &ResourceOwner, is_used: impl Fn(&str) -> bool) -> Result<Vec<String>, DockerError> {
-    let list =
-        docker::blocking(&["ps", "--all", "--filter", "name=webots-fleet-", "--format", "{{.Names}}"], SWEEP_TIMEOUT)?;
-    let names: Vec<&str> = list.lines().filter(|name| name.starts_with(&owner.prefix()) && !is_used(name)).collect();
-    if !names.is_empty() {
-        docker::blocking(&[&REMOVE, names.as_slice()].concat(), SWEEP_TIMEOUT)?;
-    }
-    Ok(names.into_iter().map(str::to_owned).collect())
-}
-
-/// Removes all containers of an owner: for a process that watches over the server's end. What is left is removed by the next
-/// start. Blocks.
+/// Removes all containers of an owner: at the start, and for a process that watches over the server's end. What is left is
+/// removed by the next start. Blocks.
 pub fn sweep_all(owner: &ResourceOwner) {
-    sweep(owner, |_| false).ok();
+    sweep(&owner.prefix()).ok();
+}
+
+/// Removes the containers whose names begin like this. Blocks.
+fn sweep(prefix: &str) -> Result<(), DockerError> {
+    let list = blocking(&["ps", "--all", "--filter", "name=webots-fleet-", "--format", "{{.Names}}"], SHORT_TIMEOUT)?;
+    let names: Vec<&str> = list.lines().filter(|name| name.starts_with(prefix)).collect();
+    if !names.is_empty() {
+        blocking(&[&REMOVE, names.as_slice()].concat(), SHORT_TIMEOUT)?;
+    }
+    Ok(())
 }
 
 #[cfg(test)]

@@ -1,17 +1,14 @@
-//! The containers of one simulation, created and ready to start. Dropping them leaves them to the orphan cleanup.
+//! The containers of one simulation, created and ready to start. Dropping them removes them.
 
 use std::sync::Arc;
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::Duration;
 
 use tokio::sync::Notify;
 use tokio_util::task::AbortOnDropHandle;
 
-use super::compose_project::container_of;
-use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
-use super::orphan_cleanup::ProjectGuard;
-use super::owned_resources;
-use super::start_error::{StartError, blame};
-use super::templates::{CONTROLLER, WEBOTS};
+use super::compose_project::{CONTROLLER, WEBOTS, container_of};
+use super::docker::{Docker, DockerError, SHORT_TIMEOUT, StartError, blame};
+use super::owned_resources::ProjectGuard;
 use crate::simulation::process::{ExitReason, SpawnSpec};
 
 /// The containers of one simulation.
@@ -22,7 +19,7 @@ pub struct SimulationContainers {
     /// The name of its compose project.
     pub(super) guard: ProjectGuard,
     /// Its services, each with a container.
-    pub(super) services: Vec<String>,
+    pub(super) services: Vec<&'static str>,
     /// Whether the project has defined one of their images, which may be why Docker can't start one.
     pub(super) is_projects: bool,
     /// Texts for its client, unchanged.
@@ -44,12 +41,6 @@ pub enum Cause {
     NotStarted,
 }
 
-/// The exit codes of a program that was ended by SIGTERM or SIGKILL, which Docker sends to all containers when it is
-/// stopped.
-const ENDED_BY_SIGNAL: [u8; 2] = [128 + 15, 128 + 9];
-/// The range of Docker's events that is queried for the end of a container, before and after now: Docker answers at the
-/// end of the range.
-const EVENTS: (Duration, Duration) = (Duration::from_mins(1), Duration::from_millis(100));
 /// Shortest time between two restarts of a participant's controller.
 const RESTART_INTERVAL: Duration = Duration::from_secs(1);
 
@@ -65,10 +56,6 @@ impl SimulationContainers {
         container_of(&self.guard.name, service)
     }
 
-    fn all(&self) -> Vec<String> {
-        self.services.iter().map(|service| self.container(service)).collect()
-    }
-
     /// The process that starts Webots' container, prints its output, and exits with its exit code.
     pub fn spawn_spec(&self, grace: Duration) -> SpawnSpec {
         let webots = self.container(WEBOTS);
@@ -81,15 +68,24 @@ impl SimulationContainers {
     /// # Errors
     /// When Docker fails, with the project or this server as the cause.
     pub async fn start_others(&mut self) -> Result<(), StartError> {
-        let others = self.services.iter().filter(|service| *service != WEBOTS).map(|service| self.container(service));
+        let others = self.services.iter().filter(|service| **service != WEBOTS).map(|service| self.container(service));
         let words: Vec<String> = std::iter::once("start".to_owned()).chain(others).collect();
         if words.len() > 1 {
             self.docker.run(&words, SHORT_TIMEOUT).await.map_err(|error| blame(self.is_projects, error))?;
         }
-        if self.services.iter().any(|service| service == CONTROLLER) {
-            let controller = self.container(CONTROLLER);
-            let request = Arc::new(Notify::new());
-            let restarts = restart_on_request(self.docker.clone(), controller, Arc::clone(&request));
+        if self.services.contains(&CONTROLLER) {
+            let (docker, controller, request) =
+                (self.docker.clone(), self.container(CONTROLLER), Arc::new(Notify::new()));
+            let requested = Arc::clone(&request);
+            let restarts = async move {
+                loop {
+                    requested.notified().await;
+                    if let Err(error) = docker.run(&["restart", "--time", "0", &controller], SHORT_TIMEOUT).await {
+                        log::warn!("a participant's controller is not started anew: {error}");
+                    }
+                    actix_rt::time::sleep(RESTART_INTERVAL).await;
+                }
+            };
             self.restart = Some((request, AbortOnDropHandle::new(actix_rt::spawn(restarts))));
         }
         Ok(())
@@ -102,8 +98,8 @@ impl SimulationContainers {
 
     /// The ids of its containers, which the kernel knows them by; none where Docker fails.
     pub fn ids(&self) -> impl Future<Output = Vec<String>> + use<> {
-        let (docker, all) = (self.docker.clone(), self.all());
-        let words = [["inspect", "--format", "{{.Id}}"].map(str::to_owned).to_vec(), all].concat();
+        let (docker, all) = (self.docker.clone(), self.services.iter().map(|service| self.container(service)));
+        let words: Vec<String> = ["inspect", "--format", "{{.Id}}"].map(str::to_owned).into_iter().chain(all).collect();
         async move {
             let ids = docker.run(&words, SHORT_TIMEOUT).await.unwrap_or_default();
             ids.lines().map(|id| id.trim().to_owned()).collect()
@@ -125,38 +121,12 @@ impl SimulationContainers {
             [_, "created", _] => (!self.is_projects).then_some(Cause::NotStarted),
             // The program has lost the connection to the daemon.
             [_, _, ended] if *ended != code.to_string() => Some(Cause::Docker),
-            _ if ENDED_BY_SIGNAL.contains(&code) => self.was_stopped(&webots).await.then_some(Cause::Docker),
             _ => None,
         }
     }
 
-    /// Whether Docker has stopped a container, or was restarted after its end. A daemon that has seen a container exit
-    /// by itself reports only that exit.
-    async fn was_stopped(&self, container: &str) -> bool {
-        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-        let [since, until] = [now.saturating_sub(EVENTS.0), now + EVENTS.1]
-            .map(|time| format!("{}.{:09}", time.as_secs(), time.subsec_nanos()));
-        let container = format!("container={container}");
-        let words = ["events", "--since", &since, "--until", &until, "--filter", &container, "--format", "{{.Action}}"];
-        let seen = self.docker.run(&words, SHORT_TIMEOUT).await;
-        seen.map_or(true, |seen| !seen.lines().any(|line| line == "die") || seen.lines().any(|line| line == "kill"))
-    }
-
     /// Removes everything of this simulation.
     pub async fn remove(self) {
-        if let Err(error) = owned_resources::remove(&self.docker, &self.all()).await {
-            log::warn!("{} is not removed yet: {error}", self.guard.name);
-        }
-    }
-}
-
-/// Restarts a container on each notification, one restart at a time.
-async fn restart_on_request(docker: Docker, container: String, request: Arc<Notify>) {
-    loop {
-        request.notified().await;
-        if let Err(error) = docker.run(&["restart", "--time", "0", &container], SHORT_TIMEOUT).await {
-            log::warn!("a participant's controller is not started anew: {error}");
-        }
-        actix_rt::time::sleep(RESTART_INTERVAL).await;
+        self.guard.remove().await;
     }
 }
