@@ -121,15 +121,6 @@ fn the_images_are_stages_of_the_dockerfile() {
             assert!(dockerfile.contains(&format!("--target {stage} ")), "how {image} is built is not told");
         }
     }
-    // What is copied into images is there, and is given to the build.
-    let given = std::fs::read_to_string(project(".dockerignore")).unwrap();
-    for line in dockerfile.lines().filter_map(|line| line.strip_prefix("COPY ")).filter(|line| !line.starts_with("--"))
-    {
-        let source = line.split(' ').next().unwrap();
-        assert!(project(source).exists(), "{source}");
-        let is_given = |line: &str| line.strip_prefix('!').is_some_and(|folder| source.starts_with(folder));
-        assert!(source == "." || given.lines().any(is_given), "{source}");
-    }
 }
 
 #[test]

@@ -56,18 +56,12 @@ fn without_histograms(metrics: BTreeSet<String>) -> BTreeSet<String> {
 }
 
 #[test]
-fn promtool_finds_no_fault_in_the_alerts_and_they_tell_the_fleets_that_are_not_well() {
+fn promtool_finds_no_fault_in_the_alerts_and_the_dashboard_and_these_tell_the_fleets_that_are_not_well() {
     promtool(&["check", "rules"], &project("deploy/prometheus/alerts.yml"));
     promtool(&["check", "config"], &project("deploy/prometheus/prometheus.yml"));
     promtool(&["test", "rules"], &project("tests/deploy/alerts.yml"));
-}
-
-#[test]
-fn the_queries_of_the_dashboard_are_some() {
-    let queries = queries();
-    assert!(queries.len() > 20, "{queries:?}");
     let rule = |(number, query): (usize, &String)| format!("  - {{record: query_{number}, expr: '{query}'}}\n");
-    let rules: String = queries.iter().enumerate().map(rule).collect();
+    let rules: String = queries().iter().enumerate().map(rule).collect();
     let file = tempfile::NamedTempFile::new().unwrap();
     std::fs::write(file.path(), format!("groups:\n- name: dashboard\n  rules:\n{rules}")).unwrap();
     promtool(&["check", "rules"], file.path());

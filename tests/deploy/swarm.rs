@@ -29,22 +29,3 @@ fn its_servers_and_its_door_are_those_of_the_demo_on_kubernetes() {
         assert_eq!([rules(swarm, &rule), rules(kubernetes, &rule)], [wanted.clone(), wanted]);
     }
 }
-
-#[test]
-fn every_file_that_swarm_keeps_has_its_hash_in_its_name() {
-    let (program, mut files) = (read("swarm/deploy"), 0);
-    for stack in ["stack.yml", "https.yml", "gpu.yml"] {
-        let stack = read(&format!("swarm/{stack}"));
-        let configs = stack.split("\nconfigs:\n").nth(1).unwrap();
-        for (name, file) in configs.lines().zip(configs.lines().skip(1)).filter(|(name, _)| name.contains(" name: ")) {
-            let variable = name.rsplit_once("${").unwrap().1.strip_suffix("_VERSION:-}").unwrap();
-            let file = file.trim().strip_prefix("file: ").unwrap();
-            assert!(
-                program.contains(&format!(" {variable}={file}")),
-                "{variable}={file} is not in deploy/swarm/deploy"
-            );
-            files += 1;
-        }
-    }
-    assert_eq!(files, 5);
-}
