@@ -142,44 +142,13 @@ async fn running_out_of_files_is_said_at_the_start_and_costs_only_those_who_are_
 }
 
 #[actix_rt::test]
-async fn a_message_without_end_is_cut_off_before_it_fills_the_memory() {
-    use std::io::{Read, Write};
-    let session = session_server(&[]).start().await;
-    let resident = || procfs::process::Process::new(session.pid()).unwrap().statm().unwrap().resident;
-    let before = resident();
-    let address = session.address();
-    let sent = actix_rt::task::spawn_blocking(move || {
-        let mut socket = std::net::TcpStream::connect(address).unwrap();
-        socket.write_all(UPGRADE).unwrap();
-        assert!(socket.read(&mut [0; 1024]).unwrap() > 0);
-        // A text frame that says it will have 300 MB.
-        let mut frame = vec![0x81, 0xff];
-        frame.extend(300_000_000_u64.to_be_bytes());
-        frame.extend([0; 4]);
-        socket.write_all(&frame).unwrap();
-        let part = [b'x'; 64 * 1024];
-        // The server may close the connection meanwhile.
-        (0..4000).take_while(|_| socket.write_all(&part).is_ok()).count()
-    });
-    assert!(sent.await.unwrap() > 2, "too little was sent to see anything");
-    assert!(resident() < before + 20 * 256, "from {before} to {} pages of 4 KiB", resident());
-}
-
-#[actix_rt::test]
-async fn a_client_that_reads_no_page_is_sent_away_and_holds_up_no_stop() {
+async fn a_client_that_reads_no_page_is_sent_away() {
     let session = session_server(&[]).set("timing", serde_json::json!({"ping": 0.5, "silence": 1})).start().await;
     let mut deaf = TcpStream::connect(session.address()).await.unwrap();
     let request = b"GET /assets/viewer.js HTTP/1.1\r\nHost: localhost\r\n\r\n";
-    let flood = async {
-        // Until it no longer takes requests in, for its answers are not read; then until the connection is cut.
-        loop {
-            let sent = actix_rt::time::timeout(Duration::from_secs(20), deaf.write_all(request)).await;
-            if sent.expect("the connection is still open").is_err() {
-                return;
-            }
-        }
-    };
-    actix_rt::time::timeout(Duration::from_secs(40), flood).await.expect("it may ask for ever");
+    // Until it no longer takes requests in, for its answers are not read; then until the connection is cut.
+    let flood = async { while deaf.write_all(request).await.is_ok() {} };
+    actix_rt::time::timeout(Duration::from_secs(40), flood).await.expect("the connection is still open");
     assert_eq!(http::get(&session.url("/health")).await.status, 200);
 }
 
