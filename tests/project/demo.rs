@@ -61,7 +61,7 @@ async fn the_demo_runs_from_its_start_to_its_stop() {
         assert!(told.contains(&part), "{part} is missing: {told}");
     }
 
-    project.available().await;
+    until("a client can be placed", async || http::get(&project.session_url("/request")).await.text() == "1").await;
     let answer = talk(&project, &format!("ws://localhost:{session}/session"), WORLD, "ws:").await;
     assert_eq!(answer, ["1".to_owned(), format!("ws://localhost:{simulation}")]);
     for path in ["/monitor", "/status", "/load", "/metrics", "/health", "/request"] {

@@ -117,15 +117,15 @@ async fn a_mail_is_given_up_with_one_line() {
 async fn a_silent_server_holds_up_nobody_and_leaves_nothing_open() {
     let mut smtp = Smtp::start(&["--hang", "greeting"]).await;
     let servers = [StandIn::start(Manner::Reset)];
-    let builder = mailing(&addresses(&servers), smtp.port).set("timing.mailAnswer", 3).set("timing.mailPatience", 4);
+    let builder = mailing(&addresses(&servers), smtp.port).set("timing.mailAnswer", 2).set("timing.mailPatience", 2);
     let session = builder.start().await;
     smtp.wait_for("opened").await;
     servers[0].set(Manner::idle(7.0, 10));
     until_states(&session, &["up"]).await;
     assert_eq!(http::get(&session.url("/session")).await.text(), servers[0].url());
-    assert_eq!(times_logged(&session, "no answer within 3 s"), 0, "it waited for the mail");
+    assert_eq!(times_logged(&session, "no answer within 2 s"), 0, "it waited for the mail");
     until("it is given up", async || times_logged(&session, "mail given up") == 1).await;
-    assert!(session.log().contains("no answer within 3 s"), "{}", session.log());
+    assert!(session.log().contains("no answer within 2 s"), "{}", session.log());
     let opened = smtp.count("opened");
     smtp.wait_for_times("closed", opened).await;
 }

@@ -25,8 +25,6 @@ pub enum Manner {
     Raw(Vec<u8>),
     /// Has no `/status`; sends these bytes for `/load`, and ends the connection.
     RawLoad(Vec<u8>),
-    /// Waits so long before it tells a load of 1 %.
-    Slow(Duration),
     /// Takes connections and says nothing.
     Hang,
     /// Takes connections and breaks them.
@@ -176,10 +174,6 @@ async fn answer(stream: &mut TcpStream, path: &str, manner: Manner) -> std::io::
         }
         Manner::Status(_) | Manner::Load(_) | Manner::RawLoad(_) => send(stream, 404, b"404: Not Found").await?,
         Manner::Body(status, body) => send(stream, status, &body).await?,
-        Manner::Slow(time) => {
-            actix_rt::time::sleep(time).await;
-            send(stream, 200, br#"{"load": 1}"#).await?;
-        }
         Manner::Raw(bytes) => {
             stream.write_all(&bytes).await?;
             return Ok(false);

@@ -20,16 +20,9 @@ fn with_webhook(servers: &[StandIn], scheme: &str, port: u16) -> Builder {
     session_server(&addresses(servers)).set("webhook", url).set("timing", timing)
 }
 
-/// Three servers that work, which the session server knows.
-fn fleet() -> Vec<StandIn> {
-    (0..3).map(|_| StandIn::start(Manner::idle(7.0, 10))).collect()
-}
-
-async fn fail(session: &Server, servers: &[StandIn]) {
-    until_states(session, &["up"; 3]).await;
-    for server in servers {
-        server.set(Manner::Reset);
-    }
+/// Three servers that fail.
+fn fleet() -> [StandIn; 3] {
+    [(); 3].map(|()| StandIn::start(Manner::Reset))
 }
 
 fn says_nothing_secret(session: &Server) {
@@ -40,7 +33,6 @@ fn says_nothing_secret(session: &Server) {
 async fn the_notices_of_a_mail_are_one_message_and_need_no_mail() {
     let (servers, receiver) = (fleet(), Receiver::start(None));
     let session = with_webhook(&servers, "http", receiver.port).start().await;
-    fail(&session, &servers).await;
     let text = receiver.texts(1).await.remove(0);
     assert!(text.starts_with("Simulation servers: 3 not responding\n"), "{text}");
     for server in addresses(&servers) {
@@ -72,7 +64,6 @@ async fn a_message_that_is_not_taken_is_tried_again_and_so_is_a_mail_for_itself(
     receiver.answer("503 Busy");
     let mut smtp = Smtp::start(&[]).await;
     let session = with_webhook(&servers, "http", receiver.port).mails_to(smtp.port).start().await;
-    fail(&session, &servers).await;
     // The mail does not wait for the messenger.
     assert_eq!(smtp.mail().await.subject(), "Simulation servers: 3 not responding");
     receiver.texts(3).await;
@@ -96,7 +87,6 @@ async fn a_messenger_whose_certificate_is_not_trusted_is_told_nothing() {
         let servers = fleet();
         let builder = with_webhook(&servers, "https", receiver.port);
         let session = builder.env("SSL_CERT_FILE", authority.file().to_str().unwrap()).start().await;
-        fail(&session, &servers).await;
         if trusted {
             receiver.texts(1).await;
         } else {
