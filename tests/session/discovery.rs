@@ -110,6 +110,7 @@ async fn a_name_server_that_fails_or_has_nothing_to_tell_changes_nothing_and_is_
     let session = looking_up(std::slice::from_ref(&name), &names)
         .mails_to(smtp.port)
         .set("timing", json!({"gather": 0.1, "flapping": 0.1, "placement": 0.2}))
+        .set("loadRefresh", 0.05)
         .start()
         .await;
     until_states(&session, &["up"; 2]).await;
@@ -179,7 +180,8 @@ async fn a_name_whose_lookup_hangs_holds_up_only_its_own_server() {
     let well = StandIn::start(good());
     let mut servers: Vec<String> = (0..HANGING).map(|number| format!("{number}.test:2000")).collect();
     servers.push(well.address());
-    let mut session = looking_up(&servers, &names).set("timing", json!({"answer": 0.5})).start().await;
+    let builder = looking_up(&servers, &names).set("timing", json!({"answer": 0.5})).set("loadRefresh", 0.05);
+    let mut session = builder.start().await;
     until_states(&session, &[vec!["down"; HANGING], vec!["up"]].concat()).await;
     assert!(session.log().contains("0.test:2000: down: no answer within 0.5 s"));
     // Some looks later, nothing has piled up, and the others are asked as ever.
@@ -188,7 +190,7 @@ async fn a_name_whose_lookup_hangs_holds_up_only_its_own_server() {
     let (asked, begin) = (well.requests(), Instant::now());
     until("it is asked twenty times more", async || well.requests() >= asked + 20).await;
     let took = begin.elapsed();
-    assert!(took < Duration::from_secs(5), "twenty looks, one each 0.1 s, took {took:?}");
+    assert!(took < Duration::from_secs(5), "twenty looks, one each 0.05 s, took {took:?}");
     assert!(threads() <= before, "{} threads, {before} before", threads());
     // Nobody waits for them at the end either.
     let begin = Instant::now();

@@ -1,5 +1,7 @@
 //! From a failure to a mail: the built program, a stand-in that fails, a real SMTP server. `tests/python.sh` prepares it.
 
+use std::collections::BTreeSet;
+
 use serde_json::{Value, json};
 
 use super::stand_in::{Manner, StandIn};
@@ -10,7 +12,7 @@ use crate::support::smtp::Smtp;
 use crate::support::{http, until};
 
 fn mailing(servers: &[String], port: u16) -> Builder {
-    let timing = json!({"answer": 4, "gather": 0.5, "flapping": 0.5, "mailRetry": 0.1, "mailAnswer": 10});
+    let timing = json!({"answer": 2, "gather": 0.5, "flapping": 0.5, "mailRetry": 0.1, "mailAnswer": 10});
     session_server(servers).mails_to(port).set("timing", timing)
 }
 
@@ -25,7 +27,7 @@ async fn read_until(smtp: &mut Smtp, text: &mut String, words: &str) {
         );
         assert_eq!((mail.header("Date").len(), mail.header("Message-ID").len()), (1, 1));
         assert!(mail.header("Content-Type")[0].starts_with("text/plain"), "{mail:?}");
-        text.push_str(mail.field("text"));
+        text.push_str(&mail.field("text").replace("\r\n", "\n"));
     }
 }
 
@@ -36,8 +38,8 @@ async fn every_kind_of_failure_is_mailed_and_so_is_its_end() {
     let evil = json!({"load": 100, "problem": "no display at :0\r\n.\r\nRCPT TO:<thief@example.com>\u{1b}[2J"});
     let failures = [
         (Manner::Reset, DOWN, "no connection"),
-        (Manner::Hang, DOWN, "no answer within 4 s"),
-        (Manner::Drip, DOWN, "no answer within 4 s"),
+        (Manner::Hang, DOWN, "no answer within 2 s"),
+        (Manner::Drip, DOWN, "no answer within 2 s"),
         (Manner::Body(500, Vec::new()), DOWN, "status 500"),
         (Manner::Status(json!({"load": "much"})), DOWN, "an answer that makes no sense"),
         (Manner::Status(evil), DOWN, "no display at :0"),
@@ -75,9 +77,8 @@ async fn a_thousand_servers_that_fail_together_are_one_mail() {
     let _session = mailing(&servers, smtp.port).set("loadRefresh", 600).set("timing.gather", 3).start().await;
     let mail = smtp.mail().await;
     assert_eq!(mail.subject(), "Simulation servers: 1000 not responding");
-    for server in &servers {
-        assert_eq!(mail.field("text").matches(&format!("\n{server}: not responding\n")).count(), 1, "{server}");
-    }
+    let told = mail.field("text").lines().filter_map(|line| line.strip_suffix(": not responding"));
+    assert_eq!(told.collect::<BTreeSet<_>>(), servers.iter().map(String::as_str).collect());
 }
 
 #[actix_rt::test]
