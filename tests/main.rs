@@ -17,7 +17,6 @@ mod demo_simulator;
 mod deploy;
 mod inputs;
 mod isolation;
-mod mail;
 mod placement;
 mod project;
 mod proxy;

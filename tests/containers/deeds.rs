@@ -1,7 +1,5 @@
 //! What a world's program tries in a container: each row is also in docs/isolation.md.
 
-use std::time::{Duration, Instant};
-
 use super::daemon::{ask, containers, docker, of_service, running, server_running};
 use super::image::NAME;
 use crate::support::{Builder, arm, is_told, until};
@@ -66,23 +64,6 @@ async fn what_fills_the_project_is_told_and_ended() {
     let server = doing("(sleep 1; dd if=/dev/zero of=/usr/local/webots-project/big bs=1M count=50 2>/dev/null) &");
     let server = server.set("limits.disk", 20).start().await;
     is_told(&server, &arm(), "limits.disk").await;
-}
-
-#[actix_rt::test]
-async fn prints_without_end_are_read_at_their_pace() {
-    let Some(_docker) = docker().await else { return };
-    let server = doing("(while :; do echo xxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxx; done) &");
-    let (server, client) = running(server.set("limits.output", 64)).await;
-    let ticks = || {
-        let stat = procfs::process::Process::new(server.pid()).unwrap().stat().unwrap();
-        stat.utime + stat.stime
-    };
-    let (begin, before) = (Instant::now(), ticks());
-    actix_rt::time::sleep(Duration::from_secs(4)).await;
-    let share = (ticks() - before) as f64 / procfs::ticks_per_second() as f64 / begin.elapsed().as_secs_f64();
-    assert!(share < 0.25, "it costs {share} of a core, in a build without optimization");
-    client.leave().await;
-    until("it is gone", async || containers(&server).is_empty()).await;
 }
 
 #[actix_rt::test]

@@ -18,23 +18,18 @@ async fn takes_clients(server: &Server) -> bool {
 #[actix_rt::test]
 async fn everything_is_gone_soon_after_the_server_was_killed() {
     let Some(_docker) = docker().await else { return };
-    let (mut server, _client) = running(server(2)).await;
-    Client::start(&server, &arm()).await.patiently("webots:").await;
-    server.signal(Signal::SIGKILL);
-    server.ended().await;
-    let begin = Instant::now();
-    until("the containers are gone", async || containers(&server).is_empty()).await;
-    assert!(begin.elapsed() < GONE, "{:?}", begin.elapsed());
-}
-
-#[actix_rt::test]
-async fn a_server_that_stops_leaves_nothing() {
-    let Some(_docker) = docker().await else { return };
-    let (mut server, _client) = running(server(2)).await;
-    let mut starting = Client::start(&server, &arm()).await;
-    starting.patiently("loading: Creating network").await;
-    server.stops().await;
-    until("the containers are gone", async || containers(&server).is_empty()).await;
+    for (signal, words, code) in
+        [(Signal::SIGKILL, "webots:", None), (Signal::SIGTERM, "loading: Creating network", Some(0))]
+    {
+        let (mut server, _client) = running(server(2)).await;
+        let mut other = Client::start(&server, &arm()).await;
+        other.patiently(words).await;
+        server.signal(signal);
+        assert_eq!(server.ended().await, code);
+        let begin = Instant::now();
+        until("the containers are gone", async || containers(&server).is_empty()).await;
+        assert!(begin.elapsed() < GONE, "{:?}", begin.elapsed());
+    }
 }
 
 #[actix_rt::test]

@@ -1,12 +1,8 @@
 //! What a project may ask for in its webots.yml: an editor, a competition; and what the administrator relaxes.
 
-use std::time::{Duration, Instant};
-
 use serde_json::json;
 
-use super::daemon::{
-    ORDINARY, as_ordinary, ask, containers, docker, of_service, running, server, server_running, server_with,
-};
+use super::daemon::{ORDINARY, as_ordinary, ask, containers, docker, of_service, running, server, server_with};
 use super::image::NAME;
 use crate::support::{Client, WORLD, arm, is_told, until};
 
@@ -127,29 +123,6 @@ async fn what_an_image_keeps_at_home_is_found_and_can_be_changed() {
     inside("mkdir -p /usr/local/webots-project/deep && touch /usr/local/webots-project/deep/new");
     client.leave().await;
     until("all is gone", async || containers(&server).is_empty()).await;
-}
-
-#[actix_rt::test]
-async fn resets_without_end_start_a_controller_once_a_second_at_most() {
-    let Some(_docker) = docker().await else { return };
-    let controller = format!(
-        "FROM {NAME}\nCOPY . /usr/local/webots-project/controllers\nCMD echo x >>/tmp/webots/starts; exec sleep 1000\n"
-    );
-    let yml = "dockerCompose: \"competition:webots-project/controllers/c\"\n";
-    let server = server_running("echo .\nwhile :; do echo reset; done");
-    server.forge().commit("lab/arm", "main", &[("controllers/Dockerfile", &controller), ("webots.yml", yml)]);
-    let (server, _client) = running(server).await;
-    let webots = of_service(&server, "webots")[0].clone();
-    let starts = || ask(&["exec", &webots, "sh", "-c", "cat /tmp/webots/starts || true"]).lines().count();
-    let (begin, before) = (Instant::now(), starts());
-    until("it has been started again and again", async || starts() >= before + 4).await;
-    let count = starts() - before;
-    assert!(
-        begin.elapsed() >= Duration::from_secs((count as u64).saturating_sub(2)),
-        "{count} starts in {:?}",
-        begin.elapsed()
-    );
-    assert!(server.log().len() < 100_000);
 }
 
 #[actix_rt::test]

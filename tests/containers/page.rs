@@ -1,10 +1,9 @@
-//! docs/containers.md by doing: its commands and its files as they stand; and of docs/scaling.md what needs root.
+//! docs/containers.md by doing: its commands and its files as they stand.
 //!
 //! | stands in | for | because |
 //! |---|---|---|
 //! | a script that does nothing | `apt-get`, `systemctl` | the machine of the tests stays as it is |
 //! | `docker image inspect` | `docker pull` | no registry can be reached: what is pulled has to be there by that name |
-//! | scripts | `certbot`, `docker` | no certificate authority and no Swarm are here |
 //! | `setpriv` | `sudo` | the user of the package is not on this machine: another one who is not root |
 
 use std::os::unix::fs::symlink;
@@ -25,7 +24,7 @@ struct Machine(tempfile::TempDir);
 impl Machine {
     fn new() -> Self {
         let machine = Self(open_folder());
-        for part in ["bin", "work", "etc/webots-fleet/simulation", "renewed"] {
+        for part in ["bin", "work", "etc/webots-fleet/simulation"] {
             std::fs::create_dir_all(machine.0.path().join(part)).unwrap();
         }
         machine
@@ -93,27 +92,4 @@ async fn the_dockerfile_of_the_page_on_containers_is_built_and_runs() {
     let (server, _client) = running(server.set("container", serde_json::json!({ "image": image }))).await;
     let made = "/usr/local/webots-project/controllers/mine/made";
     ask(&["exec", &of_service(&server, "webots")[0], "ls", made]);
-}
-
-#[actix_rt::test]
-async fn the_certificate_of_the_page_on_scaling_is_made_and_renewed() {
-    let Some(_docker) = docker().await else { return };
-    let machine = Machine::new();
-    let folder = machine.0.path();
-    for (name, text) in [("fullchain.pem", "a new chain"), ("privkey.pem", "a new key")] {
-        std::fs::write(folder.join("renewed").join(name), text).unwrap();
-    }
-    // It asks its authority, and then runs what it was given for that.
-    machine.script("certbot", "export RENEWED_LINEAGE=$FOLDER/renewed\nexec sh -ec \"${!#}\"");
-    machine.script("docker", "[ $1 = kill ] || { echo door; exit; }\necho \"$*\" >$FOLDER/kill");
-    let commands = page::blocks(&page::page("scaling.md"), "sh").concat();
-    let shown = "openssl x509 -in $PWD/tls.crt -noout -subject; stat -c '%u %a' tls.key; ls -la";
-    // Before certbot is asked, the door has a certificate of its own making that its user may read.
-    let (before, after) = commands.split_once("# After it:").unwrap();
-    let told = machine.run(&format!("{before}\n{shown}\n{after}\ncat tls.crt tls.key; stat -c '%u %a' tls.key"));
-    for words in ["fleet.example.org", "a new chain", "a new key"] {
-        assert!(told.contains(words), "{words} is not in {told}");
-    }
-    assert_eq!(told.matches("101 600").count(), 2, "{told}");
-    assert_eq!(std::fs::read_to_string(folder.join("kill")).unwrap(), "kill --signal HUP door\n");
 }

@@ -62,7 +62,8 @@ fn settings<'all>(objects: &'all [Value], name: &str, key: &str) -> &'all str {
 }
 
 #[test]
-fn all_that_kustomize_makes_keeps_to_the_published_schemas() {
+fn all_that_kustomize_makes_keeps_to_the_published_schemas_and_names_images_of_the_dockerfile() {
+    let dockerfile = std::fs::read_to_string(project("deploy/docker/Dockerfile")).unwrap();
     let python = text(Command::new(project("tests/python.sh")).output().unwrap());
     for Made { name, yaml, objects } in &*ALL {
         let file = tempfile::Builder::new().suffix(".yaml").tempfile().unwrap();
@@ -75,6 +76,13 @@ fn all_that_kustomize_makes_keeps_to_the_published_schemas() {
         let own = objects.iter().filter(|object| object["kind"] != "ServiceMonitor").count();
         assert!(passed == own && own >= 17, "{name}: {passed} of {own}\n{told}");
         assert!(!told.contains("ERROR") || *name == "base with components", "{name}: {told}");
+        for image in yaml.split("image: webots-fleet/").skip(1).filter_map(|rest| rest.lines().next()) {
+            let (stage, tag) = image.split_once(':').unwrap();
+            assert!(
+                dockerfile.contains(&format!(" AS {stage}\n")) && tag == env!("CARGO_PKG_VERSION"),
+                "{name}: {image}"
+            );
+        }
     }
 }
 
@@ -108,31 +116,6 @@ fn pods_pass_the_restricted_standard_but_for_those_that_draw_on_the_nodes_displa
 }
 
 #[test]
-fn the_images_are_stages_of_the_dockerfile() {
-    let dockerfile = std::fs::read_to_string(project("deploy/docker/Dockerfile")).unwrap();
-    let version = env!("CARGO_PKG_VERSION");
-    for Made { name, yaml, .. } in &*ALL {
-        let lines = yaml.lines().map(|line| line.trim_start_matches([' ', '-']));
-        let images: Vec<&str> = lines.filter_map(|line| line.strip_prefix("image: ")).collect();
-        assert_eq!(images.len(), 3, "{name}");
-        for image in images.into_iter().filter_map(|image| image.strip_prefix("webots-fleet/")) {
-            let (stage, tag) = image.split_once(':').unwrap();
-            assert!(dockerfile.contains(&format!(" AS {stage}\n")) && tag == version, "{name}: {image}");
-            assert!(dockerfile.contains(&format!("--target {stage} ")), "how {image} is built is not told");
-        }
-    }
-    // What is copied into images is there, and is given to the build.
-    let given = std::fs::read_to_string(project(".dockerignore")).unwrap();
-    for line in dockerfile.lines().filter_map(|line| line.strip_prefix("COPY ")).filter(|line| !line.starts_with("--"))
-    {
-        let source = line.split(' ').next().unwrap();
-        assert!(project(source).exists(), "{source}");
-        let is_given = |line: &str| line.strip_prefix('!').is_some_and(|folder| source.starts_with(folder));
-        assert!(source == "." || given.lines().any(is_given), "{source}");
-    }
-}
-
-#[test]
 fn the_configurations_are_taken_as_pods_get_them() {
     let programs =
         [("session", env!("CARGO_BIN_EXE_session-server")), ("simulation", env!("CARGO_BIN_EXE_simulation-server"))];
@@ -161,5 +144,31 @@ fn the_configurations_are_taken_as_pods_get_them() {
                 assert!(grace > config["timeout"].as_f64(), "{name}: a simulation would not end by itself");
             }
         }
+    }
+}
+
+/// `tests/swarm.sh` runs those on Swarm.
+#[test]
+fn the_servers_and_the_door_on_swarm_are_those_of_the_demo() {
+    let read = |path: &str| std::fs::read_to_string(project("deploy").join(path)).unwrap();
+    for file in ["session.json", "simulation.json"] {
+        assert_eq!(read(&format!("swarm/{file}")), read(&format!("kubernetes/overlays/demo/{file}")), "{file}");
+    }
+    assert_eq!(read("swarm/simulation-gpu.json"), read("kubernetes/overlays/gpu/simulation.json"));
+    let rules = |file: &str, beginning: &str| -> Vec<String> {
+        read(file).lines().map(str::trim).filter(|line| line.starts_with(beginning)).map(str::to_owned).collect()
+    };
+    let (swarm, kubernetes, door) = ("swarm/door.conf", "kubernetes/base/config/fleet.conf", "nginx-door.conf");
+    let proxy = ["proxy_read_timeout ", "proxy_connect_timeout ", "proxy_pass http://$fleet_address"];
+    for beginning in ["rewrite ", "add_header ", "location ", "if ("].into_iter().chain(proxy) {
+        assert!(!rules(swarm, beginning).is_empty(), "{beginning}");
+        assert_eq!(rules(swarm, beginning), rules(kubernetes, beginning));
+    }
+    // What keeps secrets from Webots, and forged headers from servers, is that of every door.
+    for header in ["Authorization", "Cookie", "X-Forwarded-User", "X-Forwarded-For", "Forwarded", "Host", "Upgrade"] {
+        let rule = format!("proxy_set_header {header} ");
+        let wanted = rules(door, &rule);
+        assert!(!wanted.is_empty(), "{header}");
+        assert_eq!([rules(swarm, &rule), rules(kubernetes, &rule)], [wanted.clone(), wanted]);
     }
 }

@@ -1,4 +1,5 @@
-//! Where the servers listen if `bind` says nothing: on all addresses of IPv4 and IPv6.
+//! Where a server listens if `bind` says nothing: on all addresses of IPv4 and IPv6. Both kinds of servers listen by the same
+//! function.
 
 use std::process::Command;
 
@@ -31,21 +32,14 @@ fn without_a_word_on_it_a_server_listens_on_both_families() {
         assert!(std::env::var_os("CI").is_none(), "unshare --net is not allowed here");
         return crate::support::skip("deploy::listening", "unshare --net is not allowed here");
     };
-    for (program, more) in [
-        (env!("CARGO_BIN_EXE_session-server"), json!({"simulationServers": []})),
-        (env!("CARGO_BIN_EXE_simulation-server"), json!({})),
-    ] {
-        let folder = tempfile::tempdir().unwrap();
-        let inside = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
-        let mut config =
-            json!({"server": "localhost", "port": 2000, "logDir": inside("log"), "cacheDir": inside("cache")});
-        config.as_object_mut().unwrap().extend(more.as_object().unwrap().clone());
-        std::fs::write(inside("config.json"), config.to_string()).unwrap();
-        let mut command = Command::new("timeout");
-        command.args(["60"]).args(own_network.split(' ')).args(["bash", "-c", ASK, "ask", program]);
-        let output = command.args([&inside("config.json"), "2000"]).output().unwrap();
-        let said = String::from_utf8(output.stdout).unwrap();
-        let errors = String::from_utf8_lossy(&output.stderr);
-        assert_eq!(said.replace('\r', ""), "HTTP/1.0 200 OK\nHTTP/1.0 200 OK\n", "{program}: {errors}");
-    }
+    let folder = tempfile::tempdir().unwrap();
+    let inside = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    let config = json!({"server": "localhost", "port": 2000, "logDir": inside("log"), "simulationServers": []});
+    std::fs::write(inside("config.json"), config.to_string()).unwrap();
+    let mut command = Command::new("timeout");
+    command.args(["60"]).args(own_network.split(' ')).args(["bash", "-c", ASK, "ask"]);
+    let output = command.args([env!("CARGO_BIN_EXE_session-server"), &inside("config.json"), "2000"]).output().unwrap();
+    let said = String::from_utf8(output.stdout).unwrap();
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(said.replace('\r', ""), "HTTP/1.0 200 OK\nHTTP/1.0 200 OK\n", "{errors}");
 }

@@ -2,7 +2,6 @@
 
 mod containers;
 mod display;
-mod drain;
 mod files;
 mod kubernetes;
 mod listening;
@@ -12,4 +11,3 @@ mod ports;
 mod preflight;
 mod prometheus;
 mod scaling;
-mod swarm;

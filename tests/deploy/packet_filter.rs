@@ -6,7 +6,6 @@ use std::net::{SocketAddr, TcpListener, TcpStream, UdpSocket};
 use std::os::fd::AsRawFd;
 use std::path::Path;
 use std::process::Command;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use nix::sched::{CloneFlags, setns, unshare};
@@ -85,21 +84,17 @@ impl Place {
         for socket in [&from, to] {
             socket.set_read_timeout(Some(Duration::from_millis(10))).unwrap();
         }
-        // Those of before may still be under way.
-        static SENT: AtomicU64 = AtomicU64::new(0);
-        let word = SENT.fetch_add(1, Ordering::Relaxed).to_be_bytes();
-        let hears = || {
-            let mut heard = [0; 8];
-            to.recv(&mut heard).is_ok() && heard == word
-        };
+        // Those of other sockets may still be under way.
+        let own = from.local_addr().unwrap().port();
+        let arrives = || to.recv_from(&mut [0; 8]).is_ok_and(|(_, sender)| sender.port() == own);
         // A sender is told of an earlier datagram that was refused.
         let is_told = |result: io::Result<usize>| result.is_err_and(|error| error.kind() == ErrorKind::HostUnreachable);
         let deadline = Instant::now() + SOON;
         while Instant::now() < deadline {
-            if is_told(from.send(&word)) || is_told(from.recv(&mut [0; 9])) {
+            if is_told(from.send(b"word")) || is_told(from.recv(&mut [0; 8])) {
                 return false;
             }
-            if hears() {
+            if arrives() {
                 return true;
             }
         }

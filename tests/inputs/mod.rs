@@ -5,18 +5,23 @@
 //! `regressions.txt` beside this file, and is tried first from then on. What Webots prints is tried where it is read:
 //! `PROPTEST_CASES=1000000 cargo test --lib every_line_is_short`.
 
-mod client_message;
-mod configuration;
-mod forwarded;
 mod mutations;
-mod report;
-mod webots_yml;
-mod world_url;
 
+use std::net::IpAddr;
+use std::path::{Component, Path};
 use std::time::Duration;
 
+use actix_web::http::header::HeaderValue;
+use actix_web::test::TestRequest;
 use nix::time::ClockId;
 use proptest::test_runner::{Config, FileFailurePersistence, TestRunner};
+use webots_fleet::session::config::SessionConfig;
+use webots_fleet::shared::config::{Configuration, load};
+use webots_fleet::shared::domain::{Load, ProjectUrl, ServerReport};
+use webots_fleet::shared::http::{Peer, TrustedProxies};
+use webots_fleet::simulation::config::SimulationConfig;
+use webots_fleet::simulation::container::{ProjectKind, WebotsYml};
+use webots_fleet::simulation::protocol::{ClientRequest, error};
 
 /// How many cases of each kind are tried where nothing else is asked for.
 const CASES: u32 = 3_000;
@@ -46,4 +51,162 @@ fn processor_time() -> Duration {
 /// Whether a text is one line that a terminal or a page shows as it is.
 fn is_one_line(text: &str) -> bool {
     !text.chars().any(char::is_control)
+}
+
+/// What a web client sends.
+#[test]
+fn a_client_is_answered_in_the_form_of_the_protocol_whatever_it_sends() {
+    try_many(include_str!("seeds/client_message.txt"), |input| {
+        let text = String::from_utf8_lossy(input);
+        match ClientRequest::parse(&text) {
+            Ok(request) => {
+                let texts = [request.reset_controller, request.resume, request.start.map(|start| start.url)];
+                assert!(texts.into_iter().flatten().all(|one| one.len() <= text.len()));
+                assert!(serde_json::from_str::<serde_json::Value>(&text).is_ok());
+            }
+            Err(wrong) => {
+                let told = error(&wrong.to_string());
+                assert!(told.starts_with("loading: Error: Wrong message: "), "{told}");
+                // Webots' page puts the text into its HTML.
+                assert!(!told.contains(['<', '>', '&']) && is_one_line(&told), "{told}");
+                assert!(!told.contains("expected struct"), "{told}");
+            }
+        }
+    });
+}
+
+/// Configuration files of both servers.
+#[test]
+fn a_configuration_is_read_or_refused_in_one_line_whatever_is_in_it() {
+    let folder = tempfile::tempdir_in("/dev/shm").or_else(|_| tempfile::tempdir()).unwrap();
+    let file = folder.path().join("configuration.json");
+    try_many(include_str!("seeds/configuration.txt"), |input| {
+        std::fs::write(&file, input).unwrap();
+        is_read_or_refused::<SessionConfig>(&file);
+        is_read_or_refused::<SimulationConfig>(&file);
+    });
+}
+
+fn is_read_or_refused<C: Configuration>(file: &Path) {
+    match load::<C>(file) {
+        Ok(loaded) => {
+            assert!(loaded.warnings.iter().all(|warning| is_one_line(warning)), "{:?}", loaded.warnings)
+        }
+        Err(told) => {
+            assert!(told.contains("configuration.json") && is_one_line(&told), "{told}");
+        }
+    }
+}
+
+/// The header in which web servers tell whom they forward; anybody can write it.
+#[test]
+fn only_a_trusted_proxy_is_believed_and_only_addresses_are() {
+    let trusted: TrustedProxies = serde_json::from_str(r#"["127.0.0.0/8", "10.0.0.0/8"]"#).unwrap();
+    let stranger: IpAddr = "203.0.113.9".parse().unwrap();
+    let proxy: IpAddr = "127.0.0.1".parse().unwrap();
+    try_many(include_str!("seeds/forwarded.txt"), |input| {
+        let Ok(value) = HeaderValue::from_bytes(input) else {
+            return;
+        };
+        let from = |address: IpAddr| {
+            let request = TestRequest::default().peer_addr((address, 4000).into());
+            trusted.peer(&request.insert_header(("x-forwarded-for", value.clone())).to_http_request())
+        };
+        assert_eq!(from(stranger), Peer::Client(stranger));
+        match from(proxy) {
+            Peer::Client(address) | Peer::Proxy(address) if address == proxy => {}
+            Peer::Client(address) => assert!(is_named(input, address), "{address} from {value:?}"),
+            other => panic!("{other:?} from {value:?}"),
+        }
+    });
+}
+
+/// Whether a header names an address, in whatever spelling.
+fn is_named(header: &[u8], address: IpAddr) -> bool {
+    let text = String::from_utf8_lossy(header);
+    let pieces = || text.split([',', ';', '=', ' ', '\t', '"', '[', ']', '%']);
+    let ports = pieces().filter_map(|piece| piece.rsplit_once(':')).map(|(host, _)| host);
+    pieces().chain(ports).filter_map(|piece| piece.parse::<IpAddr>().ok()).any(|one| one.to_canonical() == address)
+}
+
+/// What a simulation server answers, or whatever is listed as one.
+#[test]
+fn a_report_is_a_load_and_short_lines_whatever_a_server_answers() {
+    let world = ProjectUrl::parse("https://github.com/lab/arm/blob/main/worlds/a.wbt").unwrap();
+    try_many(include_str!("seeds/report.txt"), |input| {
+        let Ok(report) = ServerReport::parse(input) else {
+            return;
+        };
+        assert!(report.load.percent().is_finite() && report.load.percent() >= 0.0, "{report:?}");
+        assert!(is_one_line(&report.version), "{report:?}");
+        assert!(report.problem.as_deref().is_none_or(is_one_line), "{report:?}");
+        if let Some(instances) = report.instances {
+            assert!(instances.present() >= instances.running, "{report:?}");
+        }
+        // It answers, whatever the rules are.
+        std::hint::black_box(report.accepts(&world));
+        let again = serde_json::to_vec(&report).unwrap();
+        assert!(ServerReport::parse(&again).is_ok(), "{report:?}");
+    });
+}
+
+#[test]
+fn a_load_is_a_number_from_0_whatever_a_server_answers() {
+    try_many(include_str!("seeds/load.txt"), |input| {
+        if let Ok(load) = Load::parse(input) {
+            assert!(load.percent().is_finite() && load.percent() >= 0.0, "{load:?}");
+        }
+    });
+}
+
+/// `webots.yml` of a project.
+#[test]
+fn a_project_asks_for_nothing_outside_of_itself_whatever_is_in_its_webots_yml() {
+    try_many(include_str!("seeds/webots_yml.txt"), |input| {
+        // Each example is a line of its file.
+        let text = String::from_utf8_lossy(input).replace("\\n", "\n").replace("\\r", "\r");
+        let found = WebotsYml::parse(&text);
+        assert!(found.warnings.iter().all(|warning| is_one_line(warning)), "{:?}", found.warnings);
+        if let Some(message) = &found.project_type {
+            let line = message.strip_suffix('\n').unwrap();
+            assert!(is_one_line(line) && line.starts_with("type:") && line.len() <= 200, "{message:?}");
+        }
+        if found.kind != ProjectKind::Default {
+            let folder = &found.folder;
+            assert!(folder.starts_with("webots-project") && is_one_line(folder), "{folder:?}");
+            assert!(!folder.contains([':', '$', '\\', '"', '\'', '`', '#']), "{folder:?}");
+            let inside = found.folder_in_project();
+            assert!(inside.components().all(|part| matches!(part, Component::Normal(_))), "{inside:?}");
+        }
+    });
+}
+
+/// The URL of a world: no path outside of the repository, no option of git, nothing that a shell or a page would run.
+#[test]
+fn a_world_is_inside_of_its_repository_whatever_its_url_says() {
+    try_many(include_str!("seeds/world_url.txt"), |input| {
+        let text = String::from_utf8_lossy(input);
+        match ProjectUrl::parse(&text) {
+            Ok(world) => is_safe(&world),
+            Err(wrong) => {
+                let told = wrong.to_string();
+                assert!(told.starts_with("Wrong Webots simulation URL: "), "{told}");
+            }
+        }
+    });
+}
+
+fn is_safe(world: &ProjectUrl) {
+    for segment in world.segments() {
+        assert!(!segment.is_empty() && segment != "." && segment != "..", "{world:?}");
+        assert!(!segment.contains(['/', '\\']) && is_one_line(segment), "{world:?}");
+    }
+    assert!(!world.host().starts_with('-') && !world.host().contains(['/', '@', ' ', '\\']), "{world:?}");
+    assert!(world.repository().starts_with("https://"), "{world:?}");
+    assert!(world.world().to_ascii_lowercase().ends_with(".wbt"), "{world:?}");
+    let inside = world.candidates();
+    assert!(!inside.is_empty(), "{world:?}");
+    for reading in inside {
+        assert!(!reading.folder.starts_with('/') && !reading.folder.split('/').any(|name| name == ".git"), "{world:?}");
+    }
 }

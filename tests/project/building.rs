@@ -1,12 +1,11 @@
 //! What `server.sh` builds, with a cargo that only notes what it is asked for and hands out the programs under test.
 
-use std::os::unix::fs::PermissionsExt;
 use std::process::Command;
 
 use super::copy::{Project, programs};
+use crate::support::make_program;
 
-const CARGO: &str = r#"#!/bin/sh
-echo "$@" >>calls
+const CARGO: &str = r#"echo "$@" >>calls
 mkdir -p target/release
 cp --remove-destination "$PROGRAMS"/session-server "$PROGRAMS"/simulation-server "$PROGRAMS"/demo-simulator target/release
 "#;
@@ -43,8 +42,7 @@ fn a_start_builds_the_programs_that_it_starts_when_their_source_has_changed() {
     for file in ["Cargo.toml", "Cargo.lock", "rust-toolchain.toml", "src/lib.rs"] {
         std::fs::write(project.path(file), "").unwrap();
     }
-    std::fs::write(project.path("bin-of-cargo/cargo"), CARGO).unwrap();
-    std::fs::set_permissions(project.path("bin-of-cargo/cargo"), PermissionsExt::from_mode(0o755)).unwrap();
+    make_program(&project.path("bin-of-cargo/cargo"), CARGO);
     let servers = "build --release --locked --bin simulation-server --bin session-server";
 
     let (said, asked) = start(&project, "demo");

@@ -6,13 +6,10 @@ use std::time::Duration;
 
 use serde_json::{Value, json};
 
-use crate::support::{holds_soon, http, ports};
+use crate::support::{holds_soon, ports};
 
 /// How long `server.sh` may take for anything.
 const LIMIT: Duration = Duration::from_secs(90);
-
-/// How long this machine may be too busy to take a client.
-const BUSY: Duration = Duration::from_secs(180);
 
 /// The folder of the project under test.
 pub fn root() -> &'static Path {
@@ -51,6 +48,8 @@ impl Project {
                 config["bind"] = "127.0.0.1".into();
                 config["simulationServers"] = json!([format!("localhost:{}", session + 1)]);
                 config["loadRefresh"] = 0.1.into();
+                // Whatever else keeps this machine busy closes no server.
+                config["loadThreshold"] = 1000.into();
             });
             project.configure(&format!("simulation/{name}"), |config| {
                 config["port"] = (session + 1).into();
@@ -80,7 +79,17 @@ impl Project {
 
     /// Runs `server.sh`, from another folder.
     pub async fn server_sh(&self, arguments: &[&str]) -> Outcome {
-        run(&self.path("server.sh"), self.temporary.path(), arguments).await
+        let command = tokio::process::Command::new(self.path("server.sh"))
+            .args(arguments)
+            .current_dir(self.temporary.path())
+            .env("FLEET_BIN", programs())
+            .stdin(Stdio::null())
+            .kill_on_drop(true)
+            .output();
+        let output = actix_rt::time::timeout(LIMIT, command).await;
+        let output = output.unwrap_or_else(|_| panic!("server.sh {arguments:?} does not end")).unwrap();
+        let text = |bytes| String::from_utf8(bytes).unwrap();
+        Outcome { code: output.status.code(), output: text(output.stdout), errors: text(output.stderr) }
     }
 
     /// The same, for what has to succeed; gives back what it prints.
@@ -91,16 +100,6 @@ impl Project {
         let faults = outcome.errors.lines().filter(|line| !line.starts_with("warning: git-lfs: "));
         assert_eq!(faults.collect::<Vec<_>>(), Vec::<&str>::new(), "{arguments:?}: {outcome:#?}");
         outcome.output
-    }
-
-    /// Waits until a client can be placed. A machine that is busy with something else takes none: its load is real.
-    pub async fn available(&self) {
-        let deadline = std::time::Instant::now() + BUSY;
-        while http::get(&self.session_url("/request")).await.text() != "1" {
-            let load = http::get(&self.session_url("/load")).await.text();
-            assert!(std::time::Instant::now() < deadline, "this machine is too busy: its load is {load} %");
-            actix_rt::time::sleep(Duration::from_millis(100)).await;
-        }
     }
 
     /// A URL of the session server.
@@ -151,21 +150,6 @@ impl Drop for Project {
 /// The folder of the programs under test.
 pub fn programs() -> &'static Path {
     Path::new(env!("CARGO_BIN_EXE_session-server")).parent().unwrap()
-}
-
-/// Runs a script to its end.
-pub async fn run(script: &Path, folder: &Path, arguments: &[&str]) -> Outcome {
-    let command = tokio::process::Command::new(script)
-        .args(arguments)
-        .current_dir(folder)
-        .env("FLEET_BIN", programs())
-        .stdin(Stdio::null())
-        .kill_on_drop(true)
-        .output();
-    let output = actix_rt::time::timeout(LIMIT, command).await;
-    let output = output.unwrap_or_else(|_| panic!("{} {arguments:?} does not end", script.display())).unwrap();
-    let text = |bytes| String::from_utf8(bytes).unwrap();
-    Outcome { code: output.status.code(), output: text(output.stdout), errors: text(output.stderr) }
 }
 
 /// The processes that work in a folder or below it.

@@ -40,34 +40,15 @@ async fn what_runs_already_is_not_started_twice() {
     // The other configuration has the same ports.
     let told = refused(&project, &["start", "local"], 1).await;
     assert!(told.contains("in use") && told.contains("this runs already: demo"), "{told}");
+    // What is missing is started beside what runs.
+    let alive = project.pid("simulation", "demo");
+    kill(Pid::from_raw(project.pid("session", "demo")), Signal::SIGKILL).unwrap();
+    let is_gone =
+        async || project.server_sh(&["status", "demo"]).await.output.contains("the session server does not run");
+    until("it is gone", is_gone).await;
+    let told = project.done(&["start", "demo"]).await;
+    assert!(told.contains(&format!("the simulation server of demo already runs (process {alive})")), "{told}");
     assert_eq!(http::get(&project.session_url("/health")).await.text(), "ok");
-}
-
-#[actix_rt::test]
-async fn what_is_missing_is_started_beside_what_runs() {
-    let project = Project::copy();
-    project.done(&["start", "demo"]).await;
-    for (gone, other) in [("session", "simulation"), ("simulation", "session")] {
-        let (dead, alive) = (project.pid(gone, "demo"), project.pid(other, "demo"));
-        kill(Pid::from_raw(dead), Signal::SIGKILL).unwrap();
-        until("it is gone", async || {
-            project.server_sh(&["status", "demo"]).await.output.contains(&format!("the {gone} server does not run"))
-        })
-        .await;
-        // What runs goes on, also where the other can't start.
-        let port = if gone == "session" { project.session } else { project.simulation };
-        let listener = TcpListener::bind(("127.0.0.1", port)).unwrap();
-        let told = refused(&project, &["start", "demo"], 1).await;
-        assert!(told.contains(&format!("the {gone} server of demo has not started")), "{told}");
-        drop(listener);
-        assert_eq!(project.pid(other, "demo"), alive);
-        let told = project.done(&["start", "demo"]).await;
-        assert!(told.contains(&format!("the {other} server of demo already runs (process {alive})")), "{told}");
-        assert_eq!(project.pid(other, "demo"), alive);
-        assert_ne!(project.pid(gone, "demo"), dead);
-    }
-    let told = refused(&project, &["start", "demo"], 1).await;
-    assert!(told.matches("already runs").count() == 2 && told.contains("restart demo"), "{told}");
 }
 
 #[actix_rt::test]

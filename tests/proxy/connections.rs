@@ -1,60 +1,63 @@
-//! Long connections: quiet times, and web servers that are told to read their configuration again or are restarted.
+//! Long connections: quiet times, live pages, and web servers that are told to read their configuration again or are restarted.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
+use futures_util::StreamExt;
+
+use super::browser::Browser;
 use super::fleet::{Fleet, IDLE};
 use super::rules::Rules;
+use crate::support::SOON;
 use crate::support::client::{Client, Heard};
 
 /// Longer than the web server's patience.
 const QUIET: Duration = Duration::from_millis(IDLE.as_millis() as u64 * 3 / 2);
 
-async fn quiet_connections_last_and_live_pages_go_on(rules: Rules) {
-    let fleet = Fleet::start(rules).await;
+/// Events come at once and go on for longer than the web server waits for a word.
+async fn is_told_what_happens(browser: &Browser, path: &str) {
+    let url = format!("https://{}{path}", browser.host);
+    let mut events = browser.begin(&url, &[("Accept", "text/event-stream")]).await;
+    assert_eq!(events.status(), 200, "{path}");
+    let begun = Instant::now();
+    while begun.elapsed() < QUIET {
+        let event = actix_rt::time::timeout(SOON, events.next()).await.expect("nothing is told");
+        event.unwrap_or_else(|| panic!("{path}: the end")).unwrap();
+    }
+}
+
+async fn quiet_connections_last_and_a_restart_costs_only_connections_of_its_own(rules: Rules) {
+    let mut fleet = Fleet::start(rules).await;
+    quiet_connections_last(&fleet).await;
+    restarts(&mut fleet).await;
+}
+
+through_both!(quiet_connections_last_and_a_restart_costs_only_connections_of_its_own);
+
+async fn quiet_connections_last(fleet: &Fleet) {
     let browser = &fleet.browser;
-    let mut door = browser.connect(&rules.session_path(fleet.session.port, "/session")).await;
+    let mut door = browser.connect("/session").await;
     let mut idle = browser.open(&format!("{}/client", fleet.wss(&fleet.here))).await;
     let (mut client, stream) = fleet.simulate(browser, &fleet.there).await;
     let mut viewer = browser.open(&format!("{stream}/")).await.with_scene().await;
     viewer.send("pause").await;
     viewer.until("paused by client").await;
     // Nothing but pings goes over these connections; over Webots' stream not even these.
-    let live = super::pages::pages_are_live(&fleet, rules);
-    let (is_silent, ()) = futures_util::join!(idle.is_silent(QUIET), live);
+    let here = format!("/{}/events", fleet.here.port);
+    let (is_silent, (), ()) = futures_util::join!(
+        idle.is_silent(QUIET),
+        is_told_what_happens(browser, &here),
+        is_told_what_happens(browser, "/events")
+    );
     assert!(is_silent, "{:?}", idle.heard);
     viewer.send("real-time:-1").await;
     viewer.until("application/json:").await;
     client.until(".").await;
-    a_door_still_answers(&mut door).await;
-}
-
-/// With a URL; or with an error, if the machine that runs the tests is too busy for a simulation.
-async fn a_door_still_answers(door: &mut Client) {
+    // With a URL; or with an error, if the machine that runs the tests is too busy for a simulation.
     door.send("").await;
-    loop {
-        match door.next().await {
-            Heard::Text(text) if text.len() > 1 => return,
-            Heard::Text(_) => {}
-            Heard::Closed(frame) => panic!("closed: {frame:?}"),
-        }
-    }
+    while door.until("").await.len() == 1 {}
 }
 
-through_both!(quiet_connections_last_and_live_pages_go_on);
-
-#[actix_rt::test]
-async fn the_documents_rules_keep_what_is_pinged_and_cut_what_is_silent() {
-    let fleet = Fleet::start(Rules::Documents).await;
-    let mut door = fleet.browser.connect(&format!("/{}/session", fleet.session.port)).await;
-    let (mut client, stream) = fleet.simulate(&fleet.browser, &fleet.here).await;
-    let mut viewer = fleet.browser.open(&format!("{stream}/")).await.with_scene().await;
-    viewer.closed().await;
-    client.until(".").await;
-    a_door_still_answers(&mut door).await;
-}
-
-async fn a_restart_costs_only_connections_of_its_own(rules: Rules) {
-    let mut fleet = Fleet::start(rules).await;
+async fn restarts(fleet: &mut Fleet) {
     let (mut proxied, _) = fleet.simulate(&fleet.browser, &fleet.here).await;
     let mut direct = Client::start(&fleet.here, &super::fleet::arm()).await;
     direct.until("webots:").await;
@@ -81,5 +84,3 @@ async fn a_restart_costs_only_connections_of_its_own(rules: Rules) {
     fleet.both_up().await;
     assert!(!passing_by.is_finished(), "a connection past the web server was closed: {:?}", passing_by.await);
 }
-
-through_both!(a_restart_costs_only_connections_of_its_own);

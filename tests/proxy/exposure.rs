@@ -1,15 +1,18 @@
-//! Which ports of the machine are reachable from outside, and where pages are sent on.
+//! Which ports of the machine are reachable from outside, what arrives there, and whose limits count.
 
 use std::net::TcpListener;
+use std::sync::mpsc::channel;
+
+use serde_json::json;
 
 use super::browser::Browser;
 use super::fleet::Fleet;
-use super::rules::{Place, Rules};
+use super::rules::Rules;
 use super::users::oauth2_proxy;
-use super::web_server::{Kind, WebServer};
+use super::web_server::Kind;
 use crate::support::http::PASSWORD;
 use crate::support::listener::listen;
-use crate::support::ports;
+use crate::support::{Builder, until};
 
 /// A service of the machine that belongs to no fleet: a database's page of administration, say. It runs until the
 /// test program ends.
@@ -20,16 +23,15 @@ pub fn private_service() -> u16 {
     port
 }
 
-/// All that one fleet can show of where requests lead.
+/// All that one fleet can show of where requests lead, and of whom they are.
 async fn requests_lead_to_the_fleet_and_nowhere_else(rules: Rules) {
-    let fleet = Fleet::start(rules).await;
+    let keys = |server: Builder| server.set("trustedProxies", json!(["127.0.0.1"])).set("maxClientsPerAddress", 2);
+    let fleet = Fleet::start_with(rules, keys).await;
     only_the_fleet_is_reachable(&fleet).await;
     an_editor_is_at_the_port_of_its_webots_and_500_more(&fleet).await;
     pages_are_sent_on_to_https_and_the_bare_name(&fleet.browser).await;
-    super::pages::pages_are_complete(&fleet, rules).await;
-    super::pages::what_webots_sends_has_an_origin_of_its_own(&fleet, rules).await;
-    super::encoded::paths_arrive(&fleet, rules).await;
-    super::encoded::what_is_sent_in_pieces_comes_in_pieces(&fleet).await;
+    paths_arrive(&fleet, rules).await;
+    limits_are_for_each_client(&fleet).await;
 }
 
 through_both!(requests_lead_to_the_fleet_and_nowhere_else);
@@ -41,7 +43,6 @@ async fn only_the_fleet_is_reachable(fleet: &Fleet) {
     let session = fleet.session.port;
     let tricks = [
         format!("/{private}/"),
-        format!("/{private}/x"),
         format!("//{private}/"),
         format!("/{here}/../{private}/"),
         format!("/{here}/%2e%2e/{private}/"),
@@ -52,11 +53,8 @@ async fn only_the_fleet_is_reachable(fleet: &Fleet) {
         format!("/0{private}/"),
         format!("/{here}0/"),
         format!("/{session}/x"),
-        format!("/{session}/{private}/"),
         format!("/{session}/../{private}/"),
-        format!("/{session}@127.0.0.1:{private}/"),
         format!("/{session}0/status"),
-        format!("/{here}/{private}"),
         format!("/assets/../{private}/"),
         "/server-status".to_owned(),
         // What is for administrators alone.
@@ -81,6 +79,74 @@ async fn an_editor_is_at_the_port_of_its_webots_and_500_more(fleet: &Fleet) {
     assert_eq!(answer.header("content-security-policy"), Some("sandbox allow-scripts"));
     // The simulation server itself has no editor.
     assert_eq!(fleet.browser.get(&format!("/{}/", editor - 1)).await.status, 404);
+}
+
+/// What is asked for, and what arrives through Apache and through nginx; nothing where they refuse.
+const PATHS: [(&str, Option<&str>, Option<&str>); 13] = [
+    ("/textures/my%20file.png", Some("/textures/my%20file.png"), Some("/textures/my%20file.png")),
+    ("/%C3%BC+%2B.png?x=a%20b&y=%2F", Some("/%C3%BC++.png?x=a%20b&y=%2F"), Some("/%C3%BC++.png?x=a%20b&y=%2F")),
+    ("/a%25b.png", Some("/a%25b.png"), Some("/a%25b.png")),
+    ("/a%252fb.png", Some("/a%252fb.png"), Some("/a%252fb.png")),
+    ("/a%23b.png", Some("/a%23b.png"), Some("/a%23b.png")),
+    // Apache takes a question mark in a name for an attack.
+    ("/a%3Fb.png", None, Some("/a%3Fb.png")),
+    // A name with a slash is that of a folder, or of nothing.
+    ("/a%2Fb.png", None, Some("/a/b.png")),
+    ("/a/%2e%2e/b.png", Some("/b.png"), Some("/b.png")),
+    ("/%2e%2e/b.png", None, None),
+    ("/a/..%2F..%2Fb.png", None, None),
+    // What would end a line stays a part of the name.
+    ("/a%0D%0AX:%20y.png", Some("/a%0D%0AX:%20y.png"), Some("/a%0D%0AX:%20y.png")),
+    ("/a%00.png", None, None),
+    ("//a.png", Some("/a.png"), Some("/a.png")),
+];
+
+/// Names of files with blanks and letters of any language arrive at a Webots, and no way leads out of its port.
+async fn paths_arrive(fleet: &Fleet, rules: Rules) {
+    let port = fleet.here.port + 2;
+    let (told, asked) = channel();
+    // Once the test has ended there is nobody to tell.
+    listen(TcpListener::bind(("127.0.0.1", port)).unwrap(), move |request| {
+        told.send(request.path().to_owned()).ok().map(|()| (200, "file"))
+    });
+    for (path, apache, nginx) in PATHS {
+        let wanted = if rules.kind() == Kind::Apache { apache } else { nginx };
+        let answer = fleet.browser.get(&format!("/{port}{path}")).await;
+        if wanted.is_some() {
+            assert_eq!((answer.status.as_u16(), answer.text().as_str()), (200, "file"), "{path}");
+        } else {
+            assert!([400, 403, 404].contains(&answer.status.as_u16()), "{path}: {}", answer.status);
+        }
+        assert_eq!(asked.try_recv().ok().as_deref(), wanted, "{path}");
+    }
+}
+
+/// Clients' addresses come from the web server, serve limits and logs, and can't be forged.
+async fn limits_are_for_each_client(fleet: &Fleet) {
+    let forged = [("x-forwarded-for", "203.0.113.9"), ("forwarded", "for=203.0.113.9")];
+    let refused = async |browser: &Browser, url: &str, headers: &[(&'static str, &str)]| match browser
+        .try_open(url, headers)
+        .await
+        .map_err(|error| *error)
+    {
+        Err(tokio_tungstenite::tungstenite::Error::Http(answer)) => assert_eq!(answer.status(), 429, "{url}"),
+        other => panic!("{url}: {:?}", other.err()),
+    };
+    let door = format!("wss://{}/session", fleet.browser.host);
+    for url in [door, format!("{}/client", fleet.wss(&fleet.here)), format!("{}/client", fleet.wss(&fleet.there))] {
+        let many = fleet.browser.at("127.0.0.5");
+        let first = many.open(&url).await;
+        let _second = many.open(&url).await;
+        refused(&many, &url, &[]).await;
+        refused(&many, &url, &forged).await;
+        let _other = fleet.browser.at("127.0.0.6").open(&url).await;
+        first.leave().await;
+        until("there is room again", async || many.try_open(&url, &[]).await.is_ok()).await;
+    }
+    for server in [&fleet.here, &fleet.there] {
+        assert!(server.log().contains("client 127.0.0.5: connected"));
+        assert!(!server.log().contains("203.0.113.9"));
+    }
 }
 
 /// A browser sends the administrator's password, and the cookie of who has signed in, to every path of their host; the web server
@@ -145,19 +211,4 @@ async fn pages_are_sent_on_to_https_and_the_bare_name(browser: &Browser) {
     }
     let question = format!("{plain}/.well-known/acme-challenge/token");
     assert_eq!(browser.ask(&question, &[]).await.status, 404, "certbot's questions are answered here");
-}
-
-#[actix_rt::test]
-async fn nginx_takes_names_of_any_length() {
-    let authority = crate::support::authority::Authority::new();
-    let certificate = authority.issue(&["localhost"]);
-    let (http, https) = (ports::block(1), ports::block(1));
-    let chain = certificate.chain.to_str().unwrap();
-    let key = certificate.key.to_str().unwrap();
-    let text = Rules::Nginx.text(&Place { http, https, session: 1999, here: &[2000], there: &[3000], chain, key });
-    // With its www. as long as a name may be: 253 characters.
-    let name = ["a".repeat(63), "b".repeat(63), "c".repeat(63), "d".repeat(57)].join(".");
-    let text = text.replace("localhost", &name);
-    assert!(text.contains(&format!("server_name {name};")));
-    WebServer::start(Kind::Nginx, (http, https), &text, super::fleet::IDLE).await;
 }

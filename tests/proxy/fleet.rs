@@ -17,6 +17,7 @@ use crate::support::webots::Webots;
 
 /// Everything; each part ends with it.
 pub struct Fleet {
+    rules: Rules,
     pub browser: Browser,
     pub web: WebServer,
     pub session: Server,
@@ -93,7 +94,8 @@ impl Fleet {
         };
         let web = WebServer::start(rules.kind(), (http, https), &rules.text(&place), IDLE).await;
         let browser = Browser { address: "127.0.0.1", trust: trusting(&authority.file()), host, plain: http };
-        let fleet = Self { browser, web, session, here, there, _authority: authority, _webots: webots, _forge: forge };
+        let (_authority, _webots, _forge) = (authority, webots, forge);
+        let fleet = Self { rules, browser, web, session, here, there, _authority, _webots, _forge };
         fleet.both_up().await;
         fleet
     }
@@ -116,8 +118,18 @@ impl Fleet {
         (client, webots.strip_prefix("webots:").unwrap().to_owned())
     }
 
-    /// `wss://HOST/PORT` of a simulation server.
+    /// The machine of a simulation server.
+    pub fn machine(&self, server: &Server) -> &'static str {
+        self.rules.machines()[usize::from(std::ptr::eq(server, &self.there))]
+    }
+
+    /// Where a port of the machine of a simulation server is at the web server.
+    pub fn path(&self, server: &Server, port: u16) -> String {
+        if self.rules.is_door() { format!("/{}/{port}", self.machine(server)) } else { format!("/{port}") }
+    }
+
+    /// The URL at which clients connect to a simulation server.
     pub fn wss(&self, server: &Server) -> String {
-        format!("wss://{}/{}", self.browser.host, server.port)
+        format!("wss://{}{}", self.browser.host, self.path(server, server.port))
     }
 }

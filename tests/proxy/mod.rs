@@ -23,12 +23,9 @@ mod fleet;
 mod rules;
 mod web_server;
 
-mod addresses;
 mod connections;
-mod encoded;
 mod exposure;
 mod one_door;
-mod pages;
 mod relayed;
 mod users;
 mod whole_way;

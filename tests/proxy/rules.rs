@@ -15,8 +15,6 @@ pub enum Rules {
     NginxWithUsers(u16),
     /// `deploy/nginx-door.conf`: one nginx in front of machines whose servers have the same port.
     Door,
-    /// The same of `deploy/kubernetes`.
-    KubernetesDoor,
     /// The documents' page on a machine with a session server: every port of the machine, and three pages.
     Documents,
 }
@@ -42,7 +40,7 @@ impl Rules {
 
     /// Whether all machines are behind one nginx on another.
     pub fn is_door(self) -> bool {
-        matches!(self, Self::Door | Self::KubernetesDoor)
+        self == Self::Door
     }
 
     /// The addresses of the machines. Where there is no door, the first is also the web server's.
@@ -131,23 +129,6 @@ impl Rules {
                 &[
                     ("192\\.0\\.2\\.[0-9]+", "127\\.0\\.0\\.[23]"),
                     ("192.0.2.1:1999", &format!("127.0.0.1:{session}")),
-                    ("(?<fleet_port>2000)", &format!("(?<fleet_port>{})", here[0])),
-                    machines[0],
-                ],
-            ),
-            Self::KubernetesDoor => adapt(
-                include_str!("../../deploy/kubernetes/base/config/fleet.conf"),
-                &[
-                    (
-                        "include /etc/nginx/conf.d/tls*.part;",
-                        include_str!("../../deploy/kubernetes/base/config/tls.part"),
-                    ),
-                    ("/etc/nginx/tls/tls.crt", chain),
-                    ("/etc/nginx/tls/tls.key", key),
-                    ("listen 8080;", &format!("listen 127.0.0.1:{http};")),
-                    ("listen 8443 ssl;", &format!("listen 127.0.0.1:{https} ssl;")),
-                    ("^10\\.[0-9]+\\.[0-9]+\\.[0-9]+$", "^127\\.0\\.0\\.[23]$"),
-                    ("session:1999", &format!("127.0.0.1:{session}")),
                     ("(?<fleet_port>2000)", &format!("(?<fleet_port>{})", here[0])),
                     machines[0],
                 ],

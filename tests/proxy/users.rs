@@ -47,13 +47,10 @@ async fn who_signs_in_at_the_web_server_is_known_to_the_administrator() {
         (format!("/{port}/stream/{}/", "0".repeat(32)), 404),
         (format!("/{port}/assets/../monitor"), 302),
         (format!("/{port}/assets/%2e%2e/monitor"), 302),
-        (format!("/{port}/assets/.%2E/monitor"), 302),
         ("/assets/../monitor".to_owned(), 302),
         (format!("/monitor?/{port}/assets/"), 302),
         (format!("/{port}/status?/{port}/stream/"), 302),
-        (format!("/{port}/status#/{port}/stream/"), 302),
         (format!("/{port}/status/{port}/stream/"), 302),
-        (format!("/{port}//assets/style.css"), 302),
         (format!("/{}/stream/x", port + 1), 404),
         (format!("/{}/{port}/stream/x", port + 1), 302),
     ] {

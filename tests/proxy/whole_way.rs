@@ -5,29 +5,41 @@ use tokio::net::TcpStream;
 
 use super::fleet::{Fleet, arm};
 use super::rules::Rules;
-use crate::support::smtp::Smtp;
 use crate::support::until;
 
-async fn the_whole_way(rules: Rules) {
-    let mut smtp = Smtp::start(&[]).await;
-    let port = smtp.port;
-    let fleet = Fleet::start_with(rules, |server| server.mails_to(port)).await;
+/// Gives back the fleet, for more.
+pub async fn the_whole_way(rules: Rules) -> Fleet {
+    let fleet = Fleet::start(rules).await;
     let browser = &fleet.browser;
     let at_the_door = |path: &str| rules.session_path(fleet.session.port, path);
 
-    // Pages.
-    let page = browser.get(&at_the_door("/monitor")).await;
-    assert_eq!(page.status, 200);
+    // Pages, with what they load. The servers log where they are.
+    let port = format!("/{}", fleet.session.port);
+    let door = format!("https://{}{}/monitor", browser.host, if rules.is_door() { "" } else { &port });
+    assert!(fleet.session.log().contains(&door), "{}", fleet.session.log());
+    let page = browser.ask(&door, &[]).await.text();
     let status = browser.get(&at_the_door("/status")).await.json();
-    let named: Vec<_> = status["servers"].as_array().unwrap().iter().map(|one| one["monitor"].clone()).collect();
     for server in [&fleet.here, &fleet.there] {
-        let monitor = format!("https://{}/{}/monitor", browser.host, server.port);
-        assert!(page.text().contains(&monitor), "{}", page.text());
-        assert!(named.len() == 2 && named.contains(&monitor.clone().into()), "{named:?}");
-        assert_eq!(browser.ask(&monitor, &[]).await.status, 200);
-        let load = browser.get(&format!("/{}/load", server.port)).await.text();
+        let path = fleet.path(server, server.port);
+        let monitor = format!("https://{}{path}/monitor", browser.host);
+        assert!(page.contains(&monitor), "{page}");
+        assert!(server.log().contains(&monitor), "{}", server.log());
+        assert!(status["servers"].as_array().unwrap().iter().any(|one| one["monitor"] == *monitor), "{status}");
+        let answer = browser.ask(&monitor, &[]).await;
+        let policy = answer.header("content-security-policy").unwrap();
+        assert!(
+            answer.status == 200 && policy.starts_with("default-src 'none'") && !policy.contains("sandbox"),
+            "{policy}"
+        );
+        let load = browser.get(&format!("{path}/load")).await.text();
         assert!(load.parse::<f64>().is_ok(), "{load}");
+        assert_eq!(browser.get(&format!("{path}/assets/style.css")).await.status, 200);
     }
+    assert_eq!(browser.get(&at_the_door("/monitor")).await.status, 200);
+    assert_eq!(browser.get(&at_the_door("/assets/style.css")).await.status, 200);
+    let viewer = browser.get(&at_the_door("/viewer")).await;
+    let policy = viewer.header("content-security-policy").unwrap();
+    assert!(policy.contains(&format!("https://{0} wss://{0}", browser.host)), "{policy}");
     until("the door is open", async || browser.get(&at_the_door("/request")).await.text() == "1").await;
 
     // The door.
@@ -42,37 +54,25 @@ async fn the_whole_way(rules: Rules) {
     let given = session.until("wss").await;
     assert!(both.contains(&given), "{given}");
 
-    // A simulation on each machine.
-    for (server, address) in [(&fleet.here, "127.0.0.1"), (&fleet.there, "127.0.0.2")] {
+    // A simulation on each machine; the web client derives the address of files from that of the stream.
+    for server in [&fleet.here, &fleet.there] {
         let (client, stream) = fleet.simulate(browser, server).await;
-        assert_eq!(stream, format!("wss://{}/{}", browser.host, server.port + 1));
+        let path = fleet.path(server, server.port + 1);
+        assert_eq!(stream, format!("wss://{}{path}", browser.host));
         let mut viewer = browser.open(&format!("{stream}/")).await.with_scene().await;
-        let file = browser.get(&format!("/{}/worlds/textures/old%20wood.png?x=1", server.port + 1)).await;
+        let file = browser.get(&format!("{path}/worlds/textures/old%20wood.png?x=1")).await;
         assert_eq!((file.status.as_u16(), file.text().as_str()), (200, "a picture"));
+        // What Webots sends has an origin of its own, but not with the documents' rules.
+        let policy = (rules != Rules::Documents).then_some("sandbox allow-scripts");
+        assert_eq!(file.header("content-security-policy"), policy);
         viewer.send("real-time:-1").await;
         viewer.until("application/json:").await;
         client.leave().await;
         viewer.closed().await;
-        until("Webots has ended", async || TcpStream::connect((address, server.port + 1)).await.is_err()).await;
+        let webots = (fleet.machine(server), server.port + 1);
+        until("Webots has ended", async || TcpStream::connect(webots).await.is_err()).await;
     }
-    door.leave().await;
-
-    // The log, and a mail.
-    let door = format!("https://{}/{}", browser.host, fleet.session.port);
-    let line = format!("listens on port {}: {door}", fleet.session.port);
-    assert!(fleet.session.log().contains(&line), "{}", fleet.session.log());
-    let lost = format!("{}/{}", browser.host, fleet.there.port);
-    drop(fleet.there);
-    // Before there was a web server, none of them answered.
-    let mail = loop {
-        let mail = smtp.mail().await;
-        if mail.subject() == format!("Simulation server not responding: {lost}") {
-            break mail;
-        }
-    };
-    let link = mail.field("text").split_whitespace().find(|word| word.starts_with("http"));
-    assert_eq!(link, Some(format!("{door}/monitor").as_str()), "{mail:?}");
-    assert_eq!(browser.ask(link.unwrap(), &[]).await.status, 200);
+    fleet
 }
 
 through_both!(the_whole_way);

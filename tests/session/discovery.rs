@@ -47,9 +47,16 @@ async fn servers_behind_a_name_come_and_go() {
     let mut first = stand_ins(&loopback([2, 3]), port);
     names.set("fleet.test", &loopback([2, 3]));
     let fixed = StandIn::start(good());
-    let session = looking_up(&[fixed.address(), format!("dns+Fleet.test:{port}")], &names).start().await;
+    let session = looking_up(&[fixed.address()], &names).start().await;
+    let any_host = async || {
+        let viewer = http::get(&session.url("/viewer")).await;
+        viewer.header("content-security-policy").unwrap().contains(" http: ws:")
+    };
+    assert!(!any_host().await);
+    session.reload(json!({"simulationServers": [fixed.address(), format!("dns+Fleet.test:{port}")]}));
     until_states(&session, &["up"; 3]).await;
     assert_eq!(servers(&session).await[0].0, fixed.address(), "in the order of the configuration");
+    assert!(any_host().await, "a page that is open can't reach servers that come");
 
     // More come, one of them by IPv6.
     let (third, fourth): (IpAddr, IpAddr) = ([127, 0, 0, 4].into(), "::1".parse().unwrap());
@@ -83,6 +90,9 @@ async fn servers_behind_a_name_come_and_go() {
     until_states(&session, &["up", "down", "up", "up"]).await;
     names.set("fleet.test", &[third, fourth]);
     until_states(&session, &["up"; 3]).await;
+    session.reload(json!({"simulationServers": [fixed.address()]}));
+    until_states(&session, &["up"]).await;
+    assert_eq!(session.status().await["names"], json!([]));
 }
 
 #[actix_rt::test]
@@ -100,6 +110,7 @@ async fn a_name_server_that_fails_or_has_nothing_to_tell_changes_nothing_and_is_
     let session = looking_up(std::slice::from_ref(&name), &names)
         .mails_to(smtp.port)
         .set("timing", json!({"gather": 0.1, "flapping": 0.1, "placement": 0.2}))
+        .set("loadRefresh", 0.05)
         .start()
         .await;
     until_states(&session, &["up"; 2]).await;
@@ -162,23 +173,27 @@ async fn a_thousand_servers_are_found_behind_one_name() {
 }
 
 #[actix_rt::test]
-async fn names_come_and_go_with_the_configuration() {
-    let Some(names) = NameServer::start("names_come_and_go_with_the_configuration") else { return };
-    let port = ports::block(1);
-    let _servers = stand_ins(&loopback([2, 3]), port);
-    names.set("fleet.test", &loopback([2, 3]));
-    let session = looking_up(&[], &names).start().await;
-    let any_host = async || {
-        let viewer = http::get(&session.url("/webots-viewer")).await;
-        viewer.header("content-security-policy").unwrap().contains("script-src 'self' http: ")
-    };
-    assert!(!any_host().await);
-    session.reload(json!({"simulationServers": [format!("dns+fleet.test:{port}")]}));
-    until_states(&session, &["up"; 2]).await;
-    assert!(any_host().await, "a page that is open can't reach servers that come");
-    session.reload(json!({"drainedServers": [format!("127.0.0.3:{port}")]}));
-    until_states(&session, &["up", "draining"]).await;
-    session.reload(json!({"simulationServers": [], "drainedServers": []}));
-    until_states(&session, &[]).await;
-    assert_eq!(session.status().await["names"], json!([]));
+async fn a_name_whose_lookup_hangs_holds_up_only_its_own_server() {
+    const HANGING: usize = 20;
+    let Some(names) = NameServer::start("a_name_whose_lookup_hangs_holds_up_only_its_own_server") else { return };
+    names.signal(Signal::SIGSTOP);
+    let well = StandIn::start(good());
+    let mut servers: Vec<String> = (0..HANGING).map(|number| format!("{number}.test:2000")).collect();
+    servers.push(well.address());
+    let builder = looking_up(&servers, &names).set("timing", json!({"answer": 0.5})).set("loadRefresh", 0.05);
+    let mut session = builder.start().await;
+    until_states(&session, &[vec!["down"; HANGING], vec!["up"]].concat()).await;
+    assert!(session.log().contains("0.test:2000: down: no answer within 0.5 s"));
+    // Some looks later, nothing has piled up, and the others are asked as ever.
+    let threads = || procfs::process::Process::new(session.pid()).unwrap().stat().unwrap().num_threads;
+    let before = threads();
+    let (asked, begin) = (well.requests(), Instant::now());
+    until("it is asked twenty times more", async || well.requests() >= asked + 20).await;
+    let took = begin.elapsed();
+    assert!(took < Duration::from_secs(5), "twenty looks, one each 0.05 s, took {took:?}");
+    assert!(threads() <= before, "{} threads, {before} before", threads());
+    // Nobody waits for them at the end either.
+    let begin = Instant::now();
+    session.stops().await;
+    assert!(begin.elapsed() < Duration::from_secs(5), "the end took {:?}", begin.elapsed());
 }

@@ -7,7 +7,6 @@ mod discovery;
 mod door;
 mod mail;
 mod memory;
-mod names;
 mod placement;
 mod pushing;
 mod seeing;

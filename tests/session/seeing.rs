@@ -1,29 +1,11 @@
 //! What administrators and other programs see: pages, headers, logs, faults of the configuration.
 
-use std::collections::HashSet;
-
 use serde_json::json;
 
 use super::stand_in::{Manner, StandIn};
 use super::{addresses, times_logged, until_states};
-use crate::support::git::world;
 use crate::support::program::session_server;
 use crate::support::{http, until};
-
-#[actix_rt::test]
-async fn a_refusal_carries_a_time_to_come_back_that_is_drawn_at_random() {
-    let session = session_server(&[]).start().await;
-    let mut seconds = HashSet::new();
-    for _ in 0..100 {
-        let refused =
-            http::get(&session.url(&format!("/session?url={}", world("lab/arm", "main", "worlds/a.wbt")))).await;
-        assert_eq!(refused.status, 503);
-        assert_eq!(refused.text(), "Error: no simulation server available at the moment.");
-        assert_eq!(refused.header("access-control-expose-headers"), Some("Retry-After"));
-        seconds.insert(refused.header("retry-after").unwrap().parse::<u32>().unwrap());
-    }
-    assert_eq!(seconds, HashSet::from([2, 3, 4, 5, 6]));
-}
 
 #[actix_rt::test]
 async fn pages_of_other_origins_may_ask_and_nothing_is_posted_there() {
@@ -37,29 +19,28 @@ async fn pages_of_other_origins_may_ask_and_nothing_is_posted_there() {
         assert_eq!(header("access-control-allow-methods"), "POST, GET, OPTIONS", "{path}");
         (answer.status(), header("allow").to_owned())
     };
-    for path in ["/", "/request", "/session", "/load", "/status", "/nothing"] {
-        ask(Method::GET, path).await;
+    for path in ["/request", "/session", "/load", "/status", "/monitor"] {
+        assert_eq!(ask(Method::GET, path).await.0, 200, "{path}");
         assert!(ask(Method::OPTIONS, path).await.0.is_success(), "{path}");
+        let (status, allow) = ask(Method::POST, path).await;
+        assert!(status == StatusCode::METHOD_NOT_ALLOWED && allow.starts_with("GET"), "{path}: {status} {allow}");
     }
     for path in ["/health", "/status", "/monitor"] {
         assert_eq!(ask(Method::HEAD, path).await.0, 200, "{path}");
     }
-    for path in ["/session", "/status", "/monitor", "/request"] {
-        let (status, allow) = ask(Method::POST, path).await;
-        assert!(status == StatusCode::METHOD_NOT_ALLOWED && allow.starts_with("GET"), "{path}: {status} {allow}");
-    }
-    let nothing = http::get(&session.url("/nothing")).await;
-    assert_eq!(nothing.status, 404);
-    assert!(nothing.text().starts_with("Error: "));
+    assert_eq!(ask(Method::GET, "/nothing").await.0, 404);
+    assert!(http::get(&session.url("/nothing")).await.text().starts_with("Error: "));
 }
 
 #[actix_rt::test]
 async fn the_status_tells_all_of_each_server_and_the_metrics_what_an_alarm_needs() {
     let lab = json!({"load": 20, "version": "9", "docker": false, "allowedRepositories": ["https://github.com/lab"],
         "instances": {"queued": 0, "starting": 1, "idle": 2, "running": 3, "places": 9, "arrivals": 6}});
-    let servers = [StandIn::start(Manner::Status(lab)), StandIn::start(Manner::Body(500, Vec::new()))];
-    let session = session_server(&addresses(&servers)).set("loadRefresh", 600).set("clientCost", 3).start().await;
-    until_states(&session, &["up", "down"]).await;
+    let servers = [Manner::Status(lab), Manner::Body(500, Vec::new()), Manner::Load("40".into())].map(StandIn::start);
+    let builder = session_server(&addresses(&servers)).set("loadRefresh", 600).set("clientCost", 3);
+    let session = builder.set("drainedServers", json!([servers[2].address()])).start().await;
+    until_states(&session, &["up", "down", "draining"]).await;
+    assert_eq!(http::get(&session.url("/load")).await.text(), "30", "the mean of all who answer");
     let fresh = session.metrics().await;
     for outcome in ["placed", "unavailable", "not_accepted", "wrong_url"] {
         assert!(fresh.contains(&format!("webots_session_requests_total{{outcome=\"{outcome}\"}} 0")), "{fresh}");
@@ -69,7 +50,7 @@ async fn the_status_tells_all_of_each_server_and_the_metrics_what_an_alarm_needs
 
     let status = session.status().await;
     assert_eq!((&status["version"], &status["available"]), (&json!(env!("CARGO_PKG_VERSION")), &json!(true)));
-    assert_eq!((&status["clients"], &status["load"]), (&json!(0), &json!(20.0)));
+    assert_eq!((&status["clients"], &status["load"]), (&json!(0), &json!(30.0)));
     assert!(status["uptime"].is_u64());
     let (up, down) = (&status["servers"][0], &status["servers"][1]);
     assert_eq!(up["address"], servers[0].address());
@@ -79,7 +60,7 @@ async fn the_status_tells_all_of_each_server_and_the_metrics_what_an_alarm_needs
     assert!(up["age"].as_f64().unwrap() < 20.0 && up["latency"].as_f64().unwrap() < 3.0);
     assert_eq!((&down["state"], &down["load"], &down["age"]), (&json!("down"), &json!(null), &json!(null)));
     assert!(down["error"].as_str().unwrap().contains("500"));
-    assert_eq!(status["changes"].as_array().unwrap().len(), 2);
+    assert_eq!(status["changes"].as_array().unwrap().len(), 3);
     let page = http::get(&session.url("/monitor")).await;
     assert!(page.header("content-type").unwrap().starts_with("text/html"));
     for server in &servers {
@@ -93,7 +74,7 @@ async fn the_status_tells_all_of_each_server_and_the_metrics_what_an_alarm_needs
     for line in [
         "available 1".to_owned(),
         "clients 0".to_owned(),
-        "load_percent 20".to_owned(),
+        "load_percent 30".to_owned(),
         "requests_total{outcome=\"placed\"} 1".to_owned(),
         "requests_total{outcome=\"wrong_url\"} 1".to_owned(),
         "servers{state=\"up\"} 1".to_owned(),
@@ -103,7 +84,7 @@ async fn the_status_tells_all_of_each_server_and_the_metrics_what_an_alarm_needs
         format!("server_load_percent{{server=\"{up}\"}} 20"),
         format!("server_effective_load_percent{{server=\"{up}\"}} 23"),
         format!("server_in_flight{{server=\"{up}\"}} 1"),
-        "report_seconds_count 2".to_owned(),
+        "report_seconds_count 3".to_owned(),
     ] {
         let line = format!("webots_session_{line}");
         assert!(text.lines().any(|found| found == line), "no {line:?} in {text}");
@@ -111,39 +92,6 @@ async fn the_status_tells_all_of_each_server_and_the_metrics_what_an_alarm_needs
     assert!(text.contains(&format!("webots_session_server_latency_seconds{{server=\"{up}\"}}")), "{text}");
     assert!(!text.contains(&format!("webots_session_server_load_percent{{server=\"{down}\"}}")), "{text}");
     assert_eq!(http::get(&session.url("/health")).await.text(), "ok");
-}
-
-#[actix_rt::test]
-async fn the_log_goes_to_a_file_that_is_rotated() {
-    let folder = tempfile::tempdir().unwrap();
-    let log = folder.path().join("log/session");
-    std::fs::create_dir_all(&log).unwrap();
-    let file = |suffix: &str| log.join(format!("output.log{suffix}"));
-    for old in 1..=10 {
-        std::fs::write(file(&format!(".{old}")), format!("old file {old}\n")).unwrap();
-    }
-    std::fs::write(file(""), vec![b'x'; 500_000]).unwrap();
-    let session = session_server(&[]).set("debug", false).folder(folder.path()).start().await;
-    until("the log is rotated", async || {
-        std::fs::read_to_string(file("")).is_ok_and(|text| text.contains("listens on"))
-    })
-    .await;
-    let first = std::fs::read(file(".1")).unwrap();
-    assert!(first.len() >= 500_000 && first.starts_with(b"xxx"));
-    assert_eq!(std::fs::read_to_string(file(".10")).unwrap(), "old file 9\n");
-    assert!(!file(".11").exists());
-    assert_eq!(times_logged(&session, "listens on"), 0, "standard output is for debug");
-}
-
-#[actix_rt::test]
-async fn the_log_has_each_new_reason_why_a_server_is_down() {
-    let server = StandIn::start(Manner::Reset);
-    let session = session_server(&addresses(std::slice::from_ref(&server))).set("loadRefresh", 0.05).start().await;
-    until("it is down", async || session.log().contains(": down: no connection")).await;
-    server.set(Manner::Body(500, Vec::new()));
-    until("the other reason is there", async || session.log().contains(": still down: an answer that makes no sense"))
-        .await;
-    assert_eq!(times_logged(&session, ": still down: "), 1);
 }
 
 #[actix_rt::test]
@@ -180,15 +128,6 @@ async fn a_fault_of_the_configuration_is_one_line_and_exit_code_2() {
         assert!(said.contains("config.json: "), "{said}");
         assert!(words.iter().all(|word| said.contains(word)), "{key}: {value} gives {said}");
     }
-}
-
-#[actix_rt::test]
-async fn the_mean_load_is_that_of_all_who_answer() {
-    let servers = [StandIn::start(Manner::Load("10".into())), StandIn::start(Manner::Load("40".into()))];
-    let session =
-        session_server(&addresses(&servers)).set("drainedServers", json!([servers[1].address()])).start().await;
-    until_states(&session, &["up", "draining"]).await;
-    assert_eq!(http::get(&session.url("/load")).await.text(), "25");
 }
 
 #[actix_rt::test]

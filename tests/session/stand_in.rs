@@ -25,8 +25,6 @@ pub enum Manner {
     Raw(Vec<u8>),
     /// Has no `/status`; sends these bytes for `/load`, and ends the connection.
     RawLoad(Vec<u8>),
-    /// Waits so long before it tells a load of 1 %.
-    Slow(Duration),
     /// Takes connections and says nothing.
     Hang,
     /// Takes connections and breaks them.
@@ -66,9 +64,7 @@ pub struct StandIn {
 struct Shared {
     manner: Mutex<Manner>,
     connections: AtomicUsize,
-    busy: AtomicUsize,
-    most_busy: AtomicUsize,
-    paths: Mutex<Vec<String>>,
+    requests: AtomicUsize,
 }
 
 impl StandIn {
@@ -94,9 +90,7 @@ impl StandIn {
         let shared = Arc::new(Shared {
             manner: Mutex::new(manner),
             connections: AtomicUsize::new(0),
-            busy: AtomicUsize::new(0),
-            most_busy: AtomicUsize::new(0),
-            paths: Mutex::new(Vec::new()),
+            requests: AtomicUsize::new(0),
         });
         let end = CancellationToken::new();
         let serving = serve(listener, Arc::clone(&shared), end.clone());
@@ -124,19 +118,9 @@ impl StandIn {
         self.shared.connections.load(Ordering::SeqCst)
     }
 
-    /// How many requests it was busy with at the same time, at most.
-    pub fn most_busy(&self) -> usize {
-        self.shared.most_busy.load(Ordering::SeqCst)
-    }
-
-    /// What it was asked for.
-    pub fn paths(&self) -> Vec<String> {
-        self.shared.paths.lock().unwrap().clone()
-    }
-
     /// How many requests it has had.
     pub fn requests(&self) -> usize {
-        self.shared.paths.lock().unwrap().len()
+        self.shared.requests.load(Ordering::SeqCst)
     }
 }
 
@@ -158,13 +142,9 @@ async fn serve(listener: TcpListener, shared: Arc<Shared>, end: CancellationToke
 async fn converse(mut stream: TcpStream, shared: &Shared) -> std::io::Result<()> {
     stream.set_nodelay(true)?;
     while let Some(path) = next_request(&mut stream).await? {
-        shared.paths.lock().unwrap().push(path.clone());
-        let busy = shared.busy.fetch_add(1, Ordering::SeqCst) + 1;
-        shared.most_busy.fetch_max(busy, Ordering::SeqCst);
+        shared.requests.fetch_add(1, Ordering::SeqCst);
         let manner = shared.manner.lock().unwrap().clone();
-        let answered = answer(&mut stream, &path, manner).await;
-        shared.busy.fetch_sub(1, Ordering::SeqCst);
-        if !answered? {
+        if !answer(&mut stream, &path, manner).await? {
             break;
         }
     }
@@ -194,10 +174,6 @@ async fn answer(stream: &mut TcpStream, path: &str, manner: Manner) -> std::io::
         }
         Manner::Status(_) | Manner::Load(_) | Manner::RawLoad(_) => send(stream, 404, b"404: Not Found").await?,
         Manner::Body(status, body) => send(stream, status, &body).await?,
-        Manner::Slow(time) => {
-            actix_rt::time::sleep(time).await;
-            send(stream, 200, br#"{"load": 1}"#).await?;
-        }
         Manner::Raw(bytes) => {
             stream.write_all(&bytes).await?;
             return Ok(false);

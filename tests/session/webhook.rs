@@ -1,14 +1,11 @@
 //! From a failure to a message in a messenger: the built program, a stand-in that fails, a real web server that is posted to.
 
-use std::process::Command;
-
 use serde_json::json;
 
 use super::stand_in::{Manner, StandIn};
 use super::{addresses, until_states};
 use crate::support::authority::Authority;
 use crate::support::http;
-use crate::support::ports::dead_port;
 use crate::support::program::{Builder, Server, session_server};
 use crate::support::receiver::Receiver;
 use crate::support::smtp::Smtp;
@@ -23,16 +20,9 @@ fn with_webhook(servers: &[StandIn], scheme: &str, port: u16) -> Builder {
     session_server(&addresses(servers)).set("webhook", url).set("timing", timing)
 }
 
-/// Three servers that work, which the session server knows.
-fn fleet() -> Vec<StandIn> {
-    (0..3).map(|_| StandIn::start(Manner::idle(7.0, 10))).collect()
-}
-
-async fn fail(session: &Server, servers: &[StandIn]) {
-    until_states(session, &["up"; 3]).await;
-    for server in servers {
-        server.set(Manner::Reset);
-    }
+/// Three servers that fail.
+fn fleet() -> [StandIn; 3] {
+    [(); 3].map(|()| StandIn::start(Manner::Reset))
 }
 
 fn says_nothing_secret(session: &Server) {
@@ -43,7 +33,6 @@ fn says_nothing_secret(session: &Server) {
 async fn the_notices_of_a_mail_are_one_message_and_need_no_mail() {
     let (servers, receiver) = (fleet(), Receiver::start(None));
     let session = with_webhook(&servers, "http", receiver.port).start().await;
-    fail(&session, &servers).await;
     let text = receiver.texts(1).await.remove(0);
     assert!(text.starts_with("Simulation servers: 3 not responding\n"), "{text}");
     for server in addresses(&servers) {
@@ -75,7 +64,6 @@ async fn a_message_that_is_not_taken_is_tried_again_and_so_is_a_mail_for_itself(
     receiver.answer("503 Busy");
     let mut smtp = Smtp::start(&[]).await;
     let session = with_webhook(&servers, "http", receiver.port).mails_to(smtp.port).start().await;
-    fail(&session, &servers).await;
     // The mail does not wait for the messenger.
     assert_eq!(smtp.mail().await.subject(), "Simulation servers: 3 not responding");
     receiver.texts(3).await;
@@ -88,18 +76,6 @@ async fn a_message_that_is_not_taken_is_tried_again_and_so_is_a_mail_for_itself(
     until("it is sent", async || session.log().contains("webhook sent by")).await;
     assert!(receiver.texts(4).await.last().unwrap().starts_with("Simulation servers: 3 not responding"));
     assert!(other.posted().is_empty());
-    drop(session);
-
-    // And the messenger not for the mail.
-    let (_reserved, dead) = dead_port();
-    for server in &servers {
-        server.set(Manner::idle(7.0, 10));
-    }
-    let before = receiver.posted().len();
-    let session = with_webhook(&servers, "http", receiver.port).mails_to(dead).start().await;
-    fail(&session, &servers).await;
-    receiver.texts(before + 1).await;
-    until("the mail is tried", async || session.log().contains("mail not sent, next try in")).await;
     says_nothing_secret(&session);
 }
 
@@ -111,7 +87,6 @@ async fn a_messenger_whose_certificate_is_not_trusted_is_told_nothing() {
         let servers = fleet();
         let builder = with_webhook(&servers, "https", receiver.port);
         let session = builder.env("SSL_CERT_FILE", authority.file().to_str().unwrap()).start().await;
-        fail(&session, &servers).await;
         if trusted {
             receiver.texts(1).await;
         } else {
@@ -126,30 +101,22 @@ async fn a_messenger_whose_certificate_is_not_trusted_is_told_nothing() {
 #[actix_rt::test]
 async fn the_webhook_can_be_tried_and_a_wrong_one_is_refused_without_showing_it() {
     let receiver = Receiver::start(None);
-    let folder = tempfile::tempdir().unwrap();
-    let file = folder.path().join("webhook.json");
-    let run = async |webhook: String, option: &'static str| {
-        let config =
-            json!({"port": 1, "ssl": false, "simulationServers": [], "server": "localhost", "webhook": webhook});
-        std::fs::write(&file, config.to_string()).unwrap();
-        let mut command = Command::new(env!("CARGO_BIN_EXE_session-server"));
-        command.arg(&file).arg(option);
-        let output = actix_rt::task::spawn_blocking(move || command.output().unwrap()).await.unwrap();
-        let said = [output.stdout, output.stderr].concat();
-        (output.status.code(), String::from_utf8(said).unwrap())
+    let says = async |option: &str, webhook: &str| {
+        let (code, said) = super::mail::says(option, &json!({ "webhook": webhook }), "/dev/null").await;
+        assert!(!said.contains(SECRET), "{webhook}: {said}");
+        (code, said)
     };
     let url = format!("http://127.0.0.1:{}/{SECRET}", receiver.port);
-    let (code, said) = run(url.clone(), "--test-mail").await;
-    assert_eq!((code, said), (Some(0), format!("127.0.0.1:{} took a test: 200 OK\n", receiver.port)));
+    let sent = format!("127.0.0.1:{} took a test: 200 OK\n", receiver.port);
+    assert_eq!(says("--test-mail", &url).await, (Some(0), sent));
     assert!(receiver.texts(1).await[0].contains("Nothing has happened"));
     receiver.answer("404 Gone");
-    let (code, said) = run(url.clone(), "--test-mail").await;
-    assert!(code == Some(1) && said.contains("404 Not Found") && !said.contains(SECRET), "{said}");
-    let (code, said) = run(url, "--check").await;
-    assert!(code == Some(0) && said.contains("\"webhook\": \"********\"") && !said.contains(SECRET), "{said}");
-    for wrong in [SECRET.to_owned(), format!("ftp://x/{SECRET}"), format!("https:///{SECRET} x")] {
-        let (code, said) = run(wrong.clone(), "--check").await;
-        let is_told = said.contains("webhook: it is no URL of a web server");
-        assert!(code == Some(2) && is_told && !said.contains(SECRET), "{wrong}: {code:?} {said}");
+    let (code, said) = says("--test-mail", &url).await;
+    assert!(code == Some(1) && said.contains("404 Not Found"), "{said}");
+    let (code, said) = says("--check", &url).await;
+    assert!(code == Some(0) && said.contains("\"webhook\": \"********\""), "{said}");
+    for wrong in [SECRET, &format!("ftp://x/{SECRET}"), &format!("https:///{SECRET} x")] {
+        let (code, said) = says("--check", wrong).await;
+        assert!(code == Some(2) && said.contains("webhook: it is no URL of a web server"), "{wrong}: {said}");
     }
 }

@@ -11,7 +11,7 @@ use serde_json::Value;
 
 use super::git::Forge;
 use super::webots::Webots;
-use super::{SOON, holds_soon, http, ports, raise_file_limit};
+use super::{holds_soon, http, ports, raise_file_limit};
 
 /// A server that was started for one test. It is killed with the test, and its log is printed if the test fails.
 pub struct Server {
@@ -246,16 +246,6 @@ impl Server {
     /// Sends a signal to the server itself.
     pub fn signal(&self, signal: Signal) {
         kill(Pid::from_raw(self.pid()), signal).unwrap();
-    }
-
-    /// Stops the server, and connects so many clients that it can't accept: they wait in the system's queue.
-    pub fn crowd(&self, clients: usize) {
-        self.signal(Signal::SIGSTOP);
-        let address = self.address().parse().unwrap();
-        let connect = |_| std::net::TcpStream::connect_timeout(&address, SOON).unwrap();
-        let crowd: Vec<_> = (0..clients).map(connect).collect();
-        self.signal(Signal::SIGCONT);
-        drop(crowd);
     }
 
     /// Asks the server to end, which it does in order.
