@@ -52,7 +52,7 @@ async fn a_thousand_servers_that_fail_together_are_one_mail() {
 }
 
 #[actix_rt::test]
-async fn a_flapping_server_is_one_mail_in_its_time_with_a_count() {
+async fn a_flapping_server_is_one_mail_in_its_time() {
     let mut smtp = Smtp::start(&[]).await;
     let mailer = start(smtp.port, &json!({"timing": {"flapping": 2}}));
     let first = Instant::now();
@@ -65,9 +65,6 @@ async fn a_flapping_server_is_one_mail_in_its_time_with_a_count() {
     let mail = smtp.mail().await;
     assert!(first.elapsed() > Duration::from_secs(2), "the second mail came after {:?}", first.elapsed());
     assert_eq!(mail.subject(), "Simulation server working again: sim:2000");
-    let body = mail.field("text");
-    assert!(body.contains("Held back:  8 earlier, since it keeps changing"), "{body}");
-    assert!(body.contains("connection refused"), "no last error in {body}");
     assert_eq!(smtp.count("mail"), 2);
     nothing_unexpected(smtp.port);
 }

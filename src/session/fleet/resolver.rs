@@ -29,11 +29,9 @@ const TIMEOUT: Duration = Duration::from_secs(1);
 /// # Errors
 /// As text, when there is no answer or no address in it.
 pub async fn look_up(name: &str) -> Result<Vec<IpAddr>, String> {
-    let system = TokioResolver::builder_tokio();
-    let unread = system.as_ref().err().map(ToString::to_string);
     let found = async {
         // Without /etc/resolv.conf there is /etc/hosts.
-        let mut builder = system.unwrap_or_else(|_| {
+        let mut builder = TokioResolver::builder_tokio().unwrap_or_else(|_| {
             let none = ResolverConfig::from_name_servers(Vec::new());
             TokioResolver::builder_with_config(none, TokioRuntimeProvider::default())
         });
@@ -43,8 +41,7 @@ pub async fn look_up(name: &str) -> Result<Vec<IpAddr>, String> {
         builder.build()?.lookup_ip(name).await
     };
     let found = found.await.map_err(|error: NetError| {
-        let told = if error.is_no_records_found() { "DNS has no such records".to_owned() } else { error.to_string() };
-        unread.unwrap_or(told)
+        if error.is_no_records_found() { "DNS has no such records".to_owned() } else { error.to_string() }
     })?;
     Ok(found.iter().map(|address| address.to_canonical()).collect())
 }

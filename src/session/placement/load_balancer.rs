@@ -77,12 +77,9 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
         }
     }
 
-    /// Changes the policy. What was learned of the servers stays.
+    /// Changes the policy, from the next report of each server on. What was learned of the servers stays.
     pub fn set_policy(&mut self, policy: PlacementPolicy) {
         self.policy = policy;
-        for (id, server) in &mut self.servers {
-            server.sort_in(id, &self.policy, &mut self.ranking);
-        }
     }
 
     /// Adds a server, which is down until its first report. A known server is not changed.
@@ -104,10 +101,9 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
     /// Records what a server answered at `now`, and whether it takes new clients. If its last starts have failed for a
     /// reason of its own, other servers are preferred for a while. A server that is not in the fleet is ignored.
     pub fn report(&mut self, id: &Id, now: Instant, report: &ServerReport, accepting: bool) {
+        self.expire(now);
         let Some(server) = self.servers.get_mut(id) else { return };
-        self.replicas.count(0.0, count(server.backend.expire(now, &self.policy)));
         server.backend.report(now, report, accepting, &self.policy, &mut self.cost, &mut self.replicas);
-        server.ejection.expire(now);
         server.ejection.report(now, report.failed_starts);
         server.sort_in(id, &self.policy, &mut self.ranking);
     }
@@ -131,7 +127,6 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
         let server = self.servers.get_mut(&id)?;
         server.backend.last_pick = self.picks;
         server.backend.add_placement(now, takes_room);
-        server.ejection.note_pick(now);
         server.sort_in(&id, &self.policy, &mut self.ranking);
         Some(id)
     }

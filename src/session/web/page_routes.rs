@@ -2,16 +2,18 @@
 
 use std::time::SystemTime;
 
+use actix_web::error::ErrorInternalServerError;
 use actix_web::{HttpRequest, HttpResponse, Result, web};
 use askama::Template;
 
-use super::pages::{self, Viewer, WebotsViewer};
+use super::pages::{self, Monitor, Viewer, WebotsViewer};
 use crate::asset;
 use crate::session::fleet::FleetStatus;
 use crate::session::state::AppState;
 use crate::shared::http::assets::{self, Asset};
 use crate::shared::http::routing::{GET, READ, path};
-use crate::shared::http::{ConnectionKind, ContentSecurityPolicy, any_host, fleet_sources, html};
+use crate::shared::http::{ConnectionKind, ContentSecurityPolicy, PageView, any_host, fleet_sources, html};
+use crate::shared::run::timestamp;
 
 /// Assets of this server's pages, besides those that both servers share.
 const ASSETS: &[Asset] =
@@ -27,35 +29,33 @@ pub fn configure(app: &mut web::ServiceConfig) {
 }
 
 async fn monitor(server: web::Data<AppState>) -> Result<HttpResponse> {
-    let (status, announcement) = (server.status().await?, server.announcements.current());
-    let (clients, started) = (server.clients(), SystemTime::now() - server.started.elapsed());
-    let more = (announcement.as_deref(), server.admin_auth.is_some());
-    let page = pages::monitor(&status, clients, &server.client_urls, started, more);
-    Ok(html(page, &ContentSecurityPolicy::own()))
+    let view = view(&server, &*server.status().await?).map_err(ErrorInternalServerError)?;
+    let started = timestamp(SystemTime::now() - server.started.elapsed());
+    let page = Monitor { started, has_actions: server.admin_auth.is_some(), view };
+    Ok(html(page.render(), &ContentSecurityPolicy::own()))
 }
 
-async fn events(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
-    let permit = match server.connections.admit(ConnectionKind::Page, server.config.trusted_proxies.peer(&request)) {
-        Ok(permit) => permit,
-        Err(refused) => return HttpResponse::from_error(refused),
-    };
+async fn events(request: HttpRequest, server: web::Data<AppState>) -> Result<HttpResponse> {
+    let permit = server.connections.admit(ConnectionKind::Page, server.config.trusted_proxies.peer(&request))?;
     let shown = server.clone();
     let render = move || {
         let server = shown.clone();
         async move {
-            let status = server.status().await.ok()?;
-            let announcement = server.announcements.current();
-            let view = pages::view(&status, server.clients(), &server.client_urls, announcement.as_deref());
+            let view = view(&server, &*server.status().await.ok()?);
             view.inspect_err(|error| log::error!("the monitor page can't be rendered: {error}")).ok()
         }
     };
-    server.live.listen(permit, server.phase.clone(), render)
+    Ok(server.live.listen(permit, server.phase.clone(), render))
+}
+
+fn view(server: &AppState, status: &FleetStatus) -> askama::Result<PageView> {
+    pages::view(status, server.clients(), &server.client_urls, &server.announcement.borrow().text)
 }
 
 async fn viewer(request: HttpRequest, server: web::Data<AppState>) -> Result<HttpResponse> {
     let fleet = fleet(&server, &*server.status().await?);
     let script = server.config.viewer_script.as_ref().map(url::Url::as_str);
-    let page = Viewer { version: env!("CARGO_PKG_VERSION"), examples: &server.config.examples, script };
+    let page = Viewer { examples: &server.config.examples, script };
     Ok(html(page.render(), &ContentSecurityPolicy::viewer(&request, &fleet)))
 }
 
@@ -64,8 +64,7 @@ async fn viewer(request: HttpRequest, server: web::Data<AppState>) -> Result<Htt
 async fn webots_viewer(server: web::Data<AppState>) -> Result<HttpResponse> {
     let mut sources = fleet(&server, &*server.status().await?);
     sources.extend(server.config.viewer_script.as_ref().map(|script| script.origin().ascii_serialization()));
-    let page = WebotsViewer { version: env!("CARGO_PKG_VERSION") };
-    Ok(html(page.render(), &ContentSecurityPolicy::foreign(&sources)))
+    Ok(html(WebotsViewer.render(), &ContentSecurityPolicy::foreign(&sources)))
 }
 
 fn fleet(server: &AppState, status: &FleetStatus) -> Vec<String> {
