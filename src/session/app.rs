@@ -13,6 +13,7 @@ use super::state::AppState;
 use crate::session::fleet::{GetStatus, Reconfigure, Registry};
 use crate::session::web::configure;
 use crate::shared::config;
+use crate::shared::domain::ClientUrls;
 use crate::shared::http::server::{self, HttpServerOptions};
 use crate::shared::http::{BasicAuth, ConnectionLimiter, LiveUpdates, Metrics};
 use crate::shared::run::{
@@ -118,13 +119,13 @@ fn assemble(
     Ok(AppState {
         registry,
         available,
-        client_urls: config.client_urls(),
+        client_urls: ClientUrls { ssl: config.ssl, public: config.public_url.clone() },
         phase,
         connections,
         metrics,
         picks,
         live: LiveUpdates::default(),
-        announcement: watch::Sender::new(config.announcement.clone().unwrap_or_default()),
+        announcement: watch::Sender::default(),
         admin_auth: config.admin_password.clone().map(BasicAuth::new),
         started: Instant::now(),
         config,
@@ -140,7 +141,6 @@ fn reload(file: &Path, server: &AppState) {
             }
             let entries = loaded.config.simulation_servers.len();
             log::info!("read {} again: {entries} entries in simulationServers", file.display());
-            server.announcement.send_replace(loaded.config.announcement.clone().unwrap_or_default());
             // The URLs of the fleet stay as they were at the start.
             let config = SessionConfig { ssl: server.config.ssl, ..loaded.config };
             server.registry.do_send(Reconfigure(Arc::new(config)));

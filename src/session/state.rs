@@ -8,7 +8,7 @@ use actix::prelude::*;
 use actix_web::error::ErrorServiceUnavailable;
 use tokio::sync::watch;
 
-use super::config::{Announcement, SessionConfig};
+use super::config::SessionConfig;
 use crate::session::fleet::{FleetStatus, GetStatus, Pick, PickError, Registry};
 use crate::shared::domain::{ClientUrls, ProjectUrl};
 use crate::shared::http::{BasicAuth, ConnectionKind, ConnectionLimiter, LiveUpdates, Metrics};
@@ -34,8 +34,8 @@ pub struct AppState {
     pub picks: prometheus::IntCounterVec,
     /// The open monitor pages.
     pub live: LiveUpdates,
-    /// The administrator's announcement: that of the configuration, or the one that was posted since.
-    pub announcement: watch::Sender<Announcement>,
+    /// The administrator's announcement: one line of text, never markup; empty if there is none.
+    pub announcement: watch::Sender<String>,
     /// Checks the administrator's password, where one is configured.
     pub admin_auth: Option<BasicAuth>,
     /// When the server was started.

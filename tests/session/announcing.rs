@@ -7,7 +7,6 @@ use serde_json::{Value, json};
 use crate::support::client::Client;
 use crate::support::http::{PASSWORD, post};
 use crate::support::program::{Server, session_server};
-use crate::support::until;
 
 const ASKS: &str = "/session?announcements=1";
 
@@ -51,23 +50,6 @@ async fn an_announcement_reaches_who_asks_for_it_in_time() {
         assert_eq!(client.heard[0], "0");
         assert_eq!(client.heard.len(), 2, "{:?}", client.heard);
     }
-}
-
-#[actix_rt::test]
-async fn an_announcement_in_the_configuration_is_read_again() {
-    let session = session_server(&[]).set("adminPassword", PASSWORD).set("announcement", json!({"text": "One"}));
-    let session = session.start().await;
-    let mut viewer = Client::connect(&session.websocket(ASKS)).await;
-    assert_eq!(viewer.until("announcement:").await, "announcement: One");
-    assert_eq!(announce(&session, &json!({"text": "Two"})).await, 200);
-    assert_eq!(viewer.until("announcement:").await, "announcement: Two");
-    session.reload(json!({"announcement": {"text": "Three"}}));
-    assert_eq!(viewer.until("announcement:").await, "announcement: Three");
-    session.reload(json!({"announcement": null}));
-    assert_eq!(viewer.until("announcement:").await, "announcement:");
-    // A wrong one changes nothing.
-    session.reload(json!({"announcement": {"text": "Four", "until": "noon"}}));
-    until("it is told", async || session.log().contains("unknown field `until`")).await;
 }
 
 #[actix_rt::test]

@@ -79,7 +79,7 @@ async fn a_message_that_is_not_taken_is_tried_again_and_so_is_a_mail_for_itself(
     // The mail does not wait for the messenger.
     assert_eq!(smtp.mail().await.subject(), "Simulation servers: 3 not responding");
     receiver.texts(3).await;
-    until("it is logged", async || session.log().contains("webhook not sent, next try in")).await;
+    until("it is logged", async || session.log().contains("webhook not sent, it is tried again")).await;
     assert!(session.log().contains("503 Service Unavailable"), "{}", session.log());
     // A redirect leads notices to nobody else.
     receiver.answer(&format!("307 Elsewhere\r\nLocation: http://127.0.0.1:{}/", other.port));
@@ -99,7 +99,7 @@ async fn a_message_that_is_not_taken_is_tried_again_and_so_is_a_mail_for_itself(
     let session = with_webhook(&servers, "http", receiver.port).mails_to(dead).start().await;
     fail(&session, &servers).await;
     receiver.texts(before + 1).await;
-    until("the mail is tried", async || session.log().contains("mail not sent, next try in")).await;
+    until("the mail is tried", async || session.log().contains("mail not sent, it is tried again")).await;
     says_nothing_secret(&session);
 }
 

@@ -6,7 +6,6 @@ use std::time::Duration;
 use lettre::message::Mailbox;
 use serde::{Deserialize, Serialize};
 
-use super::announcement::Announcement;
 use super::mail_address;
 use super::server_entry::ServerEntry;
 use super::timing::Timing;
@@ -16,7 +15,7 @@ use crate::shared::config::{
     Configuration, ExpandedPath, Secret, expanded, folder, is_web_url, local_address, object, one_or_many,
     optional_expanded, optional_whole, percent, require, seconds, whole,
 };
-use crate::shared::domain::{ClientUrls, PublicAddress, PublicUrl, complete_host};
+use crate::shared::domain::{PublicAddress, PublicUrl, complete_host};
 use crate::shared::http::TrustedProxies;
 
 keys! {
@@ -65,8 +64,6 @@ pub struct SessionConfig {
     pub mail_sender_password: Option<Secret> = None,
     /// URL to which each mail's notices are posted as JSON, `{"text": ...}`, as Slack and Matrix take them. Default: none.
     pub webhook: Option<Secret> = None,
-    /// A message that open viewers and the monitor show: `{"text": ...}`. Default: none.
-    pub announcement: Option<Announcement> = None,
     /// Password for actions such as `/announcement`. Default: none, and actions are off.
     pub admin_password: Option<Secret> = None,
     /// Folder of `session/output.log`. Default: `log`.
@@ -142,11 +139,6 @@ impl SessionConfig {
         format!("{}/session", door.unwrap_or_else(|| self.address().websocket_url(self.ssl)))
     }
 
-    /// Returns what forms the URLs of simulation servers for clients.
-    pub fn client_urls(&self) -> ClientUrls {
-        ClientUrls { ssl: self.ssl, public: self.public_url.clone() }
-    }
-
     /// Normalizes the addresses of simulation servers.
     fn check_servers(&mut self) -> Result<(), String> {
         let listed = self.simulation_servers.iter_mut().filter_map(|entry| match entry {
@@ -170,8 +162,7 @@ impl Configuration for SessionConfig {
     const REQUIRED: &'static [&'static str] = &["simulationServers"];
 
     fn complete(&mut self, _: &std::path::Path) -> Result<Vec<String>, String> {
-        let mut warnings = Vec::new();
-        warnings.extend(complete_host(&mut self.server, self.port_rewrite)?);
+        let warning = complete_host(&mut self.server, self.port_rewrite)?;
         self.check_servers()?;
         require(self.timing.silence > self.timing.ping, "timing.silence", || {
             format!("{} s is not more than timing.ping", self.timing.silence.as_secs_f64())
@@ -186,11 +177,6 @@ impl Configuration for SessionConfig {
             require(is_web_url(webhook.reveal()), "webhook", || format!("it is {allowed}"))?;
         }
         self.mail_server = self.mail_server.take().filter(|host| !host.is_empty());
-        if self.administrator.is_some() && self.mail_server.is_none() {
-            warnings.push("mailServer is not set: notifications are off".to_owned());
-        } else if self.administrator.is_some() && self.mail_sender.is_none() {
-            warnings.push("mailSender is not set: notifications are off".to_owned());
-        }
-        Ok(warnings)
+        Ok(warning.into_iter().collect())
     }
 }

@@ -10,7 +10,7 @@ use futures_util::future::join_all;
 
 use super::fleet_status::NameStatus;
 use super::resolver::look_up;
-use crate::session::config::{DnsName, ServerEntry};
+use crate::session::config::ServerEntry;
 use crate::shared::domain::PublicAddress;
 use crate::shared::text::excerpt;
 
@@ -19,7 +19,7 @@ pub type LookupResult = Result<BTreeSet<PublicAddress>, String>;
 
 /// The names that are resolved.
 #[derive(Default)]
-pub struct NameTable(BTreeMap<DnsName, ResolvedName>);
+pub struct NameTable(BTreeMap<PublicAddress, ResolvedName>);
 
 /// What a name resolves to, and why its last lookup failed, if it did.
 #[derive(Default)]
@@ -32,7 +32,7 @@ struct ResolvedName {
 const MAX_ERROR_LENGTH: usize = 120;
 
 /// Resolves names to simulation servers, all at the same time.
-pub async fn look_up_all(names: Vec<DnsName>) -> Vec<(DnsName, LookupResult)> {
+pub async fn look_up_all(names: Vec<PublicAddress>) -> Vec<(PublicAddress, LookupResult)> {
     join_all(names.into_iter().map(async |name| {
         let found = servers(&name).await;
         (name, found)
@@ -40,9 +40,9 @@ pub async fn look_up_all(names: Vec<DnsName>) -> Vec<(DnsName, LookupResult)> {
     .await
 }
 
-async fn servers(name: &DnsName) -> LookupResult {
-    let addresses = look_up(&name.host).await?;
-    addresses.into_iter().map(|address| SocketAddr::new(address, name.port).to_string().parse()).collect()
+async fn servers(name: &PublicAddress) -> LookupResult {
+    let addresses = look_up(name.host()).await?;
+    addresses.into_iter().map(|address| SocketAddr::new(address, name.port()).to_string().parse()).collect()
 }
 
 impl NameTable {
@@ -55,23 +55,23 @@ impl NameTable {
     }
 
     /// All names.
-    pub fn names(&self) -> Vec<DnsName> {
+    pub fn names(&self) -> Vec<PublicAddress> {
         self.0.keys().cloned().collect()
     }
 
     /// Records lookups; names that are no longer listed are ignored. Returns whether some name resolves to other servers
     /// than before.
-    pub fn record(&mut self, answers: Vec<(DnsName, LookupResult)>) -> bool {
+    pub fn record(&mut self, answers: Vec<(PublicAddress, LookupResult)>) -> bool {
         let mut has_moved = false;
         for (name, answer) in answers {
             let Some(known) = self.0.get_mut(&name) else { continue };
             match answer {
                 Ok(found) => {
                     if known.error.take().is_some() {
-                        log::info!("{name}: can be looked up again");
+                        log::info!("dns+{name}: can be looked up again");
                     }
                     if found != known.servers {
-                        log::info!("{name}: leads to other servers than before: {}", found.len());
+                        log::info!("dns+{name}: leads to other servers than before: {}", found.len());
                         known.servers = found;
                         has_moved = true;
                     }
@@ -79,7 +79,7 @@ impl NameTable {
                 Err(error) => {
                     let error = excerpt(&error, MAX_ERROR_LENGTH);
                     if known.error.is_none() {
-                        log::warn!("{name}: can't be looked up: {error}; the servers that it led to before stay");
+                        log::warn!("dns+{name}: can't be looked up: {error}; the servers that it led to before stay");
                     }
                     known.error = Some(error);
                 }
@@ -101,8 +101,8 @@ impl NameTable {
 
     /// What is known of each name.
     pub fn status(&self) -> Vec<NameStatus> {
-        let status = |(name, known): (&DnsName, &ResolvedName)| NameStatus {
-            name: name.to_string(),
+        let status = |(name, known): (&PublicAddress, &ResolvedName)| NameStatus {
+            name: format!("dns+{name}"),
             servers: known.servers.len(),
             error: known.error.clone(),
         };

@@ -63,7 +63,7 @@ const NO_SUCH_PAGE: [StatusCode; 4] =
 fn client(interval: Duration, tls: Option<Arc<ClientConfig>>) -> awc::Client {
     let idle = (interval * 3).max(Duration::from_secs(15));
     // The whole probe has a timeout, its parts have none.
-    let tcp = TcpConnector::new(Resolver::custom(HostResolver::default())).service();
+    let tcp = TcpConnector::new(Resolver::custom(HostResolver)).service();
     let mut connector = awc::Connector::new().connector(tcp).conn_keep_alive(idle).timeout(NEVER);
     if let Some(config) = tls {
         connector = connector.rustls_0_23(config);

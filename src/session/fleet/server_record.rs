@@ -9,7 +9,7 @@ use crate::session::mail::NoticeKind;
 use crate::shared::domain::{ProjectUrl, PublicAddress, ServerReport};
 use crate::shared::run::serialize_timestamp;
 
-/// The state of a simulation server. Those that need attention come first, as on the monitor.
+/// The state of a simulation server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ServerState {

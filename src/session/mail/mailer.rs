@@ -45,18 +45,18 @@ async fn send_all(channel: Channel, signature: String, mut outbox: Outbox, mut n
 /// Reports the outcome of sending a batch to the outbox and the log.
 fn handle_outcome(channel: &Channel, outbox: &mut Outbox, batch: Vec<WaitingNotice>, sent: Result<String, String>) {
     let (now, subject, name) = (Instant::now(), summary(&batch), channel.name);
-    let error = match sent {
+    match sent {
         Ok(answer) => {
             log::info!("{name} sent by {} ({subject}): {answer}", channel.server);
-            return outbox.succeeded(&batch, now);
+            outbox.succeeded(&batch, now);
         }
-        Err(error) => error,
-    };
-    let lost = outbox.failed(batch, now);
-    if !lost.is_empty() {
-        log::error!("{name} given up ({}): {error}", summary(&lost));
-    } else if let Some(next) = outbox.due() {
-        let wait = next.saturating_duration_since(now).as_secs_f64();
-        log::warn!("{name} not sent, next try in {wait:.0} s ({subject}): {error}");
+        Err(error) => {
+            let lost = outbox.failed(batch, now);
+            if lost.is_empty() {
+                log::warn!("{name} not sent, it is tried again ({subject}): {error}");
+            } else {
+                log::error!("{name} given up ({}): {error}", summary(&lost));
+            }
+        }
     }
 }

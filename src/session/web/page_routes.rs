@@ -49,7 +49,7 @@ async fn events(request: HttpRequest, server: web::Data<AppState>) -> Result<Htt
 }
 
 fn view(server: &AppState, status: &FleetStatus) -> askama::Result<PageView> {
-    pages::view(status, server.clients(), &server.client_urls, &server.announcement.borrow().text)
+    pages::view(status, server.clients(), &server.client_urls, &server.announcement.borrow())
 }
 
 async fn viewer(request: HttpRequest, server: web::Data<AppState>) -> Result<HttpResponse> {

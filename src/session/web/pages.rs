@@ -122,14 +122,6 @@ impl ServerRow<'_> {
         self.report?.instances
     }
 
-    fn rank(&self) -> u8 {
-        self.server.record.state as u8
-    }
-
-    fn version(&self) -> &str {
-        self.report.map(|report| report.version.as_str()).unwrap_or_default()
-    }
-
     fn repositories(&self) -> Vec<String> {
         let allowed = self.report.map(|report| report.allowed_repositories.as_slice()).unwrap_or_default();
         let shown = |url: &str| one_line(url.split_once("://").map_or(url, |(_, rest)| rest));

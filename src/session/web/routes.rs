@@ -7,16 +7,27 @@ use actix_web::error::ErrorInternalServerError;
 use actix_web::http::{StatusCode, header};
 use actix_web::{HttpRequest, HttpResponse, Result, web};
 use percent_encoding::percent_decode_str;
+use serde::Deserialize;
 
 use super::metrics;
 use super::page_routes;
 use super::status::status_page;
 use super::web_client::WebClient;
-use crate::session::config::Announcement;
 use crate::session::fleet::PickError;
 use crate::session::state::AppState;
 use crate::shared::http::routing::{self, GET, POST, READ, path, retry_after};
 use crate::shared::http::{CONTENT_TYPE, ConnectionKind, body, refuse_action, websocket};
+use crate::shared::text::one_line;
+
+/// The body of `POST /announcement`.
+#[derive(Default, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct Announcement {
+    text: String,
+}
+
+/// Longest announcement, in characters.
+const MAX_ANNOUNCEMENT: usize = 300;
 
 /// Adds all routes to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
@@ -116,13 +127,16 @@ async fn announcement(request: HttpRequest, payload: web::Payload, server: web::
     if let Some(refusal) = refuse_action(server.admin_auth.as_ref(), &request, peer) {
         return refusal;
     }
-    let form = "{\"text\": TEXT} with at most 300 letters";
-    let announcement: Announcement = match body::json(&request, payload, form).await {
-        Ok(announcement) => announcement,
+    let text = match body::json(&request, payload, "{\"text\": TEXT}").await {
+        Ok(Announcement { text }) => one_line(text.trim()),
         Err(refusal) => return refusal,
     };
-    log::info!("client {peer}: announces {:?}", announcement.text);
-    server.announcement.send_replace(announcement);
+    if text.chars().count() > MAX_ANNOUNCEMENT {
+        let words = format!("Error: an announcement has at most {MAX_ANNOUNCEMENT} letters.");
+        return HttpResponse::BadRequest().body(words);
+    }
+    log::info!("client {peer}: announces {text:?}");
+    server.announcement.send_replace(text);
     HttpResponse::Ok().body("ok")
 }
 
