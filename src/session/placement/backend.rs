@@ -1,6 +1,7 @@
 //! What is known of one simulation server: its last report, and the clients that were sent to it since then.
 
 use super::cost::{CostFit, Estimate, FULL, FleetCost, believable};
+use super::ejection::Ejection;
 use super::policy::PlacementPolicy;
 use super::replicas::Replicas;
 use crate::shared::domain::{Instances, ServerReport};
@@ -46,6 +47,17 @@ impl ClientDelta {
     }
 }
 
+/// Sort key of a server: ejected servers come last, then the lowest load comes first, and of equal loads the server
+/// that was chosen longest ago.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct Rank {
+    is_ejected: bool,
+    /// The bits of the load, which sort as the load does: it is not negative.
+    load: u64,
+    /// Unique in a fleet.
+    last_pick: u64,
+}
+
 /// One server of the fleet.
 #[derive(Debug, Default)]
 pub(super) struct Backend {
@@ -73,6 +85,10 @@ pub(super) struct Backend {
     pub(super) cost: f64,
     /// When this server was chosen last, as a number that grows with each placement of the fleet.
     pub(super) last_pick: u64,
+    /// Whether its starts fail.
+    pub(super) ejection: Ejection,
+    /// Its rank in the fleet, `None` if it has no room.
+    pub(super) rank: Option<Rank>,
 }
 
 impl Backend {
@@ -97,6 +113,7 @@ impl Backend {
         fleet: &mut FleetCost,
         replicas: &mut Replicas,
     ) {
+        self.ejection.report(now, report.failed_starts);
         let report = LastReport { at: now, load: report.load.percent(), instances: report.instances };
         self.note_changes(report, replicas);
         self.fresh = 0;
@@ -122,8 +139,9 @@ impl Backend {
         self.fresh += usize::from(takes_room);
     }
 
-    /// Gives up overdue clients. Returns the number of those that reserved room.
+    /// Ends an ejection, and gives up overdue clients. Returns the number of those that reserved room.
     pub(super) fn expire(&mut self, now: Instant, policy: &PlacementPolicy) -> usize {
+        self.ejection.expire(now);
         let is_late = |placed: &Placement| now.saturating_duration_since(placed.at) >= policy.placement_timeout;
         let late = self.in_flight.partition_point(is_late);
         let given_up = self.in_flight.drain(..late).filter(|placed| placed.takes_room).count();
@@ -132,7 +150,7 @@ impl Backend {
     }
 
     /// Whether a client can be sent here.
-    pub(super) fn has_room(&self, policy: &PlacementPolicy) -> bool {
+    fn has_room(&self, policy: &PlacementPolicy) -> bool {
         let has_slot = |instances: Instances| {
             let taken = f64::from(instances.present()) + count(self.reserved) + self.sent_by_others();
             taken < f64::from(instances.places)
@@ -155,9 +173,11 @@ impl Backend {
         self.load_with(self.reserved)
     }
 
-    /// The same with all clients that were sent here; servers are compared by this load.
-    pub(super) fn rank_load(&self) -> Option<f64> {
-        self.load_with(self.in_flight.len())
+    /// The rank that it should have; `None` if it has no room. Servers are compared by their load with all clients that
+    /// were sent there.
+    pub(super) fn current_rank(&self, policy: &PlacementPolicy) -> Option<Rank> {
+        let load = self.load_with(self.in_flight.len()).filter(|_| self.has_room(policy))?;
+        Some(Rank { is_ejected: self.ejection.until.is_some(), load: load.to_bits(), last_pick: self.last_pick })
     }
 
     fn load_with(&self, in_flight: usize) -> Option<f64> {
