@@ -21,7 +21,7 @@ use std::collections::VecDeque;
 use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::sync::Arc;
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, Instant};
 
 use askama::Template;
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
@@ -93,7 +93,7 @@ fn fleet() -> FleetStatus {
         client_cost: Some(1.0),
     });
     let change = |number| StateChange {
-        at: SystemTime::now(),
+        at: String::new(),
         server: address(number).to_string(),
         state: ServerState::Down,
         why: "no answer within 3 s".to_owned(),

@@ -14,6 +14,7 @@ use webots_fleet::session::config::SessionConfig;
 use webots_fleet::session::mail::{self, Channel, Notice, NoticeKind};
 use webots_fleet::shared::config::Configuration;
 use webots_fleet::shared::domain::Load;
+use webots_fleet::shared::run::timestamp;
 
 use self::log::{keep_log, logged};
 
@@ -61,7 +62,7 @@ async fn test_mail(config: &SessionConfig) -> Result<String, String> {
 fn notice(host: &str, event: NoticeKind) -> Notice {
     let server = format!("{host}:2000");
     let error = (event == NoticeKind::NotResponding).then(|| "connection refused".to_owned());
-    Notice { server, event, load: Load::try_from(97.25).ok(), error, at: SystemTime::now() }
+    Notice { server, event, load: Load::try_from(97.25).ok(), error, at: timestamp(SystemTime::now()) }
 }
 
 fn nothing_unexpected(port: u16) {

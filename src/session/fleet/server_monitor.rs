@@ -104,11 +104,9 @@ pub async fn monitor(
 
 /// Requests the report of a server. `without_status` is when it was last found to have no `/status`.
 async fn probe(client: &awc::Client, url: &str, without_status: &mut Option<Instant>) -> Result<ServerReport, String> {
-    if without_status.is_none_or(|found| found.elapsed() >= LOAD_ONLY) {
-        if let Some((body, _)) = get(client, &format!("{url}/status")).await? {
-            return usable(ServerReport::parse(&body).map_err(bad_answer)?);
-        }
-        *without_status = Some(Instant::now());
+    let may_have_status = without_status.is_none_or(|found| found.elapsed() >= LOAD_ONLY);
+    if may_have_status && let Some((body, _)) = get(client, &format!("{url}/status")).await? {
+        return usable(ServerReport::parse(&body).map_err(bad_answer)?);
     }
     let body = get(client, &format!("{url}/load")).await?;
     let (bytes, length) = body.ok_or_else(|| bad_answer("it has neither /status nor /load"))?;
@@ -116,7 +114,11 @@ async fn probe(client: &awc::Client, url: &str, without_status: &mut Option<Inst
     if length != Some(bytes.len()) {
         return Err(bad_answer("an answer that does not end as its Content-Length says"));
     }
-    usable(ServerReport::load_only(Load::parse(&bytes).map_err(bad_answer)?))
+    let report = usable(ServerReport::load_only(Load::parse(&bytes).map_err(bad_answer)?))?;
+    if may_have_status {
+        *without_status = Some(Instant::now());
+    }
+    Ok(report)
 }
 
 /// Returns the body of a page and its length as announced, `None` if the server has no such page.

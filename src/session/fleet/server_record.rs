@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use crate::session::mail::NoticeKind;
 use crate::shared::domain::{ProjectUrl, PublicAddress, ServerReport};
-use crate::shared::run::serialize_timestamp;
+use crate::shared::run::timestamp;
 
 /// The state of a simulation server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -34,8 +34,8 @@ pub struct ServerRecord {
     pub drained: bool,
     /// Its state, as of its last probe.
     pub state: ServerState,
-    /// When it entered that state.
-    pub since: SystemTime,
+    /// When it entered that state, as text.
+    pub since: String,
     /// Its last report; kept when it is down.
     pub report: Option<Arc<ServerReport>>,
     /// The last error; kept after the server has answered again.
@@ -49,9 +49,8 @@ pub struct ServerRecord {
 /// A simulation server has changed its state.
 #[derive(Debug, Clone, Serialize)]
 pub struct StateChange {
-    /// When it changed.
-    #[serde(serialize_with = "serialize_timestamp")]
-    pub at: SystemTime,
+    /// When it changed, as text.
+    pub at: String,
     /// The simulation server's address.
     pub server: String,
     /// Its new state.
@@ -77,7 +76,7 @@ impl ServerRecord {
             address,
             drained: false,
             state: ServerState::Unknown,
-            since: SystemTime::now(),
+            since: timestamp(SystemTime::now()),
             report: None,
             last_error: None,
             latency: None,
@@ -131,8 +130,8 @@ impl ServerRecord {
         if before == state {
             return None;
         }
-        self.since = SystemTime::now();
-        let change = StateChange { at: self.since, server: self.address.to_string(), state, why: why() };
+        self.since = timestamp(SystemTime::now());
+        let change = StateChange { at: self.since.clone(), server: self.address.to_string(), state, why: why() };
         // The four events of the original.
         let event = match (before, state) {
             (_, ServerState::Down) => Some(NoticeKind::NotResponding),

@@ -34,7 +34,7 @@ impl StateHistory {
             // The last known values: a server that does not answer reports no load, and one that works again no error.
             let load = record.report.as_ref().map(|report| report.load);
             let error = record.last_error.clone().filter(|_| !event.is_about_load());
-            let notice = Notice { server: server.clone(), event, load, error, at: *at };
+            let notice = Notice { server: server.clone(), event, load, error, at: at.clone() };
             for mailer in &self.mailers {
                 if mailer.send(notice.clone()).is_err() {
                     log::error!("{server}: no notice is sent: its mailer has panicked");

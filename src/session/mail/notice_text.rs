@@ -4,7 +4,6 @@
 
 use super::outbox::{Notice, NoticeKind, WaitingNotice};
 use crate::session::config::SessionConfig;
-use crate::shared::run::timestamp;
 use crate::shared::text::excerpt;
 
 /// Longest untrusted text that is shown, in characters.
@@ -28,7 +27,7 @@ pub fn test_text(signature: &str) -> String {
 }
 
 fn paragraph(notice: &Notice) -> String {
-    let (server, event, time) = (excerpt(&notice.server, MAX_LETTERS), notice.event.words(), timestamp(notice.at));
+    let (server, event, time) = (excerpt(&notice.server, MAX_LETTERS), notice.event.words(), &notice.at);
     let load = notice.load.map(|load| format!("  Load:       {:.1}%\n", load.percent())).unwrap_or_default();
     let error = notice.error.as_ref().map(|error| format!("  Last error: {}\n", excerpt(error, MAX_LETTERS)));
     format!("{server}: {event}\n  Time:       {time}\n{load}{}\n", error.unwrap_or_default())

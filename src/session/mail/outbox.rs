@@ -9,7 +9,7 @@
 //! 3. After a failure all are retried, with a delay that doubles. A notice is given up after `mailPatience`.
 
 use std::collections::BTreeMap;
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, Instant};
 
 use crate::session::config::Timing;
 use crate::shared::domain::Load;
@@ -25,8 +25,8 @@ pub struct Notice {
     pub load: Option<Load>,
     /// The last error, if any; untrusted text.
     pub error: Option<String>,
-    /// When it happened.
-    pub at: SystemTime,
+    /// When it happened, as text.
+    pub at: String,
 }
 
 /// What happened to a simulation server.
@@ -158,7 +158,7 @@ mod tests {
     type Mail = (u64, Vec<(u16, NoticeKind)>);
 
     fn notice(port: u16, event: NoticeKind) -> Notice {
-        Notice { server: format!("host:{port}"), event, load: None, error: None, at: SystemTime::UNIX_EPOCH }
+        Notice { server: format!("host:{port}"), event, load: None, error: None, at: String::new() }
     }
 
     /// With the defaults: `gather` 10 s, `flapping` 600 s, `mailPatience` one hour.

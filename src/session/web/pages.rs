@@ -1,7 +1,7 @@
 //! The session server's HTML pages: the monitor of its fleet, and the viewer.
 
 use std::collections::VecDeque;
-use std::time::{Duration, SystemTime};
+use std::time::Duration;
 
 use askama::Template;
 
@@ -9,7 +9,6 @@ use crate::session::config::Example;
 use crate::session::fleet::{FleetStatus, ServerState, ServerStatus, StateChange};
 use crate::shared::domain::{ClientUrls, Instances, ServerReport};
 use crate::shared::http::{PageView, TableRow};
-use crate::shared::run::timestamp;
 use crate::shared::text::one_line;
 
 /// The whole page `/monitor`.
@@ -128,10 +127,6 @@ impl ServerRow<'_> {
         allowed.iter().map(|prefix| shown(prefix.as_str())).collect()
     }
 
-    fn since(&self) -> String {
-        timestamp(self.server.record.since)
-    }
-
     /// A latency as text, rounded so that the page of an idle fleet does not change.
     fn milliseconds(time: &Duration) -> String {
         match time.as_millis() {
@@ -139,11 +134,5 @@ impl ServerRow<'_> {
             millis @ 1..1000 => format!("{millis} ms"),
             _ => format!("{:.1} s", time.as_secs_f64()),
         }
-    }
-}
-
-impl Changes<'_> {
-    fn time(at: &SystemTime) -> String {
-        timestamp(*at)
     }
 }
