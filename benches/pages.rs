@@ -21,8 +21,9 @@ use std::collections::VecDeque;
 use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::sync::Arc;
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, Instant};
 
+use askama::Template;
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use support::client::{Client, Heard};
 use support::git::{Forge, world};
@@ -30,7 +31,7 @@ use support::program::{Server, session_server, simulation_server};
 use support::webots::Webots;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use webots_fleet::session::fleet::{FleetStatus, ServerRecord, ServerState, ServerStatus, StateChange};
-use webots_fleet::session::web::pages;
+use webots_fleet::session::web::pages::{self, Monitor};
 use webots_fleet::shared::domain::ClientUrls;
 
 const SERVERS: u16 = 1000;
@@ -50,11 +51,15 @@ fn main() {
 
 fn rendering() {
     let (fleet, urls) = (fleet(), ClientUrls { ssl: false, public: None });
-    let page = pages::monitor(&fleet, 1000, &urls, SystemTime::now(), (None, true)).unwrap();
+    let render = || {
+        let view = pages::view(&fleet, 1000, &urls, "").unwrap();
+        Monitor { started: String::new(), has_actions: true, view }.render().unwrap()
+    };
+    let page = render();
     let mut times: Vec<Duration> = (0..50)
         .map(|_| {
             let begun = Instant::now();
-            std::hint::black_box(pages::monitor(&fleet, 1000, &urls, SystemTime::now(), (None, true)).unwrap());
+            std::hint::black_box(render());
             begun.elapsed()
         })
         .collect();
@@ -80,7 +85,7 @@ fn fleet() -> FleetStatus {
             report: Some(Arc::new(serde_json::from_value(report.clone()).unwrap())),
             latency: Some(Duration::from_millis(3)),
             answered: Some(Instant::now()),
-            ..ServerRecord::new(address(number), false)
+            ..ServerRecord::new(address(number))
         },
         error: None,
         effective_load: Some(44.5),
@@ -88,7 +93,7 @@ fn fleet() -> FleetStatus {
         client_cost: Some(1.0),
     });
     let change = |number| StateChange {
-        at: SystemTime::now(),
+        at: String::new(),
         server: address(number).to_string(),
         state: ServerState::Down,
         why: "no answer within 3 s".to_owned(),

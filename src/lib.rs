@@ -11,8 +11,7 @@
 //! | [`shared::run`] | start, readiness, log, stop |
 //! | [`shared::http`] | pages, live updates, WebSockets, limits, certificates, metrics |
 //! | [`session::placement`] | which server gets the next client: ranking (`load_balancer`), the load that is ranked (`backend`), cost |
-//! | `session::announcements` | the administrator's message to all clients |
-//! | [`session::mail`] | notices: to whom (key `administrator`: `config/session_config`, `config/mail_address`) and how (`smtp`, `webhook`), what is in them (`notice_text`), when they go (`outbox`) |
+//! | [`session::mail`] | notices: to whom (key `administrator`: `config/session_config`, `config/mail_address`) and how (`channel`, `smtp`), what is in them (`notice_text`), when they go (`outbox`) |
 //! | [`session::fleet`] | the registry and the monitors of simulation servers |
 //! | [`session::web`] | routes, pages, `/status`, Prometheus gauges (`metrics`; counters: `app`) and the WebSocket of the session server |
 //! | [`simulation::process`] | process trees: how they start and end (`process_group`; what a server that has died left: `process_tree`, `guardian`); directories of simulations |
@@ -77,15 +76,15 @@
 //! | actor or task | ends by itself | after a panic |
 //! |---|---|---|
 //! | Registry, `LoadMonitor` | never | the server logs it and exits with code 1: the service manager restarts it |
-//! | monitor | when its server is removed from the configuration, or no name resolves to that server any more and the server does not answer | its supervisor starts a new one |
-//! | mailer | never | its supervisor starts a new one; unsent notices are lost |
+//! | monitor | when its server is removed from the configuration, or no name resolves to that server any more | its supervisor starts a new one |
+//! | mailer | never | notices are logged as not sent, until the server is restarted |
 //! | `WebClient` | with its connection | its connection closes, and its session is notified |
 //! | `Session` | with its simulation, or its client | its lease is released, and its client is notified |
 //! | Webots | with its process tree; it is never restarted, its client is notified | its process tree is killed at once, its directory removed, its slot released |
 //!
 //! The `SlotPool` is no actor: a mutex guards it. A panic while that mutex is locked also ends the server with exit code 1.
-//! The registry runs the supervisors ([`shared::run::Supervisor`], one for each kind). More than five panics of a kind
-//! within a minute end the server with exit code 1, too.
+//! The registry supervises the monitors ([`shared::run::Supervisor`]). More than five panics of them within a minute end
+//! the server with exit code 1, too.
 //!
 //! # Facts about actix 0.13 that this relies on
 //!

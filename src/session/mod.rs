@@ -1,6 +1,5 @@
 //! The session server: the entry point to a fleet of simulation servers.
 
-mod announcements;
 pub mod app;
 pub mod config;
 pub mod fleet;

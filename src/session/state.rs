@@ -8,7 +8,6 @@ use actix::prelude::*;
 use actix_web::error::ErrorServiceUnavailable;
 use tokio::sync::watch;
 
-use super::announcements::Announcements;
 use super::config::SessionConfig;
 use crate::session::fleet::{FleetStatus, GetStatus, Pick, PickError, Registry};
 use crate::shared::domain::{ClientUrls, ProjectUrl};
@@ -35,8 +34,8 @@ pub struct AppState {
     pub picks: prometheus::IntCounterVec,
     /// The open monitor pages.
     pub live: LiveUpdates,
-    /// The administrator's announcement.
-    pub announcements: Announcements,
+    /// The administrator's announcement: one line of text, never markup; empty if there is none.
+    pub announcement: watch::Sender<String>,
     /// Checks the administrator's password, where one is configured.
     pub admin_auth: Option<BasicAuth>,
     /// When the server was started.

@@ -4,7 +4,6 @@ import './live.js';
 
 const form = document.getElementById('announce');
 const text = document.getElementById('announce-text');
-const until = document.getElementById('announce-until');
 const problem = document.getElementById('announce-problem');
 
 async function announce(order) {
@@ -19,9 +18,6 @@ async function announce(order) {
 
 form?.addEventListener('submit', (event) => {
   event.preventDefault();
-  const order = { text: text.value };
-  if (until.value)
-    order.until = new Date(until.value).toISOString();
-  announce(order);
+  announce({ text: text.value });
 });
 document.getElementById('announce-end')?.addEventListener('click', () => announce({}));

@@ -10,7 +10,7 @@ use super::copy::{root, walk};
 /// what is in it; those of `session` and `simulation` also all of `shared`, and never each other.
 const ROOMS: [(&str, &str); 3] = [
     ("shared", "text config domain run http"),
-    ("session", "placement config announcements mail fleet state web app"),
+    ("session", "placement config mail fleet state web app"),
     (
         "simulation",
         "client_identity simulation_id snapshot ends failed_starts sessions slots relay protocol process machine config checkout \

@@ -84,7 +84,6 @@ async fn the_status_tells_all_of_each_server_and_the_metrics_what_an_alarm_needs
         format!("server_load_percent{{server=\"{up}\"}} 20"),
         format!("server_effective_load_percent{{server=\"{up}\"}} 23"),
         format!("server_in_flight{{server=\"{up}\"}} 1"),
-        "report_seconds_count 3".to_owned(),
     ] {
         let line = format!("webots_session_{line}");
         assert!(text.lines().any(|found| found == line), "no {line:?} in {text}");
@@ -111,7 +110,6 @@ async fn a_fault_of_the_configuration_is_one_line_and_exit_code_2() {
     for (key, value, words) in [
         ("port", json!(65536), ["port", "65535"]),
         ("simulationServers", json!("localhost:2000"), ["simulationServers", "sequence"]),
-        ("simulationServers", json!(["a:1", "a:1"]), ["simulationServers", "twice"]),
         ("simulationServers", json!(["dns+a"]), ["simulationServers[0]", "dns+NAME:PORT"]),
         ("simulationServers", json!(["dnssrv+a.b"]), ["simulationServers", "dns+NAME:PORT"]),
         ("drainedServers", json!(["a:1"]), ["drainedServers", "a:1"]),
@@ -120,7 +118,6 @@ async fn a_fault_of_the_configuration_is_one_line_and_exit_code_2() {
         ("timing", json!({"answer": "fast"}), ["timing.answer", "a number of seconds"]),
         ("timing", json!([1]), [" timing", ""]),
         ("timing", json!({"anser": 1}), ["timing", "anser"]),
-        ("timing", json!({"stop": 4.6}), ["timing.stop", "4.5"]),
         ("timing", json!({"ping": 10, "silence": 10}), ["timing.silence", "timing.ping"]),
         ("examples", json!({"titel": "a", "url": "b"}), ["examples", "title"]),
     ] {

@@ -64,7 +64,6 @@ async fn servers_are_added_drained_and_removed_without_dropping_a_client() {
     assert_eq!(place().await, servers[0].url());
     session.reload(json!({"simulationServers": [one, two, three]}));
     until_states(&session, &["up"; 3]).await;
-    assert_eq!(servers[0].requests(), 1, "a server that stays is not disturbed");
     session.reload(json!({"drainedServers": [one]}));
     until_states(&session, &["draining", "up", "up"]).await;
     assert_eq!(place().await, servers[1].url());
@@ -74,7 +73,6 @@ async fn servers_are_added_drained_and_removed_without_dropping_a_client() {
     session.reload(json!({"drainedServers": []}));
     until_states(&session, &["up", "up"]).await;
     assert_eq!(place().await, servers[0].url());
-    assert_eq!(servers[0].requests(), 1, "drained servers were judged by what they had said");
     assert_eq!(client.heard, ["0", "1"].map(str::to_owned)[usize::from(client.heard[0] == "1")..]);
     // All drained is as good as none.
     session.reload(json!({"drainedServers": [one, three]}));

@@ -67,7 +67,7 @@ async fn a_message_that_is_not_taken_is_tried_again_and_so_is_a_mail_for_itself(
     // The mail does not wait for the messenger.
     assert_eq!(smtp.mail().await.subject(), "Simulation servers: 3 not responding");
     receiver.texts(3).await;
-    until("it is logged", async || session.log().contains("webhook not sent, next try in")).await;
+    until("it is logged", async || session.log().contains("webhook not sent, it is tried again")).await;
     assert!(session.log().contains("503 Service Unavailable"), "{}", session.log());
     // A redirect leads notices to nobody else.
     receiver.answer(&format!("307 Elsewhere\r\nLocation: http://127.0.0.1:{}/", other.port));

@@ -1,6 +1,4 @@
-//! Mail addresses and mail servers in the configuration.
-
-use std::net::IpAddr;
+//! Mail addresses in the configuration.
 
 use lettre::message::Mailbox;
 use serde::{Deserialize, Deserializer};
@@ -20,11 +18,6 @@ pub fn optional<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Mai
         let allowed = "allowed is one NAME@HOST in ASCII, or Some Name <NAME@HOST>";
         serde::de::Error::custom(format!("{text:?} is no mail address; {allowed}"))
     })
-}
-
-/// Whether a text can be the name or the IP address of an SMTP server, without a port.
-pub fn is_host(text: &str) -> bool {
-    text.parse::<IpAddr>().is_ok() || (!text.contains(['[', '%']) && url::Host::parse(text).is_ok())
 }
 
 #[cfg(test)]
@@ -70,16 +63,6 @@ mod tests {
         ] {
             let error = read(text).unwrap_err().to_string();
             assert!(error.contains(&format!("{text:?}")), "{error}");
-        }
-    }
-
-    #[test]
-    fn a_host_is_a_name_or_an_address_without_a_port() {
-        for host in ["localhost", "smtp.example.org", "10.0.0.7", "::1"] {
-            assert!(is_host(host), "{host:?} was refused");
-        }
-        for other in ["", "smtp.example.org:587", "smtp://example.org", "a b", "[::1]", "user@host", "a\r\nb"] {
-            assert!(!is_host(other), "{other:?} was taken");
         }
     }
 }

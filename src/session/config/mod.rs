@@ -1,14 +1,10 @@
 //! The session server's configuration: every key, its default, and the rules between keys.
 
-mod announcement;
-mod example;
 mod mail_address;
 mod server_entry;
 mod session_config;
 mod timing;
 
-pub use announcement::{Announcement, AnnouncementKeys};
-pub use example::Example;
-pub use server_entry::{DnsName, ServerEntry};
-pub use session_config::SessionConfig;
+pub use server_entry::ServerEntry;
+pub use session_config::{Example, SessionConfig};
 pub use timing::Timing;

@@ -1,6 +1,5 @@
 //! The key `simulationServers`: addresses of simulation servers, and names that are resolved by DNS.
 
-use std::fmt;
 use std::net::IpAddr;
 
 use serde::{Deserialize, Serialize};
@@ -13,21 +12,11 @@ use crate::shared::domain::PublicAddress;
 pub enum ServerEntry {
     /// A simulation server.
     Server(PublicAddress),
-    /// A name that resolves to simulation servers.
-    Name(DnsName),
-}
-
-/// `dns+HOST:PORT`: all addresses of a host (A and AAAA), each with this port. A final dot makes the host absolute, as
-/// usual in DNS.
-///
-/// Thanos, Loki and Mimir use the same notation. A URL `dns://...` means something else: its host is the DNS server
-/// (RFC 4501, also in gRPC).
-#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct DnsName {
-    /// The host, as DNS resolves it.
-    pub host: String,
-    /// The port of all of its simulation servers.
-    pub port: u16,
+    /// `dns+HOST:PORT`: all addresses of a host (A and AAAA), each with this port.
+    ///
+    /// Thanos, Loki and Mimir use the same notation. A URL `dns://...` means something else: its host is the DNS server
+    /// (RFC 4501, also in gRPC).
+    Name(PublicAddress),
 }
 
 impl ServerEntry {
@@ -39,8 +28,8 @@ impl ServerEntry {
         }
     }
 
-    /// The name to resolve, if this is one.
-    pub fn name(&self) -> Option<&DnsName> {
+    /// The name to resolve and the port, if this is one.
+    pub fn name(&self) -> Option<&PublicAddress> {
         match self {
             Self::Name(name) => Some(name),
             Self::Server(_) => None,
@@ -53,7 +42,7 @@ impl TryFrom<String> for ServerEntry {
 
     fn try_from(text: String) -> Result<Self, String> {
         let entry = match text.strip_prefix("dns+") {
-            Some(name) => dns_name(name).map(Self::Name),
+            Some(name) => name.parse().ok().filter(is_name).map(Self::Name),
             None => text.parse().ok().map(Self::Server),
         };
         entry.ok_or_else(|| {
@@ -67,34 +56,17 @@ impl TryFrom<String> for ServerEntry {
 
 impl From<ServerEntry> for String {
     fn from(entry: ServerEntry) -> Self {
-        entry.to_string()
-    }
-}
-
-impl fmt::Display for ServerEntry {
-    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Server(address) => address.fmt(out),
-            Self::Name(name) => name.fmt(out),
+        match entry {
+            ServerEntry::Server(address) => address.to_string(),
+            ServerEntry::Name(name) => format!("dns+{name}"),
         }
     }
 }
 
-impl fmt::Display for DnsName {
-    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(out, "dns+{}:{}", self.host, self.port)
-    }
-}
-
-/// A name with its port. It is a host of which the address is not known.
-fn dns_name(text: &str) -> Option<DnsName> {
-    let (host, port) = text.rsplit_once(':')?;
-    let relative = host.strip_suffix('.').unwrap_or(host);
-    let address: PublicAddress = format!("{relative}:{port}").parse().ok()?;
+/// Whether the host of an address is not known yet.
+fn is_name(address: &PublicAddress) -> bool {
     let is_address = address.host().starts_with('[') || address.host().parse::<IpAddr>().is_ok();
-    let end = if host == relative { "" } else { "." };
-    (!is_address && !address.is_rewritten() && !relative.ends_with('.'))
-        .then(|| DnsName { host: format!("{}{end}", address.host()), port: address.port() })
+    !is_address && !address.is_rewritten()
 }
 
 #[cfg(test)]
@@ -108,14 +80,14 @@ mod tests {
     #[test]
     fn addresses_and_names_stand_side_by_side() {
         for text in ["localhost:2000", "lab.org/2000", "dns+tasks.simulation:2000"] {
-            assert_eq!(read(text).unwrap().to_string(), text);
+            assert_eq!(String::from(read(text).unwrap()), text);
         }
-        assert_eq!(read("dns+Tasks.Simulation.:02000").unwrap().to_string(), "dns+tasks.simulation.:2000");
+        assert_eq!(String::from(read("dns+Tasks.Simulation:02000").unwrap()), "dns+tasks.simulation:2000");
     }
 
     #[test]
     fn what_is_no_name_is_refused_in_words() {
-        let names = "dns+ dns+host dns+host:0 dns+host:port dns+lab.org/2000 dns+lab.org:443/2000 dns+a..:2000";
+        let names = "dns+ dns+host dns+host:0 dns+host:port dns+lab.org/2000 dns+lab.org:443/2000";
         let others =
             "dns+10.0.0.7:2000 dns+[::1]:2000 dnssrv+ dnssrv+_webots._tcp.example.org dns://a.b:2000 DNS+host:2000";
         for text in names.split(' ').chain(others.split(' ')).chain(["dns+a b:2000"]) {

@@ -1,14 +1,11 @@
 //! The session server's configuration, `config/session/NAME.json`.
 
-use std::collections::HashSet;
 use std::net::{IpAddr, Ipv6Addr};
 use std::time::Duration;
 
 use lettre::message::Mailbox;
 use serde::{Deserialize, Serialize};
 
-use super::announcement::Announcement;
-use super::example::Example;
 use super::mail_address;
 use super::server_entry::ServerEntry;
 use super::timing::Timing;
@@ -18,7 +15,7 @@ use crate::shared::config::{
     Configuration, ExpandedPath, Secret, expanded, is_web_url, one_or_many, optional_whole, percent, require, seconds,
     whole,
 };
-use crate::shared::domain::{ClientUrls, PublicAddress, PublicUrl, complete_host};
+use crate::shared::domain::{PublicAddress, PublicUrl, complete_host};
 use crate::shared::http::TrustedProxies;
 
 keys! {
@@ -65,8 +62,6 @@ pub struct SessionConfig {
     pub mail_sender_password: Option<Secret> = None,
     /// URL to which each mail's notices are posted as JSON, `{"text": ...}`, as Slack and Matrix take them. Default: none.
     pub webhook: Option<Secret> = None,
-    /// A message that open viewers and the monitor show: `{"text": ..., "until": ...}`. Default: none.
-    pub announcement: Option<Announcement> = None,
     /// Password for actions such as `/announcement`. Default: none, and actions are off.
     pub admin_password: Option<Secret> = None,
     /// Folder of `session/output.log`. Default: `log`.
@@ -94,7 +89,7 @@ pub struct SessionConfig {
     /// Reverse proxies, as addresses or networks, whose header `X-Forwarded-For` is trusted.
     /// Default: `["127.0.0.0/8", "::1/128"]`.
     pub trusted_proxies: TrustedProxies = TrustedProxies::default(),
-    /// Worlds that the page `/viewer` offers: URLs, or `{"title": ..., "url": ...}`. Default: none.
+    /// Worlds that the page `/viewer` offers: `{"title": ..., "url": ...}`. Default: none.
     #[serde(deserialize_with = "one_or_many")]
     pub examples: Vec<Example> = Vec::new(),
     /// URL of Webots' own viewer (`WebotsView.js`), for simulation servers that don't have it. Default: none.
@@ -104,8 +99,15 @@ pub struct SessionConfig {
 }
 }
 
-/// Upper limit of `timing.stop`: the server stops within five seconds.
-const MAX_STOP: Duration = Duration::from_millis(4500);
+/// An example on the page `/viewer`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Example {
+    /// Its title.
+    pub title: String,
+    /// The world's URL.
+    pub url: String,
+}
 
 impl SessionConfig {
     /// The parameters of placement.
@@ -133,23 +135,12 @@ impl SessionConfig {
         format!("{}/session", door.unwrap_or_else(|| self.address().websocket_url(self.ssl)))
     }
 
-    /// Returns what forms the URLs of simulation servers for clients.
-    pub fn client_urls(&self) -> ClientUrls {
-        ClientUrls { ssl: self.ssl, public: self.public_url.clone() }
-    }
-
-    /// Checks that each simulation server is listed once.
+    /// Checks that only listed servers are drained.
     fn check_servers(&self) -> Result<(), String> {
-        let mut seen = HashSet::new();
-        for entry in &self.simulation_servers {
-            require(seen.insert(entry), "simulationServers", || {
-                format!("{entry} is listed twice; each simulation server is listed once")
-            })?;
-        }
         // A name may resolve to any server.
         let has_names = self.simulation_servers.iter().any(|entry| entry.name().is_some());
         for address in &self.drained_servers {
-            let is_listed = has_names || seen.contains(&ServerEntry::Server(address.clone()));
+            let is_listed = has_names || self.simulation_servers.contains(&ServerEntry::Server(address.clone()));
             require(is_listed, "drainedServers", || format!("{address} is not one of simulationServers"))?;
         }
         Ok(())
@@ -160,15 +151,10 @@ impl Configuration for SessionConfig {
     const REQUIRED: &'static [&'static str] = &["simulationServers"];
 
     fn complete(&mut self, _: &std::path::Path) -> Result<Vec<String>, String> {
-        let mut warnings = Vec::new();
-        warnings.extend(complete_host(&mut self.server, self.port_rewrite)?);
+        let warning = complete_host(&mut self.server, self.port_rewrite)?;
         self.check_servers()?;
         require(self.timing.silence > self.timing.ping, "timing.silence", || {
             format!("{} s is not more than timing.ping", self.timing.silence.as_secs_f64())
-        })?;
-        require(self.timing.stop <= MAX_STOP, "timing.stop", || {
-            let (stop, most) = (self.timing.stop.as_secs_f64(), MAX_STOP.as_secs_f64());
-            format!("{stop} s is too long; allowed is at most {most} s, for the server ends within 5 s")
         })?;
         let allowed = "no URL of a web server; allowed are http and https";
         if let Some(script) = &self.viewer_script {
@@ -179,20 +165,7 @@ impl Configuration for SessionConfig {
             // The text itself is a secret.
             require(is_web_url(webhook.reveal()), "webhook", || format!("it is {allowed}"))?;
         }
-        if self.announcement.as_ref().is_some_and(Announcement::is_over) {
-            warnings.push("announcement is over: it is not shown".to_owned());
-        }
         self.mail_server = self.mail_server.take().filter(|host| !host.is_empty());
-        if let Some(host) = &self.mail_server {
-            require(mail_address::is_host(host), "mailServer", || {
-                format!("{host:?} is no host; allowed is a name or an IP address (mailServerPort has the port)")
-            })?;
-        }
-        if self.administrator.is_some() && self.mail_server.is_none() {
-            warnings.push("mailServer is not set: notifications are off".to_owned());
-        } else if self.administrator.is_some() && self.mail_sender.is_none() {
-            warnings.push("mailSender is not set: notifications are off".to_owned());
-        }
-        Ok(warnings)
+        Ok(warning.into_iter().collect())
     }
 }

@@ -40,8 +40,5 @@ pub struct Timing {
     /// Timeout of the delivery of one mail. Default: 30.
     #[serde(with = "seconds")]
     pub mail_answer: Duration = Duration::from_secs(30),
-    /// Timeout of open connections when the server stops, at most 4.5. Default: 4.
-    #[serde(with = "seconds")]
-    pub stop: Duration = Duration::from_secs(4),
 }
 }

@@ -1,12 +1,10 @@
 //! The status of the fleet, for pages and metrics.
 
 use std::collections::VecDeque;
-use std::time::SystemTime;
 
 use serde::Serialize;
 
-use super::server_record::{ServerRecord, StateChange};
-use crate::shared::run::serialize_timestamp;
+use super::server_record::{ServerRecord, ServerState, StateChange};
 
 /// Everything that is known of the fleet.
 #[derive(Debug, Clone)]
@@ -15,12 +13,19 @@ pub struct FleetStatus {
     pub available: bool,
     /// The mean load of the servers that answer.
     pub mean_load: Option<f64>,
-    /// Each simulation server, in the order of the configuration; those that no name resolves to any more come last.
+    /// Each simulation server, in the order of the configuration.
     pub servers: Vec<ServerStatus>,
     /// Each name of the configuration that is resolved.
     pub names: Vec<NameStatus>,
     /// The last changes of state, the newest first.
     pub changes: VecDeque<StateChange>,
+}
+
+impl FleetStatus {
+    /// Number of simulation servers in this state.
+    pub fn count(&self, state: ServerState) -> usize {
+        self.servers.iter().filter(|server| server.record.state == state).count()
+    }
 }
 
 /// What is known of a name that resolves to simulation servers.
@@ -32,9 +37,6 @@ pub struct NameStatus {
     pub servers: usize,
     /// Why the last lookup failed, if it did: the servers are those that were found before.
     pub error: Option<String>,
-    /// When lookups last began to fail or to succeed.
-    #[serde(serialize_with = "serialize_timestamp")]
-    pub since: SystemTime,
 }
 
 /// What is known of one simulation server.

@@ -2,7 +2,6 @@
 
 mod fleet_status;
 mod name_table;
-mod pick;
 mod registry;
 mod resolver;
 mod server_monitor;
@@ -11,6 +10,5 @@ mod server_table;
 mod state_history;
 
 pub use fleet_status::{FleetStatus, NameStatus, ServerStatus};
-pub use pick::{Pick, PickError};
-pub use registry::{GetStatus, Reconfigure, Registry};
+pub use registry::{GetStatus, Pick, PickError, Reconfigure, Registry};
 pub use server_record::{ServerRecord, ServerState, StateChange};

@@ -1,15 +1,16 @@
 //! The names of `simulationServers`, and the simulation servers that each resolves to. Part of the registry, which looks
-//! each name up every second regardless of TTL.
+//! all names up every second regardless of TTL.
 //!
 //! If a lookup fails or returns no records, the last known servers stay.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
-use std::time::SystemTime;
+
+use futures_util::future::join_all;
 
 use super::fleet_status::NameStatus;
 use super::resolver::look_up;
-use crate::session::config::{DnsName, ServerEntry};
+use crate::session::config::ServerEntry;
 use crate::shared::domain::PublicAddress;
 use crate::shared::text::excerpt;
 
@@ -18,24 +19,30 @@ pub type LookupResult = Result<BTreeSet<PublicAddress>, String>;
 
 /// The names that are resolved.
 #[derive(Default)]
-pub struct NameTable(BTreeMap<DnsName, ResolvedName>);
+pub struct NameTable(BTreeMap<PublicAddress, ResolvedName>);
 
-/// One name.
+/// What a name resolves to, and why its last lookup failed, if it did.
+#[derive(Default)]
 struct ResolvedName {
     servers: BTreeSet<PublicAddress>,
-    status: NameStatus,
-    /// Whether a lookup is in progress.
-    is_looked_up: bool,
+    error: Option<String>,
 }
 
 /// Longest error text that is kept, in characters.
 const MAX_ERROR_LENGTH: usize = 120;
 
-/// Resolves a name to simulation servers.
-pub async fn servers(name: DnsName) -> LookupResult {
-    let addresses = look_up(&name.host).await?;
-    let servers = addresses.into_iter().map(|address| SocketAddr::new(address, name.port).to_string().parse());
-    servers.collect()
+/// Resolves names to simulation servers, all at the same time.
+pub async fn look_up_all(names: Vec<PublicAddress>) -> Vec<(PublicAddress, LookupResult)> {
+    join_all(names.into_iter().map(async |name| {
+        let found = servers(&name).await;
+        (name, found)
+    }))
+    .await
+}
+
+async fn servers(name: &PublicAddress) -> LookupResult {
+    let addresses = look_up(name.host()).await?;
+    addresses.into_iter().map(|address| SocketAddr::new(address, name.port()).to_string().parse()).collect()
 }
 
 impl NameTable {
@@ -43,46 +50,42 @@ impl NameTable {
     pub fn apply(&mut self, entries: &[ServerEntry]) {
         let mut before = std::mem::take(&mut self.0);
         for name in entries.iter().filter_map(ServerEntry::name) {
-            let known = before.remove(name).unwrap_or_else(|| ResolvedName {
-                servers: BTreeSet::new(),
-                status: NameStatus { name: name.to_string(), servers: 0, error: None, since: SystemTime::now() },
-                is_looked_up: false,
-            });
-            self.0.insert(name.clone(), known);
+            self.0.insert(name.clone(), before.remove(name).unwrap_or_default());
         }
     }
 
-    /// The names that are not being looked up. The caller looks them up and reports it by [`Self::record`].
-    pub fn due(&mut self) -> Vec<DnsName> {
-        let due = |(name, known): (&DnsName, &mut ResolvedName)| {
-            (!std::mem::replace(&mut known.is_looked_up, true)).then(|| name.clone())
-        };
-        self.0.iter_mut().filter_map(due).collect()
+    /// All names.
+    pub fn names(&self) -> Vec<PublicAddress> {
+        self.0.keys().cloned().collect()
     }
 
-    /// Records a lookup, unless the name is no longer listed. Returns whether it resolves to other servers than before;
-    /// and the new status, if lookups have begun to fail, or to succeed again.
-    pub fn record(&mut self, name: &DnsName, answer: LookupResult) -> Option<(bool, Option<NameStatus>)> {
-        let ResolvedName { servers, status, is_looked_up } = self.0.get_mut(name)?;
-        *is_looked_up = false;
-        let failed_before = status.error.take().is_some();
+    /// Records lookups; names that are no longer listed are ignored. Returns whether some name resolves to other servers
+    /// than before.
+    pub fn record(&mut self, answers: Vec<(PublicAddress, LookupResult)>) -> bool {
         let mut has_moved = false;
-        match answer {
-            Ok(found) => {
-                let (new, gone) = (found.difference(servers).count(), servers.difference(&found).count());
-                has_moved = new + gone > 0;
-                if has_moved {
-                    log::info!("{name}: leads to other servers: {new} new, {gone} gone");
+        for (name, answer) in answers {
+            let Some(known) = self.0.get_mut(&name) else { continue };
+            match answer {
+                Ok(found) => {
+                    if known.error.take().is_some() {
+                        log::info!("dns+{name}: can be looked up again");
+                    }
+                    if found != known.servers {
+                        log::info!("dns+{name}: leads to other servers than before: {}", found.len());
+                        known.servers = found;
+                        has_moved = true;
+                    }
                 }
-                (status.servers, *servers) = (found.len(), found);
+                Err(error) => {
+                    let error = excerpt(&error, MAX_ERROR_LENGTH);
+                    if known.error.is_none() {
+                        log::warn!("dns+{name}: can't be looked up: {error}; the servers that it led to before stay");
+                    }
+                    known.error = Some(error);
+                }
             }
-            Err(error) => status.error = Some(excerpt(&error, MAX_ERROR_LENGTH)),
         }
-        let has_turned = failed_before != status.error.is_some();
-        if has_turned {
-            status.since = SystemTime::now();
-        }
-        Some((has_moved, has_turned.then(|| status.clone())))
+        has_moved
     }
 
     /// The servers of these entries, in their order, without duplicates.
@@ -98,6 +101,11 @@ impl NameTable {
 
     /// What is known of each name.
     pub fn status(&self) -> Vec<NameStatus> {
-        self.0.values().map(|known| known.status.clone()).collect()
+        let status = |(name, known): (&PublicAddress, &ResolvedName)| NameStatus {
+            name: format!("dns+{name}"),
+            servers: known.servers.len(),
+            error: known.error.clone(),
+        };
+        self.0.iter().map(status).collect()
     }
 }

@@ -4,7 +4,6 @@
 //! and every pick, so that a pick counts at once. It looks names up, and starts a monitor for each simulation server, a new one
 //! after a panic.
 
-use std::mem::discriminant;
 use std::net::IpAddr;
 use std::num::NonZeroU32;
 use std::sync::Arc;
@@ -14,15 +13,46 @@ use actix::prelude::*;
 use tokio::sync::watch;
 
 use super::fleet_status::{FleetStatus, ServerStatus};
-use super::name_table::{self, LookupResult};
-use super::pick::{Pick, PickError};
-use super::server_monitor::{ProbeError, ProbeResult};
+use super::name_table::look_up_all;
+use super::server_monitor::ProbeResult;
 use super::server_record::{ServerRecord, ServerState, is_refused};
 use super::server_table::ServerTable;
 use super::state_history::StateHistory;
-use crate::session::config::{DnsName, SessionConfig};
-use crate::shared::domain::{Load, ProjectUrl, PublicAddress, ServerReport};
+use crate::session::config::SessionConfig;
+use crate::shared::domain::{Load, ProjectUrl, ProjectUrlError, PublicAddress, ServerReport};
 use crate::shared::http::AddressQuota;
+use crate::shared::text::client_text;
+
+/// Requests the least loaded simulation server that accepts this world.
+#[derive(Message, Debug)]
+#[rtype(result = "Result<PublicAddress, PickError>")]
+pub struct Pick {
+    /// The world, if the client named one.
+    pub world: Option<ProjectUrl>,
+    /// The client's address, if it is known.
+    pub from: Option<IpAddr>,
+}
+
+/// Why no simulation server is picked. The texts are those of the protocol.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum PickError {
+    /// No server has room.
+    #[error("Error: no simulation server available at the moment.")]
+    Unavailable,
+    /// No server accepts worlds of this repository.
+    #[error("Error: no simulation server accepts {0}.")]
+    NotAccepted(String),
+    /// The URL does not name a world.
+    #[error("Error: {0}")]
+    InvalidWorld(#[from] ProjectUrlError),
+}
+
+impl PickError {
+    /// The message for the client, safe to show.
+    pub fn for_client(&self) -> String {
+        client_text(&self.to_string())
+    }
+}
 
 /// Requests the status of the fleet.
 #[derive(Message)]
@@ -37,7 +67,6 @@ pub struct Reconfigure(pub Arc<SessionConfig>);
 /// The actor.
 pub struct Registry {
     config: Arc<SessionConfig>,
-    latencies: prometheus::Histogram,
     /// Limits the placements of an address that reserve room. A placement reserves room until its client arrives or is
     /// given up, so a client that requests servers again and again could lock out all others. Placements beyond the limit
     /// take room only once their clients have arrived.
@@ -52,43 +81,28 @@ pub struct Registry {
 const BURST: NonZeroU32 = NonZeroU32::MIN.saturating_add(199);
 /// Further placements that may reserve room, per minute: 12.
 const PER_MINUTE: NonZeroU32 = NonZeroU32::MIN.saturating_add(11);
-/// Interval between two lookups of a name.
+/// Pause between two lookups of the names.
 const LOOKUP_INTERVAL: Duration = Duration::from_secs(1);
 /// Interval between checks of what changes without a report: placements that expire, monitors that have panicked.
 const TICK: Duration = Duration::from_millis(250);
 
 impl Registry {
     /// Starts the registry and its monitors. It publishes in `available` whether a server can take a client.
-    pub fn start(
-        config: Arc<SessionConfig>,
-        latencies: prometheus::Histogram,
-        available: watch::Sender<bool>,
-    ) -> Addr<Self> {
+    pub fn start(config: Arc<SessionConfig>, available: watch::Sender<bool>) -> Addr<Self> {
         Self::create(|ctx| {
             let servers = ServerTable::new(&config, ctx.address().recipient());
             Self {
                 quota: AddressQuota::new(BURST, PER_MINUTE),
                 changes: StateHistory::new(&config),
                 config,
-                latencies,
                 servers,
                 available,
             }
         })
     }
 
-    /// Evaluates the last reports again, because a threshold has changed, or which servers are drained.
-    fn reevaluate(&mut self) {
-        for record in self.servers.in_order().cloned().collect::<Vec<_>>() {
-            if let (Some(_), Some(report), Some(at)) = (record.current(), record.report.clone(), record.answered) {
-                self.record(&record.address, Ok(report), at);
-            }
-        }
-        self.publish();
-    }
-
     fn tick(&mut self, ctx: &mut Context<Self>) {
-        if let Err(too_many) = self.servers.monitors.restart_gone().and_then(|()| self.changes.mailers.restart_gone()) {
+        if let Err(too_many) = self.servers.monitors.restart_gone() {
             // The app stops the server when the registry has stopped.
             log::error!("{too_many}");
             ctx.stop();
@@ -105,35 +119,30 @@ impl Registry {
         }
     }
 
-    /// Records the result of a probe that ended at this time.
-    fn record(&mut self, server: &PublicAddress, answer: Result<Arc<ServerReport>, ProbeError>, at: Instant) {
+    /// Records the result of a probe.
+    fn record(&mut self, server: &PublicAddress, latency: Duration, answer: Result<ServerReport, String>) {
         let ServerTable { records, fleet, .. } = &mut self.servers;
         let Some(record) = records.get_mut(server) else { return };
-        if record.unlisted && answer.is_err() {
-            return self.servers.forget(server);
-        }
+        record.latency = Some(latency);
         let change = match answer {
             Ok(report) => {
+                let (report, now) = (Arc::new(report), Instant::now());
                 let limit = fleet.limit(server).unwrap_or(self.config.load_threshold);
-                let change = record.succeeded(Arc::clone(&report), at, limit);
+                let change = record.succeeded(Arc::clone(&report), now, limit);
                 let was_ejected = fleet.is_ejected(server);
-                fleet.report(server, at, &report, record.state != ServerState::Draining);
+                fleet.report(server, now, &report, record.state != ServerState::Draining);
                 if fleet.is_ejected(server) && !was_ejected {
                     log::warn!("{server}: {}", ejected(report.failed_starts));
                 }
                 change
             }
             Err(error) => {
-                let is_another = record.error().is_some_and(|before| discriminant(before) != discriminant(&error));
-                if is_another {
-                    log::info!("{server}: still down: {error}");
-                }
                 fleet.lose(server);
                 record.failed(error)
             }
         };
-        if let Some(change) = change {
-            self.changes.add(record, change);
+        if let Some((change, event)) = change {
+            self.changes.add(record, change, event);
         }
     }
 
@@ -151,7 +160,7 @@ impl Registry {
     fn status_of(&self, record: &ServerRecord) -> ServerStatus {
         let (fleet, address) = (&self.servers.fleet, &record.address);
         let failed = record.current().map_or(0, |report| report.failed_starts);
-        let error = record.error().map(ToString::to_string);
+        let error = record.error().map(str::to_owned);
         ServerStatus {
             error: error.or_else(|| fleet.is_ejected(address).then(|| ejected(failed))),
             effective_load: fleet.effective_load(address),
@@ -161,27 +170,18 @@ impl Registry {
         }
     }
 
-    /// Looks up each name whose last lookup has ended.
+    /// Looks all names up, again and again.
     fn look_up_names(&mut self, ctx: &mut Context<Self>) {
-        for name in self.servers.names.due() {
-            actix_rt::spawn(name_table::servers(name.clone()))
-                .into_actor(self)
-                .map(move |answer, registry, _| {
-                    registry.record_lookup(&name, answer.unwrap_or_else(|panic| Err(panic.to_string())));
-                })
-                .spawn(ctx);
-        }
-    }
-
-    fn record_lookup(&mut self, name: &DnsName, answer: LookupResult) {
-        let Some((has_moved, turned)) = self.servers.names.record(name, answer) else { return };
-        if let Some(status) = turned {
-            self.changes.add_name(status);
-        }
-        if has_moved {
-            self.servers.follow_names(&self.config);
-            self.reevaluate();
-        }
+        look_up_all(self.servers.names.names())
+            .into_actor(self)
+            .map(|answers, registry, ctx| {
+                if registry.servers.names.record(answers) {
+                    registry.servers.follow_names(&registry.config);
+                    registry.publish();
+                }
+                ctx.run_later(LOOKUP_INTERVAL, Self::look_up_names);
+            })
+            .spawn(ctx);
     }
 }
 
@@ -199,7 +199,6 @@ impl Actor for Registry {
         self.servers.apply(&self.config);
         ctx.run_interval(TICK, Self::tick);
         self.look_up_names(ctx);
-        ctx.run_interval(LOOKUP_INTERVAL, Self::look_up_names);
     }
 }
 
@@ -207,11 +206,7 @@ impl Handler<ProbeResult> for Registry {
     type Result = ();
 
     fn handle(&mut self, ProbeResult { server, latency, answer }: ProbeResult, _: &mut Self::Context) {
-        self.latencies.observe(latency.as_secs_f64());
-        if let Some(record) = self.servers.records.get_mut(&server) {
-            record.latency = Some(latency);
-        }
-        self.record(&server, answer.map(Arc::new), Instant::now());
+        self.record(&server, latency, answer);
         self.publish();
     }
 }
@@ -247,6 +242,6 @@ impl Handler<Reconfigure> for Registry {
     fn handle(&mut self, Reconfigure(config): Reconfigure, _: &mut Self::Context) {
         self.servers.apply(&config);
         self.config = config;
-        self.reevaluate();
+        self.publish();
     }
 }

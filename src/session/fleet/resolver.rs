@@ -4,7 +4,6 @@
 //! The system's `getaddrinfo` blocks a thread for each lookup and can't be cancelled: a DNS server that hangs would use
 //! up all threads.
 
-use std::cell::RefCell;
 use std::error::Error;
 use std::net::{IpAddr, SocketAddr};
 use std::time::Duration;
@@ -16,8 +15,6 @@ use hickory_resolver::config::{LookupIpStrategy, ResolverConfig};
 use hickory_resolver::net::NetError;
 use hickory_resolver::net::runtime::TokioRuntimeProvider;
 
-/// Timeout of a lookup after which the last answer is used instead.
-const SLOW: Duration = Duration::from_millis(500);
 /// Upper limit of the resolver's timeout for one attempt: two fit into the timeout of a probe (`timing.answer`).
 const TIMEOUT: Duration = Duration::from_secs(1);
 
@@ -29,11 +26,9 @@ const TIMEOUT: Duration = Duration::from_secs(1);
 /// # Errors
 /// As text, when there is no answer or no address in it.
 pub async fn look_up(name: &str) -> Result<Vec<IpAddr>, String> {
-    let system = TokioResolver::builder_tokio();
-    let unread = system.as_ref().err().map(ToString::to_string);
     let found = async {
         // Without /etc/resolv.conf there is /etc/hosts.
-        let mut builder = system.unwrap_or_else(|_| {
+        let mut builder = TokioResolver::builder_tokio().unwrap_or_else(|_| {
             let none = ResolverConfig::from_name_servers(Vec::new());
             TokioResolver::builder_with_config(none, TokioRuntimeProvider::default())
         });
@@ -43,27 +38,18 @@ pub async fn look_up(name: &str) -> Result<Vec<IpAddr>, String> {
         builder.build()?.lookup_ip(name).await
     };
     let found = found.await.map_err(|error: NetError| {
-        let told = if error.is_no_records_found() { "DNS has no such records".to_owned() } else { error.to_string() };
-        unread.unwrap_or(told)
+        if error.is_no_records_found() { "DNS has no such records".to_owned() } else { error.to_string() }
     })?;
     Ok(found.iter().map(|address| address.to_canonical()).collect())
 }
 
-/// Resolves the host of one simulation server. The last answer is used while a lookup fails or takes long.
-#[derive(Default)]
-pub struct HostResolver(RefCell<Vec<IpAddr>>);
+/// Resolves the hosts of simulation servers.
+pub struct HostResolver;
 
 impl Resolve for HostResolver {
     fn lookup<'a>(&'a self, host: &'a str, port: u16) -> LocalBoxFuture<'a, Result<Vec<SocketAddr>, Box<dyn Error>>> {
         Box::pin(async move {
-            let last = self.0.borrow().clone();
-            let lookup = look_up(host.trim_matches(['[', ']']));
-            let found = if last.is_empty() {
-                lookup.await?
-            } else {
-                actix_rt::time::timeout(SLOW, lookup).await.ok().and_then(Result::ok).unwrap_or(last)
-            };
-            self.0.replace(found.clone());
+            let found = look_up(host.trim_matches(['[', ']'])).await?;
             Ok(found.into_iter().map(|address| SocketAddr::new(address, port)).collect())
         })
     }

@@ -1,6 +1,6 @@
 //! Task: probes one simulation server.
 //!
-//! Started by the registry for each simulation server. Every [`ProbeSettings::interval`] it requests the server's
+//! Started by the registry for each simulation server. Every `loadRefresh` it requests the server's
 //! state, one request at a time, and sends the result to the registry. If the registry's mailbox is full, the result is
 //! dropped: the next probe replaces it. The task ends when the registry drops its channel; after a panic the registry
 //! starts a new one.
@@ -36,43 +36,8 @@ pub struct ProbeResult {
     pub server: PublicAddress,
     /// Duration of the probe.
     pub latency: Duration,
-    /// The server's report, or why the probe failed.
-    pub answer: Result<ServerReport, ProbeError>,
-}
-
-/// Why a probe failed, for the log and the pages.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum ProbeError {
-    /// The connection failed or broke.
-    #[error("no connection: {0}")]
-    Connection(String),
-    /// The answer was not complete within this time.
-    #[error("no answer within {} s", .0.as_secs_f64())]
-    Timeout(Duration),
-    /// The answer is invalid.
-    #[error("an answer that makes no sense: {0}")]
-    BadAnswer(String),
-    /// It answers that it can't start simulations.
-    #[error("it can start no simulation: {0}")]
-    NotReady(String),
-}
-
-/// How servers are probed.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct ProbeSettings {
-    /// Interval between the starts of two probes.
-    pub interval: Duration,
-    /// Timeout of a probe.
-    pub timeout: Duration,
-    /// Whether the fleet is behind https.
-    pub ssl: bool,
-}
-
-impl ProbeSettings {
-    /// As the configuration has it.
-    pub fn new(config: &SessionConfig) -> Self {
-        Self { interval: config.load_refresh, timeout: config.timing.answer, ssl: config.ssl }
-    }
+    /// The server's report, or why the probe failed, for the log and the pages.
+    pub answer: Result<ServerReport, String>,
 }
 
 /// Size limit of an answer, in bytes.
@@ -98,7 +63,7 @@ const NO_SUCH_PAGE: [StatusCode; 4] =
 fn client(interval: Duration, tls: Option<Arc<ClientConfig>>) -> awc::Client {
     let idle = (interval * 3).max(Duration::from_secs(15));
     // The whole probe has a timeout, its parts have none.
-    let tcp = TcpConnector::new(Resolver::custom(HostResolver::default())).service();
+    let tcp = TcpConnector::new(Resolver::custom(HostResolver)).service();
     let mut connector = awc::Connector::new().connector(tcp).conn_keep_alive(idle).timeout(NEVER);
     if let Some(config) = tls {
         connector = connector.rustls_0_23(config);
@@ -110,28 +75,22 @@ fn client(interval: Duration, tls: Option<Arc<ClientConfig>>) -> awc::Client {
 /// the same slot would delay the requests of clients.
 pub async fn monitor(
     server: PublicAddress,
-    ProbeSettings { interval, timeout, ssl }: ProbeSettings,
+    config: &SessionConfig,
     tls: Option<Arc<ClientConfig>>,
     results: Recipient<ProbeResult>,
 ) {
-    let (client, url) = (client(interval, tls), server.http_url(ssl));
+    let (interval, timeout) = (config.load_refresh, config.timing.answer);
+    let (client, url) = (client(interval, tls), server.http_url(config.ssl));
     let first = (BEGIN.elapsed() + interval.mul_f64(rand::random())).div_duration_f64(SLOT).ceil();
     let mut times = interval_at((*BEGIN + SLOT.mul_f64(first)).into(), interval);
     times.set_missed_tick_behavior(MissedTickBehavior::Skip);
-    // Until when only `/load` is requested, because the server has no `/status`.
-    let mut load_only_until = None;
+    // When the server was last found to have no `/status`.
+    let mut without_status = None;
     loop {
         let begun = Instant::now();
-        let load_only = load_only_until.is_some_and(|end| begun < end);
-        let answer = actix_rt::time::timeout(timeout, probe(&client, &url, load_only)).await;
-        let (answer, latency) = (answer.unwrap_or(Err(ProbeError::Timeout(timeout))), begun.elapsed());
-        if let Ok((_, has_status)) = answer
-            && !load_only
-        {
-            load_only_until = (!has_status).then(|| Instant::now() + LOAD_ONLY);
-        }
-        let answer = answer.map(|(report, _)| report);
-        match results.try_send(ProbeResult { server: server.clone(), latency, answer }) {
+        let answer = actix_rt::time::timeout(timeout, probe(&client, &url, &mut without_status)).await;
+        let answer = answer.unwrap_or_else(|_| Err(format!("no answer within {} s", timeout.as_secs_f64())));
+        match results.try_send(ProbeResult { server: server.clone(), latency: begun.elapsed(), answer }) {
             Ok(()) => {}
             Err(SendError::Full(_)) => log::warn!("{server}: a report is lost, too many are waiting"),
             // The registry has stopped, and the server with it.
@@ -143,30 +102,30 @@ pub async fn monitor(
     }
 }
 
-/// Requests the state of a server. Returns its report, and whether that comes from `/status`.
-async fn probe(client: &awc::Client, url: &str, load_only: bool) -> Result<(ServerReport, bool), ProbeError> {
-    if !load_only && let Some((body, _)) = get(client, &format!("{url}/status")).await? {
-        let report = ServerReport::parse(&body).map_err(|error| {
-            let text = String::from_utf8_lossy(body.get(..body.len().min(40)).unwrap_or_default()).into_owned();
-            bad_answer(&format!("{error} in {text:?}"))
-        })?;
-        return Ok((usable(report)?, true));
+/// Requests the report of a server. `without_status` is when it was last found to have no `/status`.
+async fn probe(client: &awc::Client, url: &str, without_status: &mut Option<Instant>) -> Result<ServerReport, String> {
+    let may_have_status = without_status.is_none_or(|found| found.elapsed() >= LOAD_ONLY);
+    if may_have_status && let Some((body, _)) = get(client, &format!("{url}/status")).await? {
+        return usable(ServerReport::parse(&body).map_err(bad_answer)?);
     }
     let body = get(client, &format!("{url}/load")).await?;
-    let (bytes, length) = body.ok_or_else(|| bad_answer(&"it has neither /status nor /load"))?;
+    let (bytes, length) = body.ok_or_else(|| bad_answer("it has neither /status nor /load"))?;
     // awc takes the end of the connection for the end of the body: 95.5 may be 9. JSON that is cut off is none.
     if length != Some(bytes.len()) {
-        return Err(bad_answer(&"an answer that does not end as its Content-Length says"));
+        return Err(bad_answer("an answer that does not end as its Content-Length says"));
     }
-    let load = Load::parse(&bytes).map_err(|error| bad_answer(&error))?;
-    Ok((usable(ServerReport::load_only(load))?, false))
+    let report = usable(ServerReport::load_only(Load::parse(&bytes).map_err(bad_answer)?))?;
+    if may_have_status {
+        *without_status = Some(Instant::now());
+    }
+    Ok(report)
 }
 
 /// Returns the body of a page and its length as announced, `None` if the server has no such page.
 ///
 /// # Errors
 /// When there is no answer, or one that is neither.
-async fn get(client: &awc::Client, url: &str) -> Result<Option<(Bytes, Option<usize>)>, ProbeError> {
+async fn get(client: &awc::Client, url: &str) -> Result<Option<(Bytes, Option<usize>)>, String> {
     let answer = match client.get(url).send().await {
         // A kept connection may have been closed, which is not a fault of the server.
         Err(error) if is_broken(&error) => client.get(url).send().await,
@@ -178,11 +137,11 @@ async fn get(client: &awc::Client, url: &str) -> Result<Option<(Bytes, Option<us
         return Ok(None);
     }
     if !status.is_success() {
-        return Err(bad_answer(&format!("status {status}")));
+        return Err(bad_answer(format!("status {status}")));
     }
     let length = answer.headers().get(CONTENT_LENGTH).and_then(|value| value.to_str().ok()?.parse::<usize>().ok());
     let bytes = answer.timeout(NEVER).body().limit(MAX_ANSWER_SIZE).await;
-    Ok(Some((bytes.map_err(|error| bad_answer(&error))?, length)))
+    Ok(Some((bytes.map_err(bad_answer)?, length)))
 }
 
 /// Whether a connection broke, as opposed to one that could not be made.
@@ -190,22 +149,23 @@ fn is_broken(error: &SendRequestError) -> bool {
     !matches!(error, SendRequestError::Connect(reason) if !matches!(reason, ConnectError::Disconnected))
 }
 
-fn no_answer(error: SendRequestError) -> ProbeError {
-    ProbeError::Connection(match error {
+fn no_answer(error: SendRequestError) -> String {
+    let reason = match error {
         SendRequestError::Connect(ConnectError::Disconnected) => "it was closed without an answer".to_owned(),
         error => tls::reason(&error).unwrap_or_else(|| excerpt(&error.to_string(), MAX_REASON_LENGTH)),
-    })
+    };
+    format!("no connection: {reason}")
 }
 
 /// Refuses the report of a server that can't start simulations, or whose load is not plausible.
-fn usable(report: ServerReport) -> Result<ServerReport, ProbeError> {
+fn usable(report: ServerReport) -> Result<ServerReport, String> {
     match &report.problem {
-        _ if report.load.percent() > MAX_LOAD => Err(bad_answer(&format!("a load of {} %", report.load))),
-        Some(problem) => Err(ProbeError::NotReady(excerpt(problem, MAX_REASON_LENGTH))),
+        _ if report.load.percent() > MAX_LOAD => Err(bad_answer(format!("a load of {} %", report.load))),
+        Some(problem) => Err(format!("it can start no simulation: {}", excerpt(problem, MAX_REASON_LENGTH))),
         None => Ok(report),
     }
 }
 
-fn bad_answer(reason: &dyn Display) -> ProbeError {
-    ProbeError::BadAnswer(excerpt(&reason.to_string(), MAX_REASON_LENGTH))
+fn bad_answer(reason: impl Display) -> String {
+    format!("an answer that makes no sense: {}", excerpt(&reason.to_string(), MAX_REASON_LENGTH))
 }

@@ -5,12 +5,11 @@ use std::time::{Duration, Instant, SystemTime};
 
 use serde::Serialize;
 
-use super::server_monitor::ProbeError;
 use crate::session::mail::NoticeKind;
 use crate::shared::domain::{ProjectUrl, PublicAddress, ServerReport};
-use crate::shared::run::serialize_timestamp;
+use crate::shared::run::timestamp;
 
-/// The state of a simulation server. Those that need attention come first, as on the monitor.
+/// The state of a simulation server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ServerState {
@@ -18,7 +17,7 @@ pub enum ServerState {
     Down,
     /// It was not probed yet.
     Unknown,
-    /// It accepts no new clients: it drains itself, the configuration drains it, or no name resolves to it any more.
+    /// It accepts no new clients: it drains itself, or the configuration drains it.
     Draining,
     /// Its load leaves no room for one more client, or it has no free slot.
     Full,
@@ -33,31 +32,26 @@ pub struct ServerRecord {
     pub address: PublicAddress,
     /// Whether it is listed in `drainedServers`.
     pub drained: bool,
-    /// Whether no name resolves to it any more.
-    pub unlisted: bool,
     /// Its state, as of its last probe.
     pub state: ServerState,
-    /// When it entered that state.
-    pub since: SystemTime,
+    /// When it entered that state, as text.
+    pub since: String,
     /// Its last report; kept when it is down.
     pub report: Option<Arc<ServerReport>>,
     /// The last error; kept after the server has answered again.
-    pub last_error: Option<ProbeError>,
+    pub last_error: Option<String>,
     /// Duration of the last probe.
     pub latency: Option<Duration>,
     /// Time of its last valid answer.
     pub answered: Option<Instant>,
-    /// Whether the last mail about its load said that it is full.
-    pub told_full: bool,
 }
 
-/// A simulation server has changed its state, or lookups of a name have begun to fail or to succeed.
+/// A simulation server has changed its state.
 #[derive(Debug, Clone, Serialize)]
 pub struct StateChange {
-    /// When it changed.
-    #[serde(serialize_with = "serialize_timestamp")]
-    pub at: SystemTime,
-    /// The simulation server's address, or the name.
+    /// When it changed, as text.
+    pub at: String,
+    /// The simulation server's address.
     pub server: String,
     /// Its new state.
     pub state: ServerState,
@@ -65,8 +59,8 @@ pub struct StateChange {
     pub why: String,
 }
 
-/// A change of a server's state, and what is mailed to the administrator.
-pub type ServerChange = (StateChange, Vec<NoticeKind>);
+/// A change of a server's state, and what is mailed of it to the administrator.
+pub type ServerChange = (StateChange, Option<NoticeKind>);
 
 impl ServerState {
     /// The name of the state in pages and metrics.
@@ -77,18 +71,16 @@ impl ServerState {
 
 impl ServerRecord {
     /// A server that was not probed yet.
-    pub fn new(address: PublicAddress, drained: bool) -> Self {
+    pub fn new(address: PublicAddress) -> Self {
         Self {
             address,
-            drained,
-            unlisted: false,
+            drained: false,
             state: ServerState::Unknown,
-            since: SystemTime::now(),
+            since: timestamp(SystemTime::now()),
             report: None,
             last_error: None,
             latency: None,
             answered: None,
-            told_full: false,
         }
     }
 
@@ -99,8 +91,6 @@ impl ServerRecord {
         let full = report.instances.filter(|instances| instances.present() >= instances.places);
         let (state, reason) = if self.drained {
             (ServerState::Draining, " (drained by drainedServers)".to_owned())
-        } else if self.unlisted {
-            (ServerState::Draining, " (no name leads to it any more)".to_owned())
         } else if report.draining {
             (ServerState::Draining, " (it drains itself)".to_owned())
         } else if let Some(full) = full {
@@ -115,15 +105,14 @@ impl ServerRecord {
     }
 
     /// Records that a probe has failed. Returns what has changed.
-    pub fn failed(&mut self, error: ProbeError) -> Option<ServerChange> {
-        let why = error.to_string();
-        self.last_error = Some(error);
-        self.enter(ServerState::Down, || why)
+    pub fn failed(&mut self, error: String) -> Option<ServerChange> {
+        self.last_error = Some(error.clone());
+        self.enter(ServerState::Down, || error)
     }
 
     /// Why the last probe failed, if it did.
-    pub fn error(&self) -> Option<&ProbeError> {
-        self.last_error.as_ref().filter(|_| self.state == ServerState::Down)
+    pub fn error(&self) -> Option<&str> {
+        self.last_error.as_deref().filter(|_| self.state == ServerState::Down)
     }
 
     /// The last report, unless the server is down.
@@ -141,26 +130,17 @@ impl ServerRecord {
         if before == state {
             return None;
         }
-        self.since = SystemTime::now();
-        let change = StateChange { at: self.since, server: self.address.to_string(), state, why: why() };
-        Some((change, self.events(before)))
-    }
-
-    /// The four events of the original. A server that was full, then down, then up is both working again and available
-    /// again.
-    fn events(&mut self, before: ServerState) -> Vec<NoticeKind> {
-        let mut events = Vec::new();
-        match (before, self.state) {
-            (_, ServerState::Down) => events.push(NoticeKind::NotResponding),
-            (ServerState::Down, _) => events.push(NoticeKind::WorkingAgain),
-            _ => {}
-        }
-        if self.state == ServerState::Full && !std::mem::replace(&mut self.told_full, true) {
-            events.push(NoticeKind::MaximumLoad);
-        } else if self.state == ServerState::Up && std::mem::replace(&mut self.told_full, false) {
-            events.push(NoticeKind::AvailableAgain);
-        }
-        events
+        self.since = timestamp(SystemTime::now());
+        let change = StateChange { at: self.since.clone(), server: self.address.to_string(), state, why: why() };
+        // The four events of the original.
+        let event = match (before, state) {
+            (_, ServerState::Down) => Some(NoticeKind::NotResponding),
+            (ServerState::Down, _) => Some(NoticeKind::WorkingAgain),
+            (_, ServerState::Full) => Some(NoticeKind::MaximumLoad),
+            (ServerState::Full, ServerState::Up) => Some(NoticeKind::AvailableAgain),
+            _ => None,
+        };
+        Some((change, event))
     }
 }
 
@@ -188,32 +168,29 @@ mod tests {
         ServerReport::load_only(Load::try_from(load).unwrap())
     }
 
-    /// The events of each step: a load, or `None` for a failure.
-    fn events(steps: &[Option<f64>]) -> Vec<Vec<NoticeKind>> {
-        let mut record = ServerRecord::new("host:2000".parse().unwrap(), false);
+    /// What is mailed after each step: a load, or `None` for a failure.
+    fn events(steps: &[Option<f64>]) -> Vec<Option<NoticeKind>> {
+        let mut record = ServerRecord::new("host:2000".parse().unwrap());
         let change = |step: &Option<f64>| match step {
             Some(load) => record.succeeded(Arc::new(report(*load)), Instant::now(), 95.0),
-            None => record.failed(ProbeError::Connection(String::new())),
+            None => record.failed(String::new()),
         };
-        steps.iter().map(change).map(|change| change.map(|(_, events)| events).unwrap_or_default()).collect()
+        steps.iter().map(change).map(|change| change.and_then(|(_, event)| event)).collect()
     }
 
     #[test]
     fn the_administrator_hears_of_four_events() {
         use NoticeKind::{AvailableAgain, MaximumLoad, NotResponding, WorkingAgain};
-        assert_eq!(events(&[Some(1.0), Some(2.0)]), [vec![], vec![]], "a server that is well is no news");
-        assert_eq!(events(&[None, None, Some(1.0)]), [vec![NotResponding], vec![], vec![WorkingAgain]]);
-        assert_eq!(events(&[Some(95.0), Some(99.0), Some(94.9)]), [vec![MaximumLoad], vec![], vec![AvailableAgain]]);
-        assert_eq!(events(&[None, Some(96.0)]), [vec![NotResponding], vec![WorkingAgain, MaximumLoad]]);
+        assert_eq!(events(&[Some(1.0), Some(2.0)]), [None, None], "a server that is well is no news");
+        assert_eq!(events(&[None, None, Some(1.0)]), [Some(NotResponding), None, Some(WorkingAgain)]);
+        assert_eq!(events(&[Some(95.0), Some(99.0), Some(94.9)]), [Some(MaximumLoad), None, Some(AvailableAgain)]);
         assert_eq!(
-            events(&[Some(96.0), None, Some(96.0), None, Some(1.0)]),
-            [
-                vec![MaximumLoad],
-                vec![NotResponding],
-                vec![WorkingAgain],
-                vec![NotResponding],
-                vec![WorkingAgain, AvailableAgain]
-            ]
+            events(&[None, Some(96.0), Some(1.0)]),
+            [Some(NotResponding), Some(WorkingAgain), Some(AvailableAgain)]
+        );
+        assert_eq!(
+            events(&[Some(96.0), None, Some(1.0)]),
+            [Some(MaximumLoad), Some(NotResponding), Some(WorkingAgain)]
         );
     }
 }

@@ -1,16 +1,13 @@
 //! The monitored simulation servers: those of the configuration, and those that its names resolve to. Part of the
 //! registry.
-//!
-//! A server that no name resolves to any more gets no clients. It is monitored as long as it answers, because a name
-//! may resolve to it again, and so that its clients stay visible until they have left.
 
-use std::collections::hash_map::Entry;
-use std::collections::{BTreeSet, HashMap};
+use std::collections::HashMap;
+use std::sync::Arc;
 
 use actix::prelude::*;
 
 use super::name_table::NameTable;
-use super::server_monitor::{ProbeResult, ProbeSettings, monitor};
+use super::server_monitor::{ProbeResult, monitor};
 use super::server_record::ServerRecord;
 use crate::session::config::SessionConfig;
 use crate::session::placement::LoadBalancer;
@@ -30,7 +27,6 @@ pub struct ServerTable {
     pub records: HashMap<PublicAddress, ServerRecord>,
     /// In the order of the configuration.
     listed: Vec<PublicAddress>,
-    settings: ProbeSettings,
     /// The thread of the monitors, so that requests of clients do not wait for them.
     thread: Arbiter,
     results: Recipient<ProbeResult>,
@@ -41,84 +37,63 @@ type Monitors = Supervisor<PublicAddress, ()>;
 
 impl ServerTable {
     /// No servers yet; `results` receives each probe.
-    pub fn new(config: &SessionConfig, results: Recipient<ProbeResult>) -> Self {
-        let (settings, thread) = (ProbeSettings::new(config), Arbiter::new());
+    pub fn new(config: &Arc<SessionConfig>, results: Recipient<ProbeResult>) -> Self {
+        let thread = Arbiter::new();
         Self {
             names: NameTable::default(),
             fleet: LoadBalancer::new(config.policy()),
-            monitors: monitors(&thread, settings, results.clone()),
+            monitors: monitors(&thread, config, results.clone()),
             records: HashMap::new(),
             listed: Vec::new(),
-            settings,
             thread,
             results,
         }
     }
 
-    /// Applies a configuration: servers that it no longer lists are removed.
-    pub fn apply(&mut self, config: &SessionConfig) {
-        let settings = ProbeSettings::new(config);
-        if std::mem::replace(&mut self.settings, settings) != settings {
-            self.monitors = monitors(&self.thread, settings, self.results.clone());
-            self.records.keys().for_each(|server| self.monitors.add(server.clone()));
-        }
+    /// Applies a configuration. Each server is probed at once, by new monitors.
+    pub fn apply(&mut self, config: &Arc<SessionConfig>) {
+        self.monitors = monitors(&self.thread, config, self.results.clone());
+        self.listed.iter().for_each(|server| self.monitors.add(server.clone()));
         self.fleet.set_policy(config.policy());
         self.names.apply(&config.simulation_servers);
-        self.list(config, |_| true);
+        self.follow_names(config);
     }
 
-    /// Applies changed names: a server that no name resolves to any more is removed if it does not answer.
+    /// Follows the configuration and its names: removes servers that are no longer listed, and adds new ones.
     pub fn follow_names(&mut self, config: &SessionConfig) {
-        self.list(config, |record| record.current().is_none());
-    }
-
-    /// Follows the lists of servers and of drained servers. Those that are in no list are removed if they are `gone`.
-    fn list(&mut self, config: &SessionConfig, gone: impl Fn(&ServerRecord) -> bool) {
         self.listed = self.names.servers(&config.simulation_servers);
-        let listed: BTreeSet<&PublicAddress> = self.listed.iter().collect();
-        for (server, record) in &mut self.records {
-            record.unlisted = !listed.contains(server);
-            record.drained = config.drained_servers.contains(server);
-        }
-        let unlisted = self.records.iter().filter(|(_, record)| record.unlisted && gone(record));
-        for server in unlisted.map(|(server, _)| server.clone()).collect::<Vec<_>>() {
-            self.forget(&server);
-        }
+        let mut before = std::mem::take(&mut self.records);
         for server in &self.listed {
-            if let Entry::Vacant(entry) = self.records.entry(server.clone()) {
+            let mut record = before.remove(server).unwrap_or_else(|| {
                 self.fleet.add(server.clone());
                 self.monitors.add(server.clone());
-                entry.insert(ServerRecord::new(server.clone(), config.drained_servers.contains(server)));
-            }
+                ServerRecord::new(server.clone())
+            });
+            record.drained = config.drained_servers.contains(server);
+            self.records.insert(server.clone(), record);
         }
-    }
-
-    /// Removes a server and stops its monitor.
-    pub fn forget(&mut self, server: &PublicAddress) {
-        if self.records.remove(server).is_some() {
+        for server in before.into_keys() {
             log::info!("{server}: no longer watched");
-            self.monitors.remove(server);
-            self.fleet.remove(server);
+            self.monitors.remove(&server);
+            self.fleet.remove(&server);
         }
     }
 
-    /// What is known of all servers, in the order of the configuration; those that are no longer listed come last.
+    /// What is known of all servers, in the order of the configuration.
     pub fn in_order(&self) -> impl Iterator<Item = &ServerRecord> {
-        let unlisted = self.records.iter().filter(|(_, record)| record.unlisted);
-        let unlisted: BTreeSet<_> = unlisted.map(|(server, _)| server).collect();
-        self.listed.iter().chain(unlisted).filter_map(|server| self.records.get(server))
+        self.listed.iter().filter_map(|server| self.records.get(server))
     }
 }
 
 /// No monitors yet; they run on this thread.
-fn monitors(thread: &Arbiter, settings: ProbeSettings, results: Recipient<ProbeResult>) -> Monitors {
-    let (thread, tls) = (thread.handle(), tls::client_config());
+fn monitors(thread: &Arbiter, config: &Arc<SessionConfig>, results: Recipient<ProbeResult>) -> Monitors {
+    let (thread, config, tls) = (thread.handle(), Arc::clone(config), tls::client_config());
     Supervisor::new("monitor of server", move |server: &PublicAddress, mut stopped| {
-        let (server, tls, results) = (server.clone(), tls.clone(), results.clone());
+        let (server, config, tls, results) = (server.clone(), Arc::clone(&config), tls.clone(), results.clone());
         thread.spawn_fn(move || {
             actix_rt::spawn(async move {
                 tokio::select! {
-                    () = monitor(server, settings, tls, results) => {}
+                    () = monitor(server, &config, tls, results) => {}
                     _ = stopped.recv() => {}
                 }
             });

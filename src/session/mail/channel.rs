@@ -1,17 +1,21 @@
 //! The channels on which notices go: by mail, and to a messenger.
+//!
+//! A messenger takes one JSON object with the field `text`, as Slack, Matrix' hookshot and Mattermost do. Anybody who
+//! knows its URL can post there, so it is a secret: no log and no error contains it.
 
 use std::time::Duration;
 
+use serde_json::json;
 use tokio::time::timeout;
 
 use super::notice_text::{signature, test_text};
 use super::smtp::SmtpRelay;
-use super::webhook::Webhook;
 use crate::session::config::SessionConfig;
-use crate::shared::text::one_line;
+use crate::shared::config::Secret;
+use crate::shared::http::tls;
+use crate::shared::text::{client_text, one_line};
 
 /// A channel for notices. Each has its own retries: one that does not work holds up no other.
-#[derive(Clone)]
 pub struct Channel {
     /// Its name in the log.
     pub(super) name: &'static str,
@@ -21,10 +25,9 @@ pub struct Channel {
     time_limit: Duration,
 }
 
-#[derive(Clone)]
 enum Transport {
     Smtp(Box<SmtpRelay>),
-    Webhook(Webhook),
+    Webhook(Secret),
 }
 
 impl Channel {
@@ -40,9 +43,11 @@ impl Channel {
 
     /// To the URL of the key `webhook`, if it is set.
     pub fn webhook(config: &SessionConfig) -> Option<Self> {
-        let webhook = config.webhook.clone().map(Webhook)?;
-        let (server, transport) = (webhook.server(), Transport::Webhook(webhook));
-        Some(Self { name: "webhook", server, transport, time_limit: config.timing.mail_answer })
+        let webhook = config.webhook.clone()?;
+        let url = url::Url::parse(webhook.reveal()).ok()?;
+        let server = format!("{}:{}", url.host_str()?, url.port_or_known_default()?);
+        let (transport, time_limit) = (Transport::Webhook(webhook), config.timing.mail_answer);
+        Some(Self { name: "webhook", server, transport, time_limit })
     }
 
     /// Delivers a text within `timing.mailAnswer`. Returns the server's answer.
@@ -53,7 +58,7 @@ impl Channel {
         let delivered = timeout(self.time_limit, async {
             match &self.transport {
                 Transport::Smtp(relay) => relay.deliver(text).await,
-                Transport::Webhook(webhook) => webhook.deliver(text).await,
+                Transport::Webhook(url) => post(url, text).await,
             }
         });
         let timed_out = |_| Err(format!("no answer within {} s", self.time_limit.as_secs_f64()));
@@ -69,4 +74,20 @@ impl Channel {
         let answer = self.deliver(&test_text(&signature(config))).await?;
         Ok(format!("{} took a test: {answer}", self.server))
     }
+}
+
+/// Posts a text to a messenger. Returns the status of the answer.
+async fn post(url: &Secret, text: &str) -> Result<String, String> {
+    // Messengers take what is in angle brackets for links and calls.
+    let text: Vec<String> = text.lines().map(client_text).collect();
+    // The delivery as a whole has a timeout; awc has one of its own for connections that is shorter.
+    let mut connector = awc::Connector::new().timeout(Duration::from_hours(24));
+    if let Some(config) = tls::client_config() {
+        connector = connector.rustls_0_23(config);
+    }
+    // A redirect would send the notices to another server.
+    let client = awc::Client::builder().connector(connector).disable_timeout().disable_redirects().finish();
+    let answer = client.post(url.reveal()).send_json(&json!({ "text": text.join("\n") })).await;
+    let status = answer.map_err(|error| tls::reason(&error).unwrap_or_else(|| error.to_string()))?.status();
+    if status.is_success() { Ok(status.to_string()) } else { Err(status.to_string()) }
 }

@@ -1,41 +1,32 @@
 //! Task: sends notices to the administrator on one channel, by mail or by webhook.
 //!
-//! Started by the registry for each channel that is configured, again if it has panicked. It receives [`Notice`]s.
-//! [`Outbox`] decides what is sent, and when. One batch is sent at a time; nothing waits for it.
+//! Started with the registry for each channel that is configured. It receives [`Notice`]s. [`Outbox`] decides what is
+//! sent, and when. One batch is sent at a time; notices that come meanwhile wait in the channel.
 
-use std::pin::pin;
 use std::time::Instant;
 
-use tokio::sync::mpsc::UnboundedReceiver;
+use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
 use tokio::time::sleep_until;
 
 use super::channel::Channel;
 use super::notice_text::{notice_text, signature, summary};
-use super::outbox::{MailEntry, Notice, Outbox};
+use super::outbox::{Notice, Outbox, WaitingNotice};
 use crate::session::config::SessionConfig;
-use crate::shared::run::Supervisor;
 
 /// Starts a mailer for each channel that is configured.
-pub fn start(config: &SessionConfig) -> Supervisor<&'static str, Notice> {
+pub fn start(config: &SessionConfig) -> Vec<UnboundedSender<Notice>> {
     let mail = Channel::mail(config).inspect_err(|why| log::info!("{why}"));
-    let channels: Vec<Channel> = mail.into_iter().chain(Channel::webhook(config)).collect();
-    let names: Vec<&'static str> = channels.iter().map(|channel| channel.name).collect();
-    let (signature, outbox) = (signature(config), Outbox::new(&config.timing));
-    let mut mailers = Supervisor::new("mailer of notices by", move |name, notices| {
-        if let Some(channel) = channels.iter().find(|channel| channel.name == *name) {
-            actix_rt::spawn(send_all(channel.clone(), signature.clone(), outbox.clone(), notices));
-        }
-    });
-    for name in names {
-        mailers.add(name);
-    }
-    mailers
+    let start = |channel| {
+        let (sender, notices) = unbounded_channel();
+        actix_rt::spawn(send_all(channel, signature(config), Outbox::new(&config.timing), notices));
+        sender
+    };
+    mail.into_iter().chain(Channel::webhook(config)).map(start).collect()
 }
 
 /// Sends what comes, until the server ends.
 async fn send_all(channel: Channel, signature: String, mut outbox: Outbox, mut notices: UnboundedReceiver<Notice>) {
     loop {
-        // A new notice, or the end of the last e-mail, may change when the next one is due.
         let due = outbox.due();
         tokio::select! {
             notice = notices.recv() => match notice {
@@ -44,14 +35,7 @@ async fn send_all(channel: Channel, signature: String, mut outbox: Outbox, mut n
             },
             () = sleep_until(due.unwrap_or_else(Instant::now).into()), if due.is_some() => {
                 let batch = outbox.take(Instant::now());
-                let text = notice_text(&batch, &signature);
-                let mut delivery = pin!(channel.deliver(&text));
-                let sent = loop {
-                    tokio::select! {
-                        sent = &mut delivery => break sent,
-                        Some(notice) = notices.recv() => outbox.add(notice, Instant::now()),
-                    }
-                };
+                let sent = channel.deliver(&notice_text(&batch, &signature)).await;
                 handle_outcome(&channel, &mut outbox, batch, sent);
             }
         }
@@ -59,20 +43,20 @@ async fn send_all(channel: Channel, signature: String, mut outbox: Outbox, mut n
 }
 
 /// Reports the outcome of sending a batch to the outbox and the log.
-fn handle_outcome(channel: &Channel, outbox: &mut Outbox, batch: Vec<MailEntry>, sent: Result<String, String>) {
+fn handle_outcome(channel: &Channel, outbox: &mut Outbox, batch: Vec<WaitingNotice>, sent: Result<String, String>) {
     let (now, subject, name) = (Instant::now(), summary(&batch), channel.name);
-    let error = match sent {
+    match sent {
         Ok(answer) => {
             log::info!("{name} sent by {} ({subject}): {answer}", channel.server);
-            return outbox.succeeded(&batch, now);
+            outbox.succeeded(&batch, now);
         }
-        Err(error) => error,
-    };
-    let lost = outbox.failed(batch, now);
-    if !lost.is_empty() {
-        log::error!("{name} given up ({}): {error}", summary(&lost));
-    } else if let Some(next) = outbox.due() {
-        let wait = next.saturating_duration_since(now).as_secs_f64();
-        log::warn!("{name} not sent, next try in {wait:.0} s ({subject}): {error}");
+        Err(error) => {
+            let lost = outbox.failed(batch, now);
+            if lost.is_empty() {
+                log::warn!("{name} not sent, it is tried again ({subject}): {error}");
+            } else {
+                log::error!("{name} given up ({}): {error}", summary(&lost));
+            }
+        }
     }
 }

@@ -5,7 +5,6 @@ mod mailer;
 mod notice_text;
 mod outbox;
 mod smtp;
-mod webhook;
 
 pub use channel::Channel;
 pub use mailer::start;

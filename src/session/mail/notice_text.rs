@@ -2,9 +2,8 @@
 //!
 //! Untrusted text, such as a server's error, becomes one line without control characters, in the text and in headers.
 
-use super::outbox::{MailEntry, NoticeKind};
+use super::outbox::{Notice, NoticeKind, WaitingNotice};
 use crate::session::config::SessionConfig;
-use crate::shared::run::timestamp;
 use crate::shared::text::excerpt;
 
 /// Longest untrusted text that is shown, in characters.
@@ -16,8 +15,8 @@ pub fn signature(config: &SessionConfig) -> String {
 }
 
 /// The text about these entries, of several lines. The first is the subject of a mail.
-pub fn notice_text(entries: &[MailEntry], signature: &str) -> String {
-    let paragraphs: String = entries.iter().map(paragraph).collect();
+pub fn notice_text(entries: &[WaitingNotice], signature: &str) -> String {
+    let paragraphs: String = entries.iter().map(|entry| paragraph(&entry.notice)).collect();
     format!("{}\n\n{paragraphs}{signature}", summary(entries))
 }
 
@@ -27,19 +26,17 @@ pub fn test_text(signature: &str) -> String {
     format!("Test of the session server's notifications\n\n{words}\n\n{signature}")
 }
 
-fn paragraph(MailEntry { notice, held_back, .. }: &MailEntry) -> String {
-    let (server, event, time) = (excerpt(&notice.server, MAX_LETTERS), notice.event.words(), timestamp(notice.at));
-    let load = notice.load.map(|load| format!("  Load:       {:.1}%\n", load.percent()));
+fn paragraph(notice: &Notice) -> String {
+    let (server, event, time) = (excerpt(&notice.server, MAX_LETTERS), notice.event.words(), &notice.at);
+    let load = notice.load.map(|load| format!("  Load:       {:.1}%\n", load.percent())).unwrap_or_default();
     let error = notice.error.as_ref().map(|error| format!("  Last error: {}\n", excerpt(error, MAX_LETTERS)));
-    let held = (*held_back > 0).then(|| format!("  Held back:  {held_back} earlier, since it keeps changing\n"));
-    let more: String = [load, error, held].into_iter().flatten().collect();
-    format!("{server}: {event}\n  Time:       {time}\n{more}\n")
+    format!("{server}: {event}\n  Time:       {time}\n{load}{}\n", error.unwrap_or_default())
 }
 
 /// The subject: `Simulation server not responding: HOST:PORT`, or `Simulation servers: 3 not responding, 1 working again`.
-pub fn summary(entries: &[MailEntry]) -> String {
+pub fn summary(entries: &[WaitingNotice]) -> String {
     use NoticeKind::{AvailableAgain, MaximumLoad, NotResponding, WorkingAgain};
-    if let [MailEntry { notice, .. }] = entries {
+    if let [WaitingNotice { notice, .. }] = entries {
         return format!("Simulation server {}: {}", notice.event.words(), excerpt(&notice.server, MAX_LETTERS));
     }
     let counts = [NotResponding, WorkingAgain, MaximumLoad, AvailableAgain].map(|event| {

@@ -1,6 +1,7 @@
 //! What is known of one simulation server: its last report, and the clients that were sent to it since then.
 
 use super::cost::{CostFit, Estimate, FULL, FleetCost, believable};
+use super::ejection::Ejection;
 use super::policy::PlacementPolicy;
 use super::replicas::Replicas;
 use crate::shared::domain::{Instances, ServerReport};
@@ -35,7 +36,6 @@ pub(super) struct Placement {
 struct ClientDelta {
     at: Instant,
     clients: f64,
-    takes_room: bool,
 }
 
 impl ClientDelta {
@@ -45,6 +45,17 @@ impl ClientDelta {
         let age = now.saturating_duration_since(self.at);
         self.clients * (1.0 - age.as_secs_f64() / span.as_secs_f64()).max(0.0)
     }
+}
+
+/// Sort key of a server: ejected servers come last, then the lowest load comes first, and of equal loads the server
+/// that was chosen longest ago.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct Rank {
+    is_ejected: bool,
+    /// The bits of the load, which sort as the load does: it is not negative.
+    load: u64,
+    /// Unique in a fleet.
+    last_pick: u64,
 }
 
 /// One server of the fleet.
@@ -67,8 +78,6 @@ pub(super) struct Backend {
     settling: VecDeque<ClientDelta>,
     /// Number of clients that `settling` hid from the last report.
     unseen: f64,
-    /// Those of them that reserve room.
-    unseen_reserved: f64,
     fit: CostFit,
     /// The estimate from that fit that the fleet has.
     pub(super) estimate: Estimate,
@@ -76,6 +85,10 @@ pub(super) struct Backend {
     pub(super) cost: f64,
     /// When this server was chosen last, as a number that grows with each placement of the fleet.
     pub(super) last_pick: u64,
+    /// Whether its starts fail.
+    pub(super) ejection: Ejection,
+    /// Its rank in the fleet, `None` if it has no room.
+    pub(super) rank: Option<Rank>,
 }
 
 impl Backend {
@@ -100,13 +113,13 @@ impl Backend {
         fleet: &mut FleetCost,
         replicas: &mut Replicas,
     ) {
+        self.ejection.report(now, report.failed_starts);
         let report = LastReport { at: now, load: report.load.percent(), instances: report.instances };
         self.note_changes(report, replicas);
-        // The same report may be judged again, as after a change of names.
-        if self.last.is_none_or(|last| last.at < now) {
-            self.fresh = 0;
-        }
-        self.settle(now);
+        self.fresh = 0;
+        // What the load shows by now is dropped.
+        self.settling.retain(|change| change.unseen(now) != 0.0);
+        self.unseen = self.settling.iter().map(|change| change.unseen(now)).sum();
         self.learn(report);
         self.last = Some(report);
         (self.up, self.accepting) = (true, accepting);
@@ -126,8 +139,9 @@ impl Backend {
         self.fresh += usize::from(takes_room);
     }
 
-    /// Gives up overdue clients. Returns the number of those that reserved room.
+    /// Ends an ejection, and gives up overdue clients. Returns the number of those that reserved room.
     pub(super) fn expire(&mut self, now: Instant, policy: &PlacementPolicy) -> usize {
+        self.ejection.expire(now);
         let is_late = |placed: &Placement| now.saturating_duration_since(placed.at) >= policy.placement_timeout;
         let late = self.in_flight.partition_point(is_late);
         let given_up = self.in_flight.drain(..late).filter(|placed| placed.takes_room).count();
@@ -136,7 +150,7 @@ impl Backend {
     }
 
     /// Whether a client can be sent here.
-    pub(super) fn has_room(&self, policy: &PlacementPolicy) -> bool {
+    fn has_room(&self, policy: &PlacementPolicy) -> bool {
         let has_slot = |instances: Instances| {
             let taken = f64::from(instances.present()) + count(self.reserved) + self.sent_by_others();
             taken < f64::from(instances.places)
@@ -156,18 +170,20 @@ impl Backend {
     /// The load, in percent, that is expected once it shows all clients that reserve room; `None` if the server is
     /// down.
     pub(super) fn effective_load(&self) -> Option<f64> {
-        self.load_with(self.unseen_reserved, self.reserved)
+        self.load_with(self.reserved)
     }
 
-    /// The same with all clients that were sent here; servers are compared by this load.
-    pub(super) fn rank_load(&self) -> Option<f64> {
-        self.load_with(self.unseen, self.in_flight.len())
+    /// The rank that it should have; `None` if it has no room. Servers are compared by their load with all clients that
+    /// were sent there.
+    pub(super) fn current_rank(&self, policy: &PlacementPolicy) -> Option<Rank> {
+        let load = self.load_with(self.in_flight.len()).filter(|_| self.has_room(policy))?;
+        Some(Rank { is_ejected: self.ejection.until.is_some(), load: load.to_bits(), last_pick: self.last_pick })
     }
 
-    fn load_with(&self, unseen: f64, in_flight: usize) -> Option<f64> {
+    fn load_with(&self, in_flight: usize) -> Option<f64> {
         let LastReport { load, .. } = self.last.filter(|_| self.up)?;
         // The overload of a full machine is unknown, so it may still be full after clients have left.
-        let unseen = if load < FULL { unseen } else { unseen.max(0.0) };
+        let unseen = if load < FULL { self.unseen } else { self.unseen.max(0.0) };
         let ahead = unseen + count(in_flight) + self.sent_by_others();
         Some((load + self.cost * ahead).max(0.0))
     }
@@ -182,25 +198,16 @@ impl Backend {
         // Clients in the queue cost nothing yet.
         let present = f64::from(instances.present().min(instances.places));
         let shown = (present - self.unseen).max(0.0);
-        // While many start, it is uncertain how much of them the load shows.
-        let trust = if shown < present { shown / present } else { 1.0 };
-        self.fit.learn(shown, report.load, report.at.saturating_duration_since(before.at), trust * trust);
-    }
-
-    /// Drops the changes that the load shows by now, and sums up the others.
-    fn settle(&mut self, now: Instant) {
-        self.settling.retain(|change| change.unseen(now) != 0.0);
-        self.unseen = self.settling.iter().map(|change| change.unseen(now)).sum();
-        let reserved = self.settling.iter().filter(|change| change.takes_room);
-        self.unseen_reserved = reserved.map(|change| change.unseen(now)).sum();
+        self.fit.learn(shown, report.load, report.at.saturating_duration_since(before.at));
     }
 
     /// Compares the report with the one before: which clients arrived, which left.
     fn note_changes(&mut self, report: LastReport, replicas: &mut Replicas) {
         let Some(new) = report.instances else {
-            // A load alone does not show arrivals: every placement is assumed to have arrived at once.
-            let all = self.in_flight.drain(..);
-            self.settling.extend(all.map(|Placement { at, takes_room }| ClientDelta { at, clients: 1.0, takes_room }));
+            // A load alone does not show arrivals: every placement that reserves room is assumed to have arrived at
+            // once.
+            let arrived = self.in_flight.drain(..).filter(|placed| placed.takes_room);
+            self.settling.extend(arrived.map(|Placement { at, .. }| ClientDelta { at, clients: 1.0 }));
             self.reserved = 0;
             return;
         };
@@ -219,7 +226,7 @@ impl Backend {
         // Reports do not identify clients, so arrivals are matched to the most recent placements. If the oldest were
         // taken, a client that never arrives would stay in flight as long as others follow it.
         for Placement { at, takes_room } in self.in_flight.drain(self.in_flight.len() - came..) {
-            self.settling.push_back(ClientDelta { at, clients: 1.0, takes_room: true });
+            self.settling.push_back(ClientDelta { at, clients: 1.0 });
             self.reserved -= usize::from(takes_room);
         }
         // Other changes: clients that arrived without a placement from here, minus those that left. When they happened
@@ -229,7 +236,7 @@ impl Backend {
         self.fit.count_arrivals(came + others.max(0.0));
         if others != 0.0 {
             let at = before + report.at.saturating_duration_since(before) / 2;
-            self.settling.push_back(ClientDelta { at, clients: others, takes_room: true });
+            self.settling.push_back(ClientDelta { at, clients: others });
         }
     }
 }
@@ -329,17 +336,6 @@ mod tests {
         server.assert_load(22.0, 1.0);
         server.report(8.0, 21.0, Some((10, 20)));
         server.assert_load(21.0, 0.0);
-    }
-
-    #[test]
-    fn a_repeated_report_changes_nothing() {
-        let mut server = Server::new(10.0, Some((5, 5)));
-        (0..2).for_each(|_| server.place(0.0));
-        server.report(1.0, 10.0, Some((6, 6)));
-        let before = server.0.effective_load().unwrap();
-        server.report(1.0, 10.0, Some((6, 6)));
-        assert_eq!(server.0.in_flight.len(), 1);
-        server.assert_load(before, 0.01);
     }
 
     #[test]

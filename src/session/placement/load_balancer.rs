@@ -1,8 +1,7 @@
 //! The servers of the fleet, and the choice between them.
 
-use super::backend::{Backend, count};
+use super::backend::{Backend, Rank, count};
 use super::cost::{Estimate, FleetCost};
-use super::ejection::Ejection;
 use super::policy::PlacementPolicy;
 use super::replicas::Replicas;
 use crate::shared::domain::ServerReport;
@@ -29,7 +28,7 @@ use std::time::{Duration, Instant};
 #[derive(Debug)]
 pub struct LoadBalancer<Id> {
     policy: PlacementPolicy,
-    servers: HashMap<Id, Server>,
+    servers: HashMap<Id, Backend>,
     /// Those that have room, so that a choice among a thousand is as fast as one among ten. A server's rank is updated
     /// when it is probed or chosen, when something of it expires, and with the policy.
     ranking: BTreeMap<Rank, Id>,
@@ -39,25 +38,6 @@ pub struct LoadBalancer<Id> {
     picks: u64,
     /// When placements and ejections were last checked for those that expire.
     checked: Option<Instant>,
-}
-
-#[derive(Debug)]
-struct Server {
-    backend: Backend,
-    ejection: Ejection,
-    /// `None` if it has no room.
-    rank: Option<Rank>,
-}
-
-/// Sort key of a server: ejected servers come last, then the lowest load comes first, and of equal loads the server
-/// that was chosen longest ago.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-struct Rank {
-    is_ejected: bool,
-    /// The bits of the load, which sort as the load does: it is not negative.
-    load: u64,
-    /// Unique in a fleet.
-    last_pick: u64,
 }
 
 /// Interval between checks for placements and ejections that expire.
@@ -77,26 +57,21 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
         }
     }
 
-    /// Changes the policy. What was learned of the servers stays.
+    /// Changes the policy, from the next report of each server on. What was learned of the servers stays.
     pub fn set_policy(&mut self, policy: PlacementPolicy) {
         self.policy = policy;
-        for (id, server) in &mut self.servers {
-            server.sort_in(id, &self.policy, &mut self.ranking);
-        }
     }
 
     /// Adds a server, which is down until its first report. A known server is not changed.
     pub fn add(&mut self, id: Id) {
         self.picks += 1;
-        let backend = || Backend::new(&self.policy, self.picks);
-        let server = || Server { backend: backend(), ejection: Ejection::default(), rank: None };
-        self.servers.entry(id).or_insert_with(server);
+        self.servers.entry(id).or_insert_with(|| Backend::new(&self.policy, self.picks));
     }
 
     /// Removes a server and all that was known of it.
     pub fn remove(&mut self, id: &Id) {
         if let Some(server) = self.servers.remove(id) {
-            self.cost.replace(server.backend.estimate, Estimate::default());
+            self.cost.replace(server.estimate, Estimate::default());
             server.rank.map(|rank| self.ranking.remove(&rank));
         }
     }
@@ -104,19 +79,17 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
     /// Records what a server answered at `now`, and whether it takes new clients. If its last starts have failed for a
     /// reason of its own, other servers are preferred for a while. A server that is not in the fleet is ignored.
     pub fn report(&mut self, id: &Id, now: Instant, report: &ServerReport, accepting: bool) {
+        self.expire(now);
         let Some(server) = self.servers.get_mut(id) else { return };
-        self.replicas.count(0.0, count(server.backend.expire(now, &self.policy)));
-        server.backend.report(now, report, accepting, &self.policy, &mut self.cost, &mut self.replicas);
-        server.ejection.expire(now);
-        server.ejection.report(now, report.failed_starts);
-        server.sort_in(id, &self.policy, &mut self.ranking);
+        server.report(now, report, accepting, &self.policy, &mut self.cost, &mut self.replicas);
+        sort_in(server, id, &self.policy, &mut self.ranking);
     }
 
     /// Records that a server does not answer: it gets no clients until its next report.
     pub fn lose(&mut self, id: &Id) {
         let Some(server) = self.servers.get_mut(id) else { return };
-        server.backend.up = false;
-        server.sort_in(id, &self.policy, &mut self.ranking);
+        server.up = false;
+        sort_in(server, id, &self.policy, &mut self.ranking);
     }
 
     /// Returns the server with the lowest load among those that have room and are `eligible`, and counts the client as
@@ -129,10 +102,9 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
         let id = self.ranking.values().find(|id| eligible(id))?.clone();
         self.picks += 1;
         let server = self.servers.get_mut(&id)?;
-        server.backend.last_pick = self.picks;
-        server.backend.add_placement(now, takes_room);
-        server.ejection.note_pick(now);
-        server.sort_in(&id, &self.policy, &mut self.ranking);
+        server.last_pick = self.picks;
+        server.add_placement(now, takes_room);
+        sort_in(server, &id, &self.policy, &mut self.ranking);
         Some(id)
     }
 
@@ -144,9 +116,8 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
         self.checked = Some(now);
         let mut given_up = 0;
         for (id, server) in &mut self.servers {
-            server.ejection.expire(now);
-            given_up += server.backend.expire(now, &self.policy);
-            server.sort_in(id, &self.policy, &mut self.ranking);
+            given_up += server.expire(now, &self.policy);
+            sort_in(server, id, &self.policy, &mut self.ranking);
         }
         self.replicas.count(0.0, count(given_up));
     }
@@ -165,36 +136,32 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
     /// The load, in percent, that is expected once it shows all clients that reserve room; `None` if the server is
     /// down.
     pub fn effective_load(&self, id: &Id) -> Option<f64> {
-        self.servers.get(id)?.backend.effective_load()
+        self.servers.get(id)?.effective_load()
     }
 
     /// The load, in percent, from which on a server gets no client; `None` if it is not in the fleet.
     pub fn limit(&self, id: &Id) -> Option<f64> {
-        self.servers.get(id).map(|server| server.backend.limit(&self.policy))
+        self.servers.get(id).map(|server| server.limit(&self.policy))
     }
 
     /// Number of clients that were sent to a server and have neither been seen there nor been given up.
     pub fn in_flight(&self, id: &Id) -> usize {
-        self.servers.get(id).map_or(0, |server| server.backend.in_flight.len())
+        self.servers.get(id).map_or(0, |server| server.in_flight.len())
     }
 
     /// Expected cost of a client on a server, in percent of load; `None` if it is not in the fleet.
     pub fn client_cost(&self, id: &Id) -> Option<f64> {
-        self.servers.get(id).map(|server| server.backend.cost)
+        self.servers.get(id).map(|server| server.cost)
     }
 }
 
-impl Server {
-    /// Updates the rank of a server after a change.
-    fn sort_in<Id: Clone>(&mut self, id: &Id, policy: &PlacementPolicy, ranking: &mut BTreeMap<Rank, Id>) {
-        let load = self.backend.rank_load().filter(|_| self.backend.has_room(policy));
-        let (is_ejected, last_pick) = (self.ejection.until.is_some(), self.backend.last_pick);
-        let rank = load.map(|load| Rank { is_ejected, load: load.to_bits(), last_pick });
-        if self.rank != rank {
-            self.rank.map(|before| ranking.remove(&before));
-            rank.map(|now| ranking.insert(now, id.clone()));
-            self.rank = rank;
-        }
+/// Updates the rank of a server after a change.
+fn sort_in<Id: Clone>(server: &mut Backend, id: &Id, policy: &PlacementPolicy, ranking: &mut BTreeMap<Rank, Id>) {
+    let (before, now) = (server.rank, server.current_rank(policy));
+    if before != now {
+        before.map(|rank| ranking.remove(&rank));
+        now.map(|rank| ranking.insert(rank, id.clone()));
+        server.rank = now;
     }
 }
 

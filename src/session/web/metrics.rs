@@ -5,7 +5,6 @@ use crate::shared::http::Gauge;
 
 /// The gauges of `/metrics`.
 pub fn gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> {
-    let count = |wanted: ServerState| status.servers.iter().filter(|server| server.record.state == wanted).count();
     let all = [ServerState::Unknown, ServerState::Up, ServerState::Full, ServerState::Draining, ServerState::Down];
     let of_servers = |name, help, value: &dyn Fn(&ServerStatus) -> Option<f64>| {
         let value = |server: &ServerStatus| Some((vec![server.record.address.to_string()], value(server)?));
@@ -31,7 +30,7 @@ pub fn gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> 
             name: "webots_session_servers",
             help: "Simulation servers by state",
             labels: &["state"],
-            values: all.iter().map(|state| (vec![state.word()], number(count(*state)))).collect(),
+            values: all.iter().map(|state| (vec![state.word()], number(status.count(*state)))).collect(),
         },
         of_servers("webots_session_server_up", "1 while a simulation server gives good answers", &|server| {
             Some(f64::from(u8::from(!matches!(server.record.state, ServerState::Down | ServerState::Unknown))))

@@ -1,6 +1,5 @@
 //! The interface to browsers and programs: routes, pages, and the WebSocket of a web client.
 
-mod actions;
 mod metrics;
 mod page_routes;
 pub mod pages;

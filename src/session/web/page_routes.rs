@@ -2,15 +2,19 @@
 
 use std::time::SystemTime;
 
+use actix_web::error::ErrorInternalServerError;
 use actix_web::{HttpRequest, HttpResponse, Result, web};
 use askama::Template;
 
-use super::pages::{self, Viewer, WebotsViewer};
+use super::pages::{self, Monitor, Viewer, WebotsViewer};
 use crate::asset;
 use crate::session::state::AppState;
 use crate::shared::http::assets::{self, Asset};
 use crate::shared::http::routing::{GET, READ, path};
-use crate::shared::http::{ConnectionKind, OWN_FILES, VIEWER, any_host, fleet_sources, foreign_scripts, html};
+use crate::shared::http::{
+    ConnectionKind, OWN_FILES, PageView, VIEWER, any_host, fleet_sources, foreign_scripts, html,
+};
+use crate::shared::run::timestamp;
 
 /// Assets of this server's pages, besides those that both servers share.
 const ASSETS: &[Asset] =
@@ -26,35 +30,32 @@ pub fn configure(app: &mut web::ServiceConfig) {
 }
 
 async fn monitor(server: web::Data<AppState>) -> Result<HttpResponse> {
-    let (status, announcement) = (server.status().await?, server.announcements.current());
-    let (clients, started) = (server.clients(), SystemTime::now() - server.started.elapsed());
-    let more = (announcement.as_deref(), server.admin_auth.is_some());
-    let page = pages::monitor(&status, clients, &server.client_urls, started, more);
-    Ok(html(page, OWN_FILES))
+    let view = view(&server, &*server.status().await?).map_err(ErrorInternalServerError)?;
+    let started = timestamp(SystemTime::now() - server.started.elapsed());
+    let page = Monitor { started, has_actions: server.admin_auth.is_some(), view };
+    Ok(html(page.render(), OWN_FILES))
 }
 
-async fn events(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
-    let permit = match server.connections.admit(ConnectionKind::Page, server.config.trusted_proxies.peer(&request)) {
-        Ok(permit) => permit,
-        Err(refused) => return HttpResponse::from_error(refused),
-    };
+async fn events(request: HttpRequest, server: web::Data<AppState>) -> Result<HttpResponse> {
+    let permit = server.connections.admit(ConnectionKind::Page, server.config.trusted_proxies.peer(&request))?;
     let shown = server.clone();
     let render = move || {
         let server = shown.clone();
         async move {
-            let status = server.status().await.ok()?;
-            let announcement = server.announcements.current();
-            let view = pages::view(&status, server.clients(), &server.client_urls, announcement.as_deref());
+            let view = view(&server, &*server.status().await.ok()?);
             view.inspect_err(|error| log::error!("the monitor page can't be rendered: {error}")).ok()
         }
     };
-    server.live.listen(permit, server.phase.clone(), render)
+    Ok(server.live.listen(permit, server.phase.clone(), render))
+}
+
+fn view(server: &AppState, status: &FleetStatus) -> askama::Result<PageView> {
+    pages::view(status, server.clients(), &server.client_urls, &server.announcement.borrow())
 }
 
 async fn viewer(server: web::Data<AppState>) -> HttpResponse {
     let script = server.config.viewer_script.as_ref().map(url::Url::as_str);
-    let page = Viewer { version: env!("CARGO_PKG_VERSION"), examples: &server.config.examples, script };
-    html(page.render(), VIEWER)
+    html(Viewer { examples: &server.config.examples, script }.render(), VIEWER)
 }
 
 /// Webots' own viewer is third-party code, and a link to this page can name another script on a host of the fleet. So
@@ -68,8 +69,7 @@ async fn webots_viewer(server: web::Data<AppState>) -> Result<HttpResponse> {
         None => fleet_sources(status.servers.iter().map(|one| &one.record.address), urls.ssl),
     };
     sources.extend(server.config.viewer_script.as_ref().map(|script| script.origin().ascii_serialization()));
-    let page = WebotsViewer { version: env!("CARGO_PKG_VERSION") };
-    Ok(html(page.render(), &foreign_scripts(&sources)))
+    Ok(html(WebotsViewer.render(), &foreign_scripts(&sources)))
 }
 
 async fn asset(request: HttpRequest) -> HttpResponse {

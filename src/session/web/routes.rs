@@ -7,16 +7,27 @@ use actix_web::error::ErrorInternalServerError;
 use actix_web::http::{StatusCode, header};
 use actix_web::{HttpRequest, HttpResponse, Result, web};
 use percent_encoding::percent_decode_str;
+use serde::Deserialize;
 
-use super::actions;
 use super::metrics;
 use super::page_routes;
 use super::status::status_page;
 use super::web_client::WebClient;
 use crate::session::fleet::PickError;
 use crate::session::state::AppState;
-use crate::shared::http::routing::{self, GET, READ, path, retry_after};
-use crate::shared::http::{CONTENT_TYPE, ConnectionKind, websocket};
+use crate::shared::http::routing::{self, GET, POST, READ, path, retry_after};
+use crate::shared::http::{CONTENT_TYPE, ConnectionKind, body, refuse_action, websocket};
+use crate::shared::text::one_line;
+
+/// The body of `POST /announcement`.
+#[derive(Default, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct Announcement {
+    text: String,
+}
+
+/// Longest announcement, in characters.
+const MAX_ANNOUNCEMENT: usize = 300;
 
 /// Adds all routes to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
@@ -32,7 +43,7 @@ fn add(app: &mut web::ServiceConfig) {
         .service(path("/status", READ, status_json))
         .service(path("/metrics", READ, metrics_text))
         .service(path("/health", READ, health))
-        .configure(actions::configure);
+        .service(path("/announcement", POST, announcement));
 }
 
 fn wants_websocket(request: &HttpRequest) -> bool {
@@ -40,11 +51,11 @@ fn wants_websocket(request: &HttpRequest) -> bool {
     upgrade.is_some_and(|value| value.eq_ignore_ascii_case("websocket"))
 }
 
-async fn root(request: HttpRequest, stream: web::Payload, server: web::Data<AppState>) -> HttpResponse {
-    if wants_websocket(&request) { open_websocket(&request, stream, &server) } else { availability(server).await }
+async fn root(request: HttpRequest, stream: web::Payload, server: web::Data<AppState>) -> Result<HttpResponse> {
+    if wants_websocket(&request) { open_websocket(&request, stream, &server) } else { Ok(availability(server).await) }
 }
 
-async fn session(request: HttpRequest, stream: web::Payload, server: web::Data<AppState>) -> HttpResponse {
+async fn session(request: HttpRequest, stream: web::Payload, server: web::Data<AppState>) -> Result<HttpResponse> {
     if wants_websocket(&request) {
         return open_websocket(&request, stream, &server);
     }
@@ -63,7 +74,8 @@ async fn session(request: HttpRequest, stream: web::Payload, server: web::Data<A
     if status == StatusCode::SERVICE_UNAVAILABLE {
         response.insert_header(retry_after());
     }
-    response.content_type("text/plain; charset=utf-8").body(picked.unwrap_or_else(|error| error.for_client()))
+    let text = picked.unwrap_or_else(|error| error.for_client());
+    Ok(response.content_type("text/plain; charset=utf-8").body(text))
 }
 
 /// The world of a query. `webots.js` does not percent-encode it, so everything after `url=` is the world: a plus sign
@@ -78,16 +90,13 @@ fn wanted_world(query: &str) -> Option<Cow<'_, str>> {
     Some(percent_decode_str(whole).decode_utf8_lossy())
 }
 
-fn open_websocket(request: &HttpRequest, stream: web::Payload, server: &web::Data<AppState>) -> HttpResponse {
+fn open_websocket(request: &HttpRequest, stream: web::Payload, server: &web::Data<AppState>) -> Result<HttpResponse> {
     let peer = server.config.trusted_proxies.peer(request);
-    let permit = match server.connections.admit(ConnectionKind::Client, peer) {
-        Ok(permit) => permit,
-        Err(refused) => return HttpResponse::from_error(refused),
-    };
+    let permit = server.connections.admit(ConnectionKind::Client, peer)?;
     let server = Arc::clone(server);
     // Pages that don't ask for them would not understand them.
     let wants_announcements = request.query_string().split('&').any(|one| one == "announcements=1");
-    websocket::open(request, stream, WebClient::new(server, peer, wants_announcements, permit))
+    Ok(websocket::open(request, stream, WebClient::new(server, peer, wants_announcements, permit)))
 }
 
 async fn availability(server: web::Data<AppState>) -> HttpResponse {
@@ -110,6 +119,25 @@ async fn metrics_text(server: web::Data<AppState>) -> Result<HttpResponse> {
     let text = server.metrics.render(&metrics::gauges(server.clients(), &status));
     let text = text.map_err(|error| ErrorInternalServerError(format!("Error: {error}.")))?;
     Ok(HttpResponse::Ok().content_type(CONTENT_TYPE).body(text))
+}
+
+/// Replaces the announcement, with the administrator's password; without a text it ends.
+async fn announcement(request: HttpRequest, payload: web::Payload, server: web::Data<AppState>) -> HttpResponse {
+    let peer = server.config.trusted_proxies.peer(&request);
+    if let Some(refusal) = refuse_action(server.admin_auth.as_ref(), &request, peer) {
+        return refusal;
+    }
+    let text = match body::json(&request, payload, "{\"text\": TEXT}").await {
+        Ok(Announcement { text }) => one_line(text.trim()),
+        Err(refusal) => return refusal,
+    };
+    if text.chars().count() > MAX_ANNOUNCEMENT {
+        let words = format!("Error: an announcement has at most {MAX_ANNOUNCEMENT} letters.");
+        return HttpResponse::BadRequest().body(words);
+    }
+    log::info!("client {peer}: announces {text:?}");
+    server.announcement.send_replace(text);
+    HttpResponse::Ok().body("ok")
 }
 
 async fn health() -> HttpResponse {

@@ -7,7 +7,6 @@ use serde_json::{Value, json};
 use crate::session::fleet::{FleetStatus, ServerStatus};
 use crate::session::state::AppState;
 use crate::shared::domain::ClientUrls;
-use crate::shared::run::timestamp;
 
 /// The page `/status`. Loads are in percent, times in seconds; `null` is what is not known.
 pub fn status_page(server: &AppState, status: &FleetStatus) -> Value {
@@ -29,7 +28,7 @@ fn server_status(server: &ServerStatus, urls: &ClientUrls) -> Value {
         "address": record.address,
         "monitor": format!("{}/monitor", urls.http_url(&record.address)),
         "state": record.state,
-        "since": timestamp(record.since),
+        "since": record.since,
         "load": report.map(|report| report.load),
         "effectiveLoad": server.effective_load,
         "inFlight": server.in_flight,

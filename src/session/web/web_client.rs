@@ -14,7 +14,6 @@ use futures_util::stream::{self, Stream};
 use serde::Deserialize;
 use tokio::sync::watch;
 
-use crate::session::config::Announcement;
 use crate::session::state::AppState;
 use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::websocket::wrong_message;
@@ -78,7 +77,7 @@ impl Actor for WebClient {
         liveness::watch(ctx, timing.ping, timing.silence, |client| &mut client.liveness);
         ctx.add_stream(updates(self.server.available.clone(), self.server.phase.clone()));
         if self.wants_announcements {
-            ctx.add_stream(announcements(self.server.announcements.subscribe()));
+            ctx.add_stream(announcements(self.server.announcement.subscribe()));
         }
     }
 }
@@ -103,13 +102,13 @@ fn updates(
 }
 
 /// The current announcement, if there is one, and each change; no text once it is over.
-fn announcements(mut all: watch::Receiver<Option<Arc<Announcement>>>) -> impl Stream<Item = Option<ByteString>> {
-    if all.borrow().is_some() {
+fn announcements(mut all: watch::Receiver<String>) -> impl Stream<Item = Option<ByteString>> {
+    if !all.borrow().is_empty() {
         all.mark_changed();
     }
     stream::unfold(all, async |mut all| {
         all.changed().await.ok()?;
-        let text = all.borrow_and_update().as_ref().map(|one| client_text(&one.text)).unwrap_or_default();
+        let text = client_text(&all.borrow_and_update());
         Some((Some(format!("announcement: {text}").trim_end().into()), all))
     })
 }

@@ -48,9 +48,7 @@ struct Watch<'one> {
 /// The page that holds Webots' own viewer.
 #[derive(Template)]
 #[template(path = "session/webots_viewer.html")]
-struct WebotsViewer {
-    version: &'static str,
-}
+struct WebotsViewer;
 
 /// Adds the routes to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
@@ -181,6 +179,5 @@ async fn watch(
 
 /// Webots' own viewer shows what worlds bring: it runs in an embedded page with an origin of its own.
 async fn viewer() -> HttpResponse {
-    let page = WebotsViewer { version: env!("CARGO_PKG_VERSION") };
-    html(page.render(), &foreign_scripts(&[]))
+    html(WebotsViewer.render(), &foreign_scripts(&[]))
 }
