@@ -83,8 +83,7 @@
 //! | `Session` | with its simulation, or its client | its lease is released, and its client is notified |
 //! | Webots | with its process tree; it is never restarted, its client is notified | its process tree is killed at once, its directory removed, its slot released |
 //!
-//! The `SlotPool` is no actor: a mutex guards it. A panic while that mutex is locked also ends the server with exit code 1.
-//! The registry runs the supervisors ([`shared::run::Supervisor`], one for each kind). More than five panics of a kind
+//! The `SlotPool` is no actor: a mutex guards it. The registry runs the supervisors ([`shared::run::Supervisor`], one for each kind). More than five panics of a kind
 //! within a minute end the server with exit code 1, too.
 //!
 //! # Facts about actix 0.13 that this relies on

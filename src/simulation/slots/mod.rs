@@ -1,7 +1,5 @@
 //! The slots that clients wait for: leases, the queue, and the limit per address; the streams of simulations that have one.
 
-mod access;
-mod party;
 mod present;
 mod slot_event;
 mod slot_lease;

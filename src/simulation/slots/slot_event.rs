@@ -12,8 +12,6 @@ pub enum SlotEvent {
     Granted(u16),
     /// The first watcher of the simulation connects, or the last one leaves.
     Watched(bool),
-    /// Too many simulations wait for disconnected clients, and this one has waited longest: it must end.
-    AwayTooLong,
     /// The administrator stops the simulation; the words are for its client.
     Stopped(String),
 }
