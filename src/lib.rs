@@ -70,7 +70,7 @@
 //! guards. Dropping it frees all three, whatever its state, even after a panic. When the simulation server exits, for
 //! whatever reason, its [`simulation::process::guardian`] process ends everything that the server has started.
 //! One `simulation::isolation::Watcher` enforces the limits that the kernel does not, and notes what simulations use. One
-//! thread copies all streams that are relayed; the server exits if it panics.
+//! thread copies all streams that are relayed, but those of watchers; the server exits if it panics.
 //!
 //! # What ends, and what restarts
 //!

@@ -90,7 +90,18 @@ impl Direction {
             if !self.pending.is_empty() || self.source == Source::Empty {
                 return Ok(false);
             }
-            let length = self.read(buffer)?;
+            let length = match self.from.read(buffer) {
+                Ok(0) => return Err(ErrorKind::UnexpectedEof.into()),
+                Err(error) if error.kind() == ErrorKind::WouldBlock => {
+                    self.source = Source::Empty;
+                    return Ok(false);
+                }
+                read => read?,
+            };
+            // epoll reports what comes after a read that did not fill the buffer.
+            if length < buffer.len() && self.source == Source::Readable {
+                self.source = Source::Empty;
+            }
             let read = buffer.get(..length).unwrap_or_default();
             let written = write(to, read)?;
             let rest = read.get(written..).unwrap_or_default();
@@ -99,25 +110,6 @@ impl Direction {
             }
         }
         Ok(true)
-    }
-
-    /// Returns how much was read: nothing if the source has to be waited for.
-    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        match self.from.read(buffer) {
-            Ok(0) => Err(ErrorKind::UnexpectedEof.into()),
-            Ok(length) => {
-                // epoll reports what comes after a read that did not fill the buffer.
-                if length < buffer.len() && self.source == Source::Readable {
-                    self.source = Source::Empty;
-                }
-                Ok(length)
-            }
-            Err(error) if error.kind() == ErrorKind::WouldBlock => {
-                self.source = Source::Empty;
-                Ok(0)
-            }
-            Err(error) => Err(error),
-        }
     }
 }
 

@@ -1,11 +1,10 @@
-//! A simulation that has a slot or waits for one, and its record.
+//! A simulation that has a slot or waits for one: its record, and the events for its session.
 
 use std::net::IpAddr;
 use std::time::SystemTime;
 
-use actix::Recipient;
+use actix::{Message, Recipient};
 
-use super::slot_event::SlotEvent;
 use crate::shared::http::Peer;
 use crate::shared::run::{seconds_since_1970, timestamp};
 use crate::shared::text::{excerpt, without_paths};
@@ -30,6 +29,20 @@ pub(super) struct Present {
     /// How it ends. Only the first report counts.
     pub how: Option<End>,
     events: Vec<String>,
+}
+
+/// An event of a lease.
+#[derive(Message)]
+#[rtype(result = "()")]
+pub enum SlotEvent {
+    /// This many clients are ahead in the queue.
+    Queued(usize),
+    /// This port may be used until the lease is dropped.
+    Granted(u16),
+    /// The first watcher of the simulation connects, or the last one leaves.
+    Watched(bool),
+    /// The administrator stops the simulation; the words are for its client.
+    Stopped(String),
 }
 
 /// Who has a token that leads to the stream of a simulation.
@@ -85,11 +98,6 @@ impl Present {
         };
         present.note(&event);
         present
-    }
-
-    /// The address for which it counts, if it is known.
-    pub(super) fn address(&self) -> Option<IpAddr> {
-        self.client.rate_limit_key()
     }
 
     /// Lends it a port.

@@ -4,8 +4,7 @@ use std::sync::Arc;
 
 use actix::Recipient;
 
-use super::present::{Holder, Present};
-use super::slot_event::SlotEvent;
+use super::present::{Holder, Present, SlotEvent};
 use super::slot_pool::SlotPool;
 use crate::shared::domain::ProjectUrl;
 use crate::shared::http::Peer;

@@ -11,17 +11,16 @@ use std::ops::RangeInclusive;
 use std::sync::Arc;
 use std::time::Duration;
 
-use parking_lot::{Mutex, MutexGuard};
+use parking_lot::Mutex;
 
-use super::present::{Party, Present};
-use super::slot_event::SlotEvent;
+use super::present::{Party, Present, SlotEvent};
 use crate::shared::domain::Instances;
 use crate::simulation::ends::Ends;
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::snapshot::{Simulation, Snapshot, Stage};
 
 /// The slots of this server, and the simulations that have one or wait for one.
-pub struct SlotPool(Mutex<Slots>);
+pub struct SlotPool(pub(super) Mutex<Slots>);
 
 pub(super) struct Slots {
     ports: RangeInclusive<u16>,
@@ -52,15 +51,11 @@ impl SlotPool {
         Arc::new(Self(Mutex::new(Slots { ports, queue_capacity, per_address, per_user, arrivals: 0, present, ends })))
     }
 
-    pub(super) fn slots(&self) -> MutexGuard<'_, Slots> {
-        self.0.lock()
-    }
-
     /// Checks again each second which ports other programs have left.
     pub async fn recheck(self: Arc<Self>) {
         loop {
             actix_rt::time::sleep(RECHECK).await;
-            self.slots().serve();
+            self.0.lock().serve();
         }
     }
 
@@ -70,9 +65,9 @@ impl SlotPool {
     /// Why it may not wait, as text for the client: the slots and the queue are full, or its address or its user has
     /// reached its limit.
     pub(super) fn acquire(&self, mut present: Present) -> Result<(), String> {
-        let mut slots = self.slots();
+        let mut slots = self.0.lock();
         slots.arrivals += 1;
-        let address = present.address().map(Party::Address).zip(slots.per_address);
+        let address = present.client.rate_limit_key().map(Party::Address).zip(slots.per_address);
         let user = present.shown.identity.user.clone().map(Party::User).zip(slots.per_user);
         present.parties = address.into_iter().chain(user).collect();
         let (id, refusal) = (present.shown.id, slots.refusal(&present));
@@ -90,7 +85,7 @@ impl SlotPool {
 
     /// Frees the slot of a simulation, or its position in the queue.
     pub(super) fn release(&self, id: SimulationId) {
-        let mut slots = self.slots();
+        let mut slots = self.0.lock();
         if let Some(present) = slots.present.remove(&id) {
             slots.ends.record(present.ended());
         }
@@ -99,7 +94,7 @@ impl SlotPool {
 
     /// Changes the record of a simulation, if it has not ended.
     pub(super) fn change(&self, id: SimulationId, change: impl FnOnce(&mut Present)) {
-        if let Some(present) = self.slots().present.get_mut(&id) {
+        if let Some(present) = self.0.lock().present.get_mut(&id) {
             change(present);
         }
     }
@@ -112,19 +107,19 @@ impl SlotPool {
     /// Stops the simulation that has this id now, and no other one: `why` is for its client. Returns whether there is
     /// one.
     pub fn stop(&self, id: &str, why: String) -> bool {
-        let slots = self.slots();
+        let slots = self.0.lock();
         let found = slots.present.values().find(|one| one.shown.id.to_string() == id);
         found.inspect(|one| one.listener.do_send(SlotEvent::Stopped(why))).is_some()
     }
 
     /// The numbers of simulations by state.
     pub fn instances(&self) -> Instances {
-        self.slots().instances()
+        self.0.lock().instances()
     }
 
     /// All simulations at this moment.
     pub fn snapshot(&self) -> Snapshot {
-        let slots = self.slots();
+        let slots = self.0.lock();
         let simulations = slots.present.values().map(|one| one.shown.clone()).collect();
         Snapshot { instances: slots.instances(), simulations }
     }

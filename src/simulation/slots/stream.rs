@@ -3,8 +3,7 @@
 
 use std::sync::Arc;
 
-use super::present::{Holder, Present};
-use super::slot_event::SlotEvent;
+use super::present::{Holder, Present, SlotEvent};
 use super::slot_pool::SlotPool;
 use crate::simulation::sessions::Token;
 use crate::simulation::simulation_id::SimulationId;
@@ -39,7 +38,7 @@ impl Present {
 impl SlotPool {
     /// The stream of a token, if the token is valid.
     pub fn stream(&self, token: Token) -> Option<StreamTarget> {
-        self.slots().present.values().find_map(|one| {
+        self.0.lock().present.values().find_map(|one| {
             let (_, holder) = one.accesses.iter().find(|(access, _)| *access == token)?;
             let read_only = *holder != Holder::Client;
             Some(StreamTarget { simulation: one.shown.id, port: one.shown.port?, read_only })
@@ -48,7 +47,7 @@ impl SlotPool {
 
     /// Issues a token to watch a simulation; `None` if it has no stream.
     pub fn watch(&self, simulation: SimulationId) -> Option<Token> {
-        let mut slots = self.slots();
+        let mut slots = self.0.lock();
         let accesses = &mut slots.present.get_mut(&simulation)?.accesses;
         let token = Token::random();
         (!accesses.is_empty()).then(|| accesses.push((token, Holder::Invited)))?;
@@ -57,7 +56,7 @@ impl SlotPool {
 
     /// Marks a watcher's token as used; `None` if it already was.
     pub fn start_watching(self: &Arc<Self>, simulation: SimulationId, token: Token) -> Option<WatchGuard> {
-        let mut slots = self.slots();
+        let mut slots = self.0.lock();
         let present = slots.present.get_mut(&simulation)?;
         let invited = present.accesses.iter_mut().find(|access| **access == (token, Holder::Invited))?;
         invited.1 = Holder::Watcher;
