@@ -69,7 +69,7 @@
 //! guards. Dropping it frees all three, whatever its state, even after a panic. When the simulation server exits, for
 //! whatever reason, its [`simulation::process::guardian`] process ends everything that the server has started.
 //! One `simulation::isolation::Watcher` enforces the limits that the kernel does not, and notes what simulations use. One
-//! thread copies all streams that are relayed; the server exits if it panics.
+//! thread copies all streams that are relayed, but those of watchers; the server exits if it panics.
 //!
 //! # What ends, and what restarts
 //!
@@ -82,9 +82,8 @@
 //! | `Session` | with its simulation, or its client | its lease is released, and its client is notified |
 //! | Webots | with its process tree; it is never restarted, its client is notified | its process tree is killed at once, its directory removed, its slot released |
 //!
-//! The `SlotPool` is no actor: a mutex guards it. A panic while that mutex is locked also ends the server with exit code 1.
-//! The registry supervises the monitors ([`shared::run::Supervisor`]). More than five panics of them within a minute end
-//! the server with exit code 1, too.
+//! The `SlotPool` is no actor: a mutex guards it. The registry supervises the monitors ([`shared::run::Supervisor`]). More than
+//! five panics of them within a minute end the server with exit code 1, too.
 //!
 //! # Facts about actix 0.13 that this relies on
 //!

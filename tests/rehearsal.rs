@@ -102,12 +102,12 @@ async fn a_class_that_does_not_fit_is_told_why_and_time_in_the_line_counts_as_wa
 #[actix_rt::test]
 async fn a_class_that_reloads_comes_back_to_its_simulations() {
     let fleet = Fleet::with_places(4).await;
-    let arguments = ["--clients", "2", "--over", "0s", "--stay", "8s", "--reload", "100", "--expect", "2"];
+    let arguments = ["--clients", "2", "--over", "0s", "--stay", "8s", "--misbehave", "return=100", "--expect", "2"];
     let said = fleet.rehearse(&[&arguments[..], &["--real-time", "0"]].concat()).await;
     assert_eq!(said.code, Some(0), "{said:?}");
     let status = fleet.simulation.status().await;
     assert_eq!(status["instances"]["arrivals"], 2, "they began anew: {said:?}");
-    let said = fleet.rehearse(&["--reload", "60", "--misbehave", "drop=41"]).await;
+    let said = fleet.rehearse(&["--misbehave", "return=60,drop=41"]).await;
     assert!(said.err.contains("the shares are 101 percent"), "{said:?}");
 }
 
@@ -125,11 +125,11 @@ async fn a_fleet_that_is_not_there_or_elsewhere_or_only_a_part_is_refused_in_one
     let no_session_server = (1, "error: ws://", ": no session server, maybe a simulation server\n");
     for (url, arguments, (code, begin, end)) in [
         (format!("http://127.0.0.1:{port}"), &ONE[..], (1, "error: ", "\n")),
-        // Nobody is there to agree. Nothing is sent: the address is one for documentation.
+        // Nothing is sent: the address is one for documentation.
         (
             "http://192.0.2.1:1999".to_owned(),
             &ONE[..],
-            (2, "error: nobody agreed to load http://192.0.2.1:1999/; --yes agrees\n", ""),
+            (2, "error: http://192.0.2.1:1999/ is not this machine: --yes loads it with 1 clients at once", "\n"),
         ),
         (fleet.simulation.url(""), &ONE[..], no_session_server),
         (fleet.simulation.url(""), &["--explain"], no_session_server),
@@ -255,20 +255,6 @@ async fn the_acceptance_run_prints_each_step_as_it_is_known() {
     let reading = async { while !lines.next_line().await.unwrap().unwrap().starts_with("Interrupted: ") {} };
     actix_rt::time::timeout(SOON, reading).await.expect("that it ends early is said");
     assert_eq!(child.wait().await.unwrap().code(), Some(130));
-}
-
-#[actix_rt::test]
-async fn simulation_servers_elsewhere_behind_a_session_server_here_are_not_loaded_unasked() {
-    let fleet = StandIn::start(Script { session: vec!["ws://192.0.2.1:2000"], ..Script::default() }).await;
-    let url = format!("http://{}", fleet.address);
-    let refusal =
-        format!("error: nobody agreed to load ws://192.0.2.1:2000, where {url}/ sends its clients; --yes agrees\n");
-    for arguments in [&["--clients", "3", "--over", "0s"][..], &["--explain"]] {
-        let Said { code, out, err } = rehearse(&url, arguments).await;
-        assert_eq!((code, &err), (Some(2), &refusal), "{arguments:?}");
-        assert!(!out.contains("as expected"), "nothing was measured");
-    }
-    assert_eq!(fleet.asked("/client"), [""; 0]);
 }
 
 fn signal(child: &Child, signal: Signal) {

@@ -110,13 +110,11 @@ pub async fn serve(assembly: Application) -> Result<(), AppError> {
     let (config, port) = (&server.config, server.config.port);
     start::announce("simulation server", &config.http_url(), &format!("{}/client", config.websocket_url(port)), port);
     let slots = Arc::clone(&server.slots);
+    actix_rt::spawn(Arc::clone(&slots).recheck());
     // It is answered unless this thread is blocked, or another one keeps the slots.
     actix_rt::spawn(service_manager::feed_watchdog(async move || slots.instances().places > 0));
     let why = tokio::select! {
         why = handle_signals(&mut signals, &server) => why,
-        _ = actix_rt::spawn(Arc::clone(&server.slots).recheck()) => {
-            return Err("a panic has left the slots in disorder".to_owned().into());
-        }
         fault = permanent::stopped("LoadMonitor", server.load_monitor.clone()) => return Err(fault.into()),
     };
     log::info!("stopping");

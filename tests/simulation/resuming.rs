@@ -237,34 +237,6 @@ async fn a_server_that_stops_leaves_nothing_of_who_is_away() {
 }
 
 #[actix_rt::test]
-async fn those_who_are_away_hold_half_of_the_places_and_end_nobody_elses_simulation() {
-    let server = quick(demo_server(4)).set("trustedProxies", json!(["127.0.0.1"])).start().await;
-    let at = async |address| Client::from_address(&server, address).await.unwrap();
-    let words = format!("{ENDED}: Too many simulations waited for their clients");
-    // Who has been away for the longest, or who has more than others.
-    for (addresses, ended) in
-        [(["192.0.2.1", "192.0.2.1", "192.0.2.1"], 0), (["192.0.2.1", "192.0.2.2", "192.0.2.2"], 1)]
-    {
-        let mut tokens = Vec::new();
-        for (away, address) in [1, 2, 2].into_iter().zip(addresses) {
-            let (client, token) = at(address).await.start_resumable().await;
-            drop(client);
-            server.until_away(away).await;
-            tokens.push(token);
-        }
-        until("one has ended", async || server.simulations().await.len() == 2).await;
-        let told = refused(&server, &tokens.remove(ended)).await;
-        assert!(told.starts_with(&words), "{told}");
-        for token in tokens {
-            let mut client = Client::resuming(&server, &token).await;
-            client.token().await;
-            client.close_with(1000).await;
-        }
-        nothing_left(&server, 4).await;
-    }
-}
-
-#[actix_rt::test]
 async fn who_comes_back_counts_for_the_address_that_has_asked_and_keeps_to_allowed_origins() {
     let change = |builder: Builder| {
         let builder = builder.set("trustedProxies", json!(["127.0.0.1"])).set("maxPlacesPerAddress", 1);

@@ -103,7 +103,7 @@ async fn one_user_has_a_share_of_the_places_wherever_it_is() {
     let mut waits = from("anna", "203.0.113.2").await;
     assert_eq!(waits.until("").await, "queue: 0");
     let told = from("anna", "203.0.113.3").await.until("").await;
-    let words = "loading: Error: You have 1 places of this simulation server, and 1 more clients of yours are waiting";
+    let words = "loading: Error: You have 1 places of this simulation server, and 1 more are waiting";
     assert!(told.starts_with(words), "{told}");
     // Another user of the same address, and somebody without a name, pass the one who waits.
     let mut other = from("ben", "203.0.113.1").await;

@@ -188,13 +188,3 @@ pub async fn an_actor_that_must_live_ends_the_server() {
     // The program ends with exit code 1 for whatever is told here.
     assert_eq!(inside.ended().await.unwrap_err().to_string(), "the actor LoadMonitor is gone");
 }
-
-pub async fn slots_in_disorder_end_the_server() {
-    let inside = Inside::new(Stage::Idle, |_| ()).await;
-    let (places, _granted) = unbounded_channel();
-    let listener = Listener { places, exits: unbounded_channel().0 }.start();
-    let lease = lease(&inside.server, &listener, &ProjectUrl::parse(&arm()).unwrap());
-    let panic = || lease.update(|_| std::panic::resume_unwind(Box::new("a test has asked for it")));
-    std::panic::catch_unwind(std::panic::AssertUnwindSafe(panic)).unwrap_err();
-    assert_eq!(inside.ended().await.unwrap_err().to_string(), "a panic has left the slots in disorder");
-}

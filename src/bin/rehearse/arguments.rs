@@ -7,7 +7,8 @@ use clap::Parser;
 use url::Url;
 use webots_fleet::shared::run::raise_open_files;
 
-use crate::behaviour::{Behaviour, Mix};
+use crate::behaviour::Mix;
+use crate::localhost::is_localhost;
 
 /// Longest time of an argument: 30 days.
 const LONGEST: Duration = Duration::from_hours(30 * 24);
@@ -17,7 +18,7 @@ const FILES: (u64, u64) = (4, 64);
 /// Plays a class of web clients against a fleet, and says how many fit.
 ///
 /// It speaks to a session server as Webots' web page does: availability, a simulation server, the start, the scene and its
-/// updates, run, leave. Exit code 0: as expected; 1: not, or nothing could be measured; 2: wrong arguments, or nobody agreed;
+/// updates, run, leave. Exit code 0: as expected; 1: not, or nothing could be measured; 2: wrong arguments, or --yes is missing;
 /// 130: Ctrl-C or SIGTERM.
 #[derive(Parser, Debug, Clone)]
 #[command(version)]
@@ -44,9 +45,6 @@ pub(crate) struct Arguments {
     /// vanish (a network that is gone), hasty (start and go at once). Example: reload=10,vanish=5
     #[arg(long, default_value = "", value_parser = str::parse::<Mix>)]
     pub(crate) misbehave: Mix,
-    /// How many percent of the clients reload their page in the middle, and come back to their simulation
-    #[arg(long, value_name = "PERCENT", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=100))]
-    pub(crate) reload: u32,
     /// Clients come again and again for this time, in place of once
     #[arg(long, value_parser = time)]
     pub(crate) soak: Option<Duration>,
@@ -63,12 +61,9 @@ pub(crate) struct Arguments {
     #[arg(long, default_value = "w3d", value_parser = ["w3d", "x3d"])]
     pub(crate) viewer: String,
     /// Walk through all steps with one client, and compare what comes with what is expected of a fleet and of Webots
-    #[arg(long, conflicts_with_all = ["clients", "over", "stay", "real_time", "misbehave", "reload", "soak", "expect", "json"])]
+    #[arg(long, conflicts_with_all = ["clients", "over", "stay", "real_time", "misbehave", "soak", "expect", "json"])]
     pub(crate) explain: bool,
-    /// Draw the clients that misbehave from this number; the same number draws the same
-    #[arg(long, default_value_t = 1)]
-    pub(crate) seed: u64,
-    /// Don't ask before loading a fleet that is not on this machine
+    /// Load a fleet that is not on this machine
     #[arg(long)]
     pub(crate) yes: bool,
 }
@@ -82,7 +77,9 @@ impl Arguments {
         if !self.fleet.username().is_empty() || self.fleet.password().is_some() {
             return Err("the session server's URL has a user name or a password, which nobody would be sent".to_owned());
         }
-        self.mix()?;
+        if !self.yes && !is_localhost(&self.fleet) {
+            return Err(format!("{} is not this machine: --yes loads it with {}", self.fleet, self.summary()));
+        }
         let clients = if self.explain { 1 } else { self.clients };
         let needed = u64::from(clients) * FILES.0 + FILES.1;
         let allowed = raise_open_files(needed);
@@ -94,14 +91,6 @@ impl Arguments {
         let Some(file) = &self.json else { return Ok(()) };
         let opened = std::fs::OpenOptions::new().create(true).append(true).open(file);
         opened.map(drop).map_err(|error| format!("{} can't be written: {error}", file.display()))
-    }
-
-    /// The mix of the clients' behaviours.
-    ///
-    /// # Errors
-    /// When the shares exceed 100 percent, as text.
-    pub(crate) fn mix(&self) -> Result<Mix, String> {
-        self.misbehave.clone().with(Behaviour::Return, self.reload)
     }
 
     /// A summary of the rehearsal: `200 clients within 1m, each for 10m`.

@@ -1,7 +1,6 @@
 //! The display of a running rehearsal: the number of clients at each stage.
 
-use std::cell::{Cell, RefCell};
-use std::io::{IsTerminal, Write};
+use std::cell::Cell;
 use std::time::{Duration, Instant};
 
 /// The stage of a client.
@@ -15,18 +14,17 @@ pub(crate) enum Stage {
     Running,
 }
 
-/// Counts clients by stage, and shows the counts on the terminal.
+/// Counts clients by stage, and prints the counts.
 pub(crate) struct Board {
     start: Instant,
     counts: [Cell<u32>; 3],
     asked: Cell<u32>,
     refused: Cell<u32>,
     done: Cell<u32>,
-    factors: RefCell<(f64, u32)>,
 }
 
-/// Interval between two lines if there is no terminal.
-const BETWEEN_LINES: Duration = Duration::from_secs(10);
+/// Interval between two lines.
+const BETWEEN_LINES: Duration = Duration::from_secs(5);
 
 impl Board {
     /// An empty board whose clock starts now.
@@ -37,7 +35,6 @@ impl Board {
             asked: Cell::default(),
             refused: Cell::default(),
             done: Cell::default(),
-            factors: RefCell::default(),
         }
     }
 
@@ -68,42 +65,19 @@ impl Board {
         AtStage(count)
     }
 
-    /// Records that a simulation ran at this share of real time within the last second.
-    pub(crate) fn paced(&self, factor: f64) {
-        let mut factors = self.factors.borrow_mut();
-        factors.0 += factor;
-        factors.1 += 1;
-    }
-
-    /// Shows the counts each second until dropped.
+    /// Prints the counts periodically until dropped.
     pub(crate) async fn show(&self) {
-        let mut told = Instant::now();
         loop {
-            actix_rt::time::sleep(Duration::from_secs(1)).await;
-            let line = self.line();
-            if std::io::stderr().is_terminal() {
-                rewrite_line(&line);
-            } else if told.elapsed() >= BETWEEN_LINES {
-                told = Instant::now();
-                eprintln!("{line}");
-            }
-        }
-    }
-
-    /// Clears the shown line.
-    pub(crate) fn clear() {
-        if std::io::stderr().is_terminal() {
-            rewrite_line("");
+            actix_rt::time::sleep(BETWEEN_LINES).await;
+            eprintln!("{}", self.line());
         }
     }
 
     fn line(&self) -> String {
         let seconds = self.start.elapsed().as_secs();
-        let (sum, count) = self.factors.take();
-        let pace = if count == 0 { String::new() } else { format!(", at {:.2} of real time", sum / f64::from(count)) };
         let [waiting, starting, running] = &self.counts;
         format!(
-            "{:02}:{:02}  {} asked, {} wait, {} start, {} run{pace}, {} refused, {} gone",
+            "{:02}:{:02}  {} asked, {} wait, {} start, {} run, {} refused, {} gone",
             seconds / 60,
             seconds % 60,
             self.asked.get(),
@@ -114,14 +88,6 @@ impl Board {
             self.done.get()
         )
     }
-}
-
-/// Overwrites the terminal's last line with a text, cut at the terminal's width.
-fn rewrite_line(text: &str) {
-    // To the begin of the line, without wrapping; the old text is erased.
-    let written = write!(std::io::stderr(), "\r\x1b[?7l\x1b[2K{text}\x1b[?7h");
-    // The reader may have closed the pipe.
-    written.and_then(|()| std::io::stderr().flush()).ok();
 }
 
 /// Counts a client at its stage.

@@ -77,9 +77,8 @@ impl<'class> Browser<'class> {
         Self { arguments, board, session, behaviour, visit, visits, full: None }
     }
 
-    /// Goes through all steps. `meet` receives the simulation server of the client, and returns whether the client may
-    /// connect to it.
-    pub(crate) async fn visit(mut self, meet: impl Fn(&str) -> bool) {
+    /// Goes through all steps. `meet` receives the simulation server of the client.
+    pub(crate) async fn visit(mut self, meet: impl Fn(&str)) {
         self.board.came();
         let patience = self.arguments.patience;
         let started = actix_rt::time::timeout(patience, self.start(meet)).await;
@@ -101,13 +100,11 @@ impl<'class> Browser<'class> {
         self.board.gone(matches!(self.visit.outcome, Outcome::Ran | Outcome::Unseen | Outcome::Left));
     }
 
-    async fn start(&mut self, meet: impl Fn(&str) -> bool) -> Result<Running, StartError> {
+    async fn start(&mut self, meet: impl Fn(&str)) -> Result<Running, StartError> {
         let waiting = self.board.enter(Stage::Waiting);
         let asked = Instant::now();
         let server = self.find_server().await?;
-        if !meet(&server) {
-            return Err(StartError::Left);
-        }
+        meet(&server);
         self.visit.server = server.split_once("://").map(|(_, address)| address.to_owned());
         let mut lease = Connection::open(&format!("{server}/client")).await?;
         let start = match self.behaviour {
@@ -265,7 +262,6 @@ impl<'class> Browser<'class> {
                     // A paused simulation sends nothing.
                     let simulated = first.zip(last).map_or(0.0, |(first, last): (f64, f64)| last - first) / 1000.0;
                     let factor = simulated / wall;
-                    self.board.paced(factor);
                     self.visit.pace.push(Pace { at: self.board.now(), factor });
                     (since, first) = (Instant::now(), last);
                 }

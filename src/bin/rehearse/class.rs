@@ -5,13 +5,11 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use futures_util::future::join_all;
-use tokio::sync::Notify;
 
 use crate::arguments::Arguments;
 use crate::behaviour::{Behaviour, Draw};
 use crate::board::Board;
 use crate::browser::Browser;
-use crate::consent::Consent;
 use crate::interruption::interruption;
 use crate::servers::Servers;
 use crate::session::Session;
@@ -30,17 +28,14 @@ pub(crate) struct Played {
     pub(crate) interrupted: bool,
 }
 
-/// Plays the whole class, or until Ctrl-C or SIGTERM. Ends at once if the user refuses to load a server that a client
-/// is sent to.
-pub(crate) async fn play(arguments: &Arguments, consent: &Consent<'_>) -> Played {
+/// Plays the whole class, or until Ctrl-C or SIGTERM.
+pub(crate) async fn play(arguments: &Arguments) -> Played {
     let class = Class {
         arguments,
-        consent,
-        refused: Notify::new(),
         board: Board::new(),
         session: Session::new(&arguments.fleet),
         servers: Servers::default(),
-        draw: RefCell::new(Draw::new(arguments.mix().unwrap_or_default(), arguments.seed)),
+        draw: RefCell::new(Draw::new(arguments.misbehave.clone())),
         visits: RefCell::default(),
     };
     let clients = join_all((0..arguments.clients).map(|client| class.come(client)));
@@ -50,19 +45,14 @@ pub(crate) async fn play(arguments: &Arguments, consent: &Consent<'_>) -> Played
     tokio::select! {
         _ = clients => {}
         _ = aside => {}
-        () = class.refused.notified() => {}
         () = interruption() => interrupted = true,
     }
-    Board::clear();
     Played { visits: class.visits.take(), peaks: class.servers.peaks(), interrupted }
 }
 
 /// The state that all clients share.
 struct Class<'arguments> {
     arguments: &'arguments Arguments,
-    consent: &'arguments Consent<'arguments>,
-    /// Notified when the user refused to load a server that a client was sent to.
-    refused: Notify,
     board: Board,
     session: Session,
     servers: Servers,
@@ -89,20 +79,9 @@ impl Class<'_> {
         }
     }
 
-    /// Whether a client may connect to the server that it was sent to.
-    fn meet(&self, server: &str) -> bool {
-        let may_load = self.consent.has_server(server);
-        if may_load {
-            self.servers.met(server);
-        } else {
-            self.refused.notify_one();
-        }
-        may_load
-    }
-
     async fn visit(&self, client: u32, behaviour: Behaviour) {
         let who = (client, behaviour);
         let browser = Browser::new(self.arguments, &self.board, &self.session, &self.visits, who);
-        browser.visit(|server| self.meet(server)).await;
+        browser.visit(|server| self.servers.met(server)).await;
     }
 }

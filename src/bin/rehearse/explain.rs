@@ -3,10 +3,8 @@
 
 use std::time::{Duration, Instant};
 
-use crate::Fault;
 use crate::arguments::Arguments;
 use crate::connection::{Connection, Deadline, Ended, unless_error};
-use crate::consent::Consent;
 use crate::session::Session;
 use crate::step_log::StepLog;
 use crate::words::{add, excerpt, over, told};
@@ -43,17 +41,14 @@ struct StepError;
 /// Walks through all steps and prints the results. Returns whether all of them were as expected.
 ///
 /// # Errors
-/// When the session server does not answer at all, or the user did not agree to load a server.
-pub(crate) async fn run(arguments: &Arguments, consent: &Consent<'_>) -> Result<bool, Fault> {
+/// When the session server does not answer at all.
+pub(crate) async fn run(arguments: &Arguments) -> Result<bool, String> {
     let session = Session::new(&arguments.fleet);
     session.answers().await?;
     let mut walk = StepLog::begin(arguments);
     // The last printed step shows where it failed.
-    Box::pin(walk.go(arguments, &session, consent)).await.ok();
-    match consent.refusal() {
-        Some(why) => Err(Fault::NotAgreed(why)),
-        None => Ok(walk.end()),
-    }
+    Box::pin(walk.go(arguments, &session)).await.ok();
+    Ok(walk.end())
 }
 
 /// The texts on the connection to the simulation server until Webots was ready, or its start failed.
@@ -66,9 +61,9 @@ struct Start {
 }
 
 impl StepLog {
-    async fn go(&mut self, arguments: &Arguments, session: &Session, consent: &Consent<'_>) -> Result<(), StepError> {
+    async fn go(&mut self, arguments: &Arguments, session: &Session) -> Result<(), StepError> {
         self.ask_for_availability(arguments, session).await?;
-        let (mut lease, webots) = self.start(arguments, session, consent).await?;
+        let (mut lease, webots) = self.start(arguments, session).await?;
         let address = format!("{}/", webots.trim_end_matches('/'));
         let opened = Connection::open_scene(&address).await;
         let came = opened.as_ref().map_or_else(ToString::to_string, |_| "a WebSocket".to_owned());
@@ -109,16 +104,11 @@ impl StepLog {
     }
 
     /// Requests a simulation server and starts the world there. Returns the connection and the URL of Webots.
-    async fn start(
-        &mut self,
-        arguments: &Arguments,
-        session: &Session,
-        consent: &Consent<'_>,
-    ) -> Result<(Connection, String), StepError> {
+    async fn start(&mut self, arguments: &Arguments, session: &Session) -> Result<(Connection, String), StepError> {
         let server = session.simulation_server(&arguments.world).await;
         let came = excerpt(server.as_ref().map_or_else(Clone::clone, Clone::clone).as_str());
         self.note("simulation server", "`ws://HOST:PORT` or `wss://HOST/PORT`", &came, server.is_ok());
-        let server = server.ok().filter(|server| consent.has_server(server)).ok_or(StepError)?;
+        let server = server.map_err(|_| StepError)?;
         let opened = Connection::open(&format!("{server}/client")).await;
         let came = opened.as_ref().map_or_else(ToString::to_string, |_| "a WebSocket".to_owned());
         self.note("client", "a WebSocket at `/client`", &came, opened.is_ok());

@@ -7,7 +7,6 @@ use serde::Serialize;
 
 use crate::arguments::Arguments;
 use crate::real_time_factors::{RealTimeFactors, factors, factors_of, quantile, sorted};
-use crate::reasons::Reasons;
 use crate::visit::{Outcome, Steps, Visit};
 
 /// The numbers of a rehearsal.
@@ -85,18 +84,6 @@ pub(crate) struct Server {
     pub(crate) peak_load: Option<f64>,
     /// The speed of simulated time there.
     pub(crate) pace: Option<RealTimeFactors>,
-    /// The first of two seconds in a row in which its simulations ran below real time on average.
-    pub(crate) slow: Option<Slow>,
-}
-
-/// When a server was too slow for its simulations.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-#[serde(rename_all = "camelCase")]
-pub(crate) struct Slow {
-    /// Seconds since the start.
-    pub(crate) at: f64,
-    /// Number of simulations that ran there.
-    pub(crate) simulations: u32,
 }
 
 /// The JSON file: the numbers, and each client's visit.
@@ -125,7 +112,7 @@ impl Report {
             .map(|(address, peak)| {
                 let here: Vec<&Visit> =
                     visits.iter().filter(|visit| visit.server.as_ref() == Some(address) && visit.has_run()).collect();
-                server(address, *peak, &here, arguments.real_time)
+                server(address, *peak, &here)
             })
             .collect();
         Self {
@@ -134,7 +121,7 @@ impl Report {
             played: arguments.summary(),
             times: times(visits),
             pace: factors(visits.iter().flat_map(factors_of)),
-            verdict: verdict(&seats, &servers),
+            verdict: verdict(&seats),
             expected: arguments.expect,
             interrupted: false,
             seats,
@@ -166,7 +153,6 @@ impl Report {
 
 fn seats(visits: &[Visit], real_time: f64) -> Seats {
     let mut seats = Seats::default();
-    let (mut refused, mut broke_off) = (Reasons::default(), Reasons::default());
     for visit in visits {
         seats.asked += 1;
         seats.given += u32::from(visit.has_run());
@@ -177,13 +163,21 @@ fn seats(visits: &[Visit], real_time: f64) -> Seats {
                 None if real_time > 0.0 => seats.unmeasured += 1,
                 None => seats.fit += 1,
             },
-            Outcome::Refused(why) | Outcome::Failed(why) => refused.add(why, visit),
-            Outcome::BrokeOff(why) => broke_off.add(why, visit),
+            Outcome::Refused(why) | Outcome::Failed(why) => *seats.refused.entry(reason(why, visit)).or_default() += 1,
+            Outcome::BrokeOff(why) => *seats.broke_off.entry(reason(why, visit)).or_default() += 1,
             Outcome::Unseen => seats.unseen += 1,
             Outcome::Left => seats.left += 1,
         }
     }
-    Seats { refused: refused.told(), broke_off: broke_off.told(), ..seats }
+    seats
+}
+
+/// The reason that a client was told, without what its simulation has printed, and the simulation server that it came from,
+/// which some reasons name themselves.
+fn reason(why: &str, visit: &Visit) -> String {
+    let why = why.split(" Its last output:").next().unwrap_or(why).trim_end_matches('.');
+    let server = visit.server.as_deref().filter(|server| !why.contains(server));
+    server.map_or(why.to_owned(), |server| format!("{why} at {server}"))
 }
 
 fn times(visits: &[Visit]) -> Vec<Row> {
@@ -202,14 +196,13 @@ fn times(visits: &[Visit]) -> Vec<Row> {
     steps.into_iter().filter_map(row).collect()
 }
 
-fn server(address: &str, peak_load: Option<f64>, here: &[&Visit], real_time: f64) -> Server {
+fn server(address: &str, peak_load: Option<f64>, here: &[&Visit]) -> Server {
     Server {
         address: address.to_owned(),
         seats: u32::try_from(here.len()).unwrap_or(u32::MAX),
         most_at_once: most_at_once(here),
         peak_load,
         pace: factors(here.iter().flat_map(|visit| factors_of(visit))),
-        slow: first_slow(here, real_time),
     }
 }
 
@@ -229,37 +222,7 @@ fn most_at_once(here: &[&Visit]) -> u32 {
     most.max().and_then(|most| u32::try_from(most).ok()).unwrap_or_default()
 }
 
-/// The first of two slow seconds in a row, in which a server's simulations ran below a share of real time on average.
-fn first_slow(here: &[&Visit], real_time: f64) -> Option<Slow> {
-    let mut seconds: BTreeMap<u64, Vec<f64>> = BTreeMap::new();
-    for pace in here.iter().flat_map(|visit| visit.pace.iter().skip(1)) {
-        // Seconds of a rehearsal are few and not negative.
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "the second counts")]
-        seconds.entry(pace.at as u64).or_default().push(pace.factor);
-    }
-    let is_slow = |factors: &Vec<f64>| factors.iter().sum::<f64>() < real_time * f64::from(count(factors.len()));
-    // One slow second is noise.
-    let mut before = None;
-    for (second, factors) in seconds {
-        if !is_slow(&factors) {
-            before = None;
-        } else if let Some(slow) = before {
-            return Some(slow);
-        } else {
-            #[expect(clippy::cast_precision_loss, reason = "a second of the rehearsal")]
-            let at = second as f64;
-            let simulations = here.iter().filter(|visit| began(visit) <= at && at <= visit.ended).count();
-            before = Some(Slow { at, simulations: count(simulations) });
-        }
-    }
-    None
-}
-
-fn count(number: usize) -> u32 {
-    u32::try_from(number).unwrap_or(u32::MAX)
-}
-
-fn verdict(seats: &Seats, servers: &[Server]) -> String {
+fn verdict(seats: &Seats) -> String {
     let all = seats.asked - seats.left - seats.unseen - seats.unmeasured;
     let mut sentence = match (seats.fit, all) {
         (_, 0) if seats.unmeasured > 0 => "None stayed long enough to tell its pace".to_owned(),
@@ -268,18 +231,10 @@ fn verdict(seats: &Seats, servers: &[Server]) -> String {
         (fit, all) if fit == all => format!("All {all} fit"),
         (fit, all) => format!("{fit} of {all} fit"),
     };
-    let first = servers.iter().filter_map(|server| Some((server, server.slow?)));
-    if let Some((server, slow)) = first.min_by(|(_, one), (_, other)| one.at.total_cmp(&other.at)) {
-        let what =
-            format!("{} was the first to run below real time, at {} simulations", server.address, slow.simulations);
-        sentence = format!("{sentence}; {what}");
-    } else {
-        let reasons = [("got none", &seats.refused), ("broke off", &seats.broke_off)];
-        let reasons =
-            reasons.into_iter().flat_map(|(what, all)| all.iter().map(move |(why, number)| (number, what, why)));
-        if let Some((number, what, why)) = reasons.max_by_key(|(number, ..)| **number) {
-            sentence = format!("{sentence}; {number} {what}: {why}");
-        }
+    let reasons = [("got none", &seats.refused), ("broke off", &seats.broke_off)];
+    let reasons = reasons.into_iter().flat_map(|(what, all)| all.iter().map(move |(why, number)| (number, what, why)));
+    if let Some((number, what, why)) = reasons.max_by_key(|(number, ..)| **number) {
+        sentence = format!("{sentence}; {number} {what}: {why}");
     }
     sentence + "."
 }
@@ -338,7 +293,7 @@ mod tests {
         assert_eq!(seats.refused, BTreeMap::from([("Error: full at gpu-2:2000".to_owned(), 2)]));
         assert_eq!(seats.broke_off.values().sum::<u32>(), 1);
         assert!(of_two.is_as_expected() && !report(&["--expect", "3"], &visits).is_as_expected());
-        assert_eq!(of_two.verdict, "2 of 6 fit; gpu-2:2000 was the first to run below real time, at 2 simulations.");
+        assert_eq!(of_two.verdict, "2 of 6 fit; 2 got none: Error: full at gpu-2:2000.");
         let servers: Vec<_> =
             of_two.servers.iter().map(|server| (server.seats, server.most_at_once, server.peak_load)).collect();
         assert_eq!(servers, [(4, 2, Some(60.0)), (2, 2, Some(99.0))]);
@@ -374,27 +329,5 @@ mod tests {
         };
         assert_eq!(all(&[&killed, &full, &killed]), "None fits; 2 broke off: Webots was killed at gpu-1:2000.");
         assert_eq!(all(&[&Outcome::Ran, &full, &full, &killed]), "1 of 4 fit; 2 got none: full at gpu-1:2000.");
-    }
-
-    #[test]
-    fn a_reason_names_the_servers_that_it_came_from() {
-        let late = Outcome::Failed("no simulation within 10s".to_owned());
-        let named = Outcome::Failed("ws://gpu-1:2000/client can't be reached: refused".to_owned());
-        let mut nowhere = visit(0, "", 0.0, late.clone(), &[]);
-        nowhere.server = None;
-        let seen = |servers: &[&str]| {
-            let all = (1..).zip(servers).map(|(client, server)| visit(client, server, 0.0, late.clone(), &[]));
-            let all = all.chain([nowhere.clone(), visit(9, "gpu-1:2000", 0.0, named.clone(), &[])]);
-            report(&[], &all.collect::<Vec<_>>()).seats.refused.into_iter().collect::<Vec<_>>()
-        };
-        let told = |place: &str, count| {
-            let mut all = vec![("no simulation within 10s".to_owned(), 1)];
-            all.push((format!("no simulation within 10s at {place}"), count));
-            all.push(("ws://gpu-1:2000/client can't be reached: refused".to_owned(), 1));
-            all
-        };
-        assert_eq!(seen(&["gpu-1:2000"; 2]), told("gpu-1:2000", 2));
-        assert_eq!(seen(&["gpu-1:2000", "gpu-2:2000"]), told("gpu-1:2000, gpu-2:2000", 2));
-        assert_eq!(seen(&["gpu-1:1", "gpu-2:1", "gpu-3:1", "gpu-4:1", "gpu-1:1"]), told("4 simulation servers", 5));
     }
 }

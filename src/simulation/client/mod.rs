@@ -4,7 +4,6 @@ pub mod quota;
 mod resume;
 mod session;
 mod start;
-mod state;
 mod web_client;
 
 pub use session::Session;

@@ -23,10 +23,7 @@ impl Session {
             log::info!("{}: away; it may come back within {} s", self.name(), absence.as_secs());
             self.show_away(Some(seconds_since_1970() + absence.as_secs()));
         }
-        self.deadline = Some(ctx.run_later(absence, move |this, ctx| {
-            log::info!("{}: has not come back within {} s", this.name(), absence.as_secs());
-            ctx.stop();
-        }));
+        self.deadline = Some(ctx.run_later(absence, |_, ctx| ctx.stop()));
     }
 
     fn show_away(&self, until: Option<u64>) {
@@ -37,15 +34,15 @@ impl Session {
 
     /// Sends to this connection from now on, and obeys no earlier one any more.
     pub(super) fn attach(&mut self, Connection { peer, client, mut actions }: Connection, ctx: &mut Context<Self>) {
+        self.peer = peer;
+        if let Some(before) = self.client.replace(client) {
+            before.do_send(ToClient::End(protocol::taken_over(), CloseCode::Normal));
+        }
         let actions = stream::poll_fn(move |context| actions.poll_recv(context));
         let (actions, attachment) = stream::abortable(actions.chain(stream::iter([ClientAction::Disconnect])));
         ctx.add_stream(actions);
-        self.peer = peer;
         if let Some(before) = self.attachment.replace(attachment) {
             before.abort();
-        }
-        if let Some(before) = self.client.replace(client) {
-            before.do_send(ToClient::End(protocol::taken_over(), CloseCode::Normal));
         }
     }
 
@@ -54,30 +51,30 @@ impl Session {
         let Some(url) = &self.url else { return };
         self.text(protocol::webots(url));
         if self.resumable {
-            let registered = self.token.map(|token| token.number());
-            let number = registered.unwrap_or_else(|| self.server.sessions.register(ctx.address().recipient()));
-            let token = *self.token.insert(Token::new(number));
+            let register = || self.server.sessions.register(ctx.address().recipient());
+            let token = self.token.map_or_else(register, Token::next);
+            self.token = Some(token);
             self.text(protocol::absence(self.server.config.timing.absence.as_secs()));
             self.text(protocol::resume(&token));
         }
     }
 
     /// Why a client with this token may not return, as text for it; `None` if it may.
-    fn refusal(&self, token: &Token) -> Option<String> {
-        match &self.token {
-            None => Some(protocol::ended(None)),
-            Some(own) if own != token => Some(protocol::taken_over()),
-            Some(_) => self.ended.as_ref().map(|why| protocol::ended(Some(why))),
+    fn refusal(&self, token: Token) -> Option<String> {
+        if self.token != Some(token) {
+            return Some(protocol::taken_over());
         }
+        self.ended.as_ref().map(|why| protocol::ended(Some(why)))
     }
 }
 
 impl Handler<Resume> for Session {
-    type Result = Result<(), String>;
+    type Result = ();
 
-    fn handle(&mut self, Resume { token, connection }: Resume, ctx: &mut Self::Context) -> Self::Result {
-        if let Some(refusal) = self.refusal(&token) {
-            return Err(refusal);
+    fn handle(&mut self, Resume { token, connection }: Resume, ctx: &mut Self::Context) {
+        if let Some(refusal) = self.refusal(token) {
+            log::info!("{}: client {} does not come back: {refusal}", self.name(), connection.peer);
+            return connection.client.do_send(ToClient::End(refusal, CloseCode::Normal));
         }
         log::info!("{}: goes on as client {}", self.name(), connection.peer);
         self.attach(connection, ctx);
@@ -94,6 +91,5 @@ impl Handler<Resume> for Session {
         if self.is_watched {
             self.text(protocol::watched(true));
         }
-        Ok(())
     }
 }

@@ -2,7 +2,7 @@
 //!
 //! Created by a web client that requests a simulation. Dropping it releases what it holds in its state: a position in
 //! the queue, a checkout in progress, a running Webots. It ends with its client, or some time after the connection of a
-//! client that may return.
+//! client that may return. `start` is its way to a running Webots, `resume` the wait for its client.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -11,17 +11,17 @@ use actix::prelude::*;
 use actix_web_actors::ws::CloseCode;
 use futures_util::stream::AbortHandle;
 
-use super::state::{State, WebotsHandle};
+use crate::shared::domain::ProjectUrl;
 use crate::shared::http::Peer;
 use crate::shared::run::closing;
 use crate::simulation::client_identity::ClientIdentity;
-use crate::simulation::ends::EndReason;
+use crate::simulation::ends::{EndReason, Taken};
 use crate::simulation::protocol::{self, Mode};
 use crate::simulation::sessions::{ClientAction, Connection, ToClient, Token};
 use crate::simulation::simulation_id::SimulationId;
-use crate::simulation::slots::{Slot, SlotEvent};
+use crate::simulation::slots::{Slot, SlotEvent, SlotLease};
 use crate::simulation::state::AppState;
-use crate::simulation::webots::{Keep, ResetController, WebotsEvent, WebotsExit};
+use crate::simulation::webots::{Keep, ResetController, Stop, Webots, WebotsEvent, WebotsExit};
 
 /// The actor.
 pub struct Session {
@@ -31,7 +31,7 @@ pub struct Session {
     pub(super) id: Option<SimulationId>,
     /// The connection of its client, until it has ended.
     pub(super) client: Option<Recipient<ToClient>>,
-    /// Ends the attachment of that connection.
+    /// Ends the attachment of that connection, at once.
     pub(super) attachment: Option<AbortHandle>,
     pub(super) state: State,
     /// How it is shown.
@@ -53,8 +53,29 @@ pub struct Session {
     pub(super) deadline: Option<SpawnHandle>,
     /// Why the simulation has ended, if it has.
     pub(super) ended: Option<String>,
-    /// The reset of a controller, while it runs.
-    resetting: Option<SpawnHandle>,
+    /// Whether a controller is being reset.
+    is_resetting: bool,
+}
+
+/// The life cycle of a simulation, as its session knows it. Dropping a state releases what the session holds in it.
+pub(super) enum State {
+    /// Waiting for a slot; the lease holds the position in the queue.
+    Waiting { world: ProjectUrl, lease: SlotLease },
+    /// The project is being checked out for this slot; the job ends with the actor.
+    CheckingOut(Slot),
+    /// Webots was started.
+    Launched(WebotsHandle),
+    /// It holds nothing: it was not admitted yet, or its client got the last text.
+    Over,
+}
+
+/// A running Webots. Dropping the handle stops it.
+pub(super) struct WebotsHandle(pub(super) Addr<Webots>);
+
+impl Drop for WebotsHandle {
+    fn drop(&mut self) {
+        self.0.do_send(Stop(EndReason::Left));
+    }
 }
 
 /// Interval of `absence` messages to a client that may return, which show that the connection works.
@@ -86,7 +107,7 @@ impl Session {
                 is_watched: false,
                 deadline: None,
                 ended: None,
-                resetting: None,
+                is_resetting: false,
             };
             session.attach(connection, ctx);
             session.request_slot(&request.url, identity, ctx);
@@ -108,10 +129,8 @@ impl Session {
 
     /// Sends the client a text that is dropped if it can't keep up.
     fn hint(&self, text: String) {
-        if let Some(client) = &self.client
-            && let Err(lost) = client.try_send(ToClient::Text(text))
-        {
-            log::debug!("{}: does not listen: {lost}", self.name());
+        if let Some(client) = &self.client {
+            client.try_send(ToClient::Text(text)).ok();
         }
     }
 
@@ -129,19 +148,34 @@ impl Session {
         let State::Launched(WebotsHandle(webots)) = &self.state else {
             return self.text(protocol::nothing_to_reset());
         };
-        if self.resetting.is_some() {
+        if self.is_resetting {
             return log::info!("{}: a controller is being reset already", self.name());
         }
+        self.is_resetting = true;
         let restored = webots.send(ResetController(file.clone())).into_actor(self);
-        self.resetting = Some(ctx.spawn(restored.map(move |answer, this, _| {
-            this.resetting = None;
-            match answer {
-                Ok(Ok(())) => this.text(protocol::reset_controller(&file)),
-                // This error does not end the simulation.
-                Ok(Err(error)) => this.text(protocol::error(&error.to_string())),
-                Err(error) => log::warn!("{}: no controller was reset: {error}", this.name()),
+        restored
+            .map(move |answer, this, _| {
+                this.is_resetting = false;
+                match answer {
+                    Ok(Ok(())) => this.text(protocol::reset_controller(&file)),
+                    // This error does not end the simulation.
+                    Ok(Err(error)) => this.text(protocol::error(&error.to_string())),
+                    // Webots has ended, which its client hears.
+                    Err(_) => {}
+                }
+            })
+            .spawn(ctx);
+    }
+
+    /// Reports how the simulation ends, before the state is dropped. Webots' own report takes precedence.
+    pub(super) fn end(&self, reason: EndReason, why: &str) {
+        match &self.state {
+            State::Waiting { lease, .. } | State::CheckingOut(Slot { lease, .. }) => {
+                lease.end(reason, why, Taken::default());
             }
-        })));
+            State::Launched(WebotsHandle(webots)) => webots.do_send(Stop(reason)),
+            State::Over => {}
+        }
     }
 
     fn exited(&mut self, WebotsExit { clean, own, why }: &WebotsExit, ctx: &mut Context<Self>) {
@@ -160,26 +194,11 @@ impl Actor for Session {
         closing(self.server.phase.subscribe())
             .into_actor(self)
             .map(|(), this, ctx| {
-                this.state.end(EndReason::Stopped, "The server was stopped");
-                this.token = None;
+                this.end(EndReason::Stopped, "The server was stopped");
                 this.finish(protocol::stopping(), "", CloseCode::Away, ctx);
+                ctx.stop();
             })
             .spawn(ctx);
-    }
-
-    fn stopped(&mut self, _: &mut Self::Context) {
-        log::info!("{}: gone", self.name());
-    }
-}
-
-impl Drop for Session {
-    /// A client that is still attached has lost its simulation, because the session has panicked.
-    fn drop(&mut self) {
-        if let Some(client) = self.client.take() {
-            let why = "The simulation was lost by a fault of this server";
-            self.state.end(EndReason::Fault, why);
-            client.do_send(ToClient::End(protocol::error(why), CloseCode::Error));
-        }
     }
 }
 
@@ -192,10 +211,7 @@ impl StreamHandler<ClientAction> for Session {
                     webots.do_send(Keep);
                 }
             }
-            ClientAction::Leave => {
-                self.client = None;
-                ctx.stop();
-            }
+            ClientAction::Leave => ctx.stop(),
             ClientAction::Disconnect => {
                 self.client = None;
                 self.await_client(ctx);
@@ -210,32 +226,21 @@ impl Handler<SlotEvent> for Session {
     type Result = ();
 
     fn handle(&mut self, event: SlotEvent, ctx: &mut Self::Context) {
-        match (event, std::mem::replace(&mut self.state, State::Over)) {
-            (SlotEvent::Granted(port), State::Waiting { world, lease }) => {
-                self.check_out(world, Slot { lease, port }, ctx);
-            }
-            (SlotEvent::Queued(ahead), state @ State::Waiting { .. }) => {
-                self.state = state;
-                for text in protocol::queue(ahead) {
-                    self.text(text);
+        match event {
+            SlotEvent::Granted(port) => {
+                if let State::Waiting { world, lease } = std::mem::replace(&mut self.state, State::Over) {
+                    self.check_out(world, Slot { lease, port }, ctx);
                 }
             }
-            (SlotEvent::Watched(is_watched), state) => {
-                (self.state, self.is_watched) = (state, is_watched);
+            SlotEvent::Queued(ahead) => protocol::queue(ahead).into_iter().for_each(|text| self.text(text)),
+            SlotEvent::Watched(is_watched) => {
+                self.is_watched = is_watched;
                 self.text(protocol::watched(is_watched));
             }
-            (SlotEvent::AwayTooLong, state @ State::Launched(_)) if self.client.is_none() => {
-                let why = "Too many simulations waited for their clients, and this one had waited longest";
-                log::info!("{}: {why}", self.name());
-                state.end(EndReason::Left, why);
-                self.finish(protocol::error(why), why, CloseCode::Normal, ctx);
-            }
-            (SlotEvent::Stopped(_), State::Over) => {}
-            (SlotEvent::Stopped(why), state) => {
-                state.end(EndReason::Administrator, "The administrator has stopped it");
+            SlotEvent::Stopped(why) => {
+                self.end(EndReason::Administrator, "The administrator has stopped it");
                 self.finish(protocol::error(&why), &why, CloseCode::Normal, ctx);
             }
-            (_, state) => self.state = state,
         }
     }
 }

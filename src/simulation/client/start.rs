@@ -6,8 +6,7 @@ use std::time::Instant;
 use actix::prelude::*;
 use actix_web_actors::ws::CloseCode;
 
-use super::session::Session;
-use super::state::{State, WebotsHandle};
+use super::session::{Session, State, WebotsHandle};
 use crate::shared::domain::ProjectUrl;
 use crate::simulation::checkout::Project;
 use crate::simulation::client_identity::ClientIdentity;
@@ -40,7 +39,7 @@ impl Session {
     /// The same for a start that fails for a reason of this server's own, which is reported to session servers.
     pub(super) fn fail_own(&mut self, why: &str, ctx: &mut Context<Self>) {
         self.server.failed_starts.add(&format!("{}: {why}", self.name()));
-        self.state.end(EndReason::Fault, why);
+        self.end(EndReason::Fault, why);
         self.refer(why, ctx);
     }
 
@@ -87,7 +86,7 @@ impl Session {
                 Ok(Err(error)) if error.is_own() => this.fail_own(&error.to_string(), ctx),
                 Ok(Err(error)) => {
                     let why = error.to_string();
-                    this.state.end(EndReason::NoCheckout, &why);
+                    this.end(EndReason::NoCheckout, &why);
                     this.give_up(&why, ctx);
                 }
                 Err(error) => this.fail_own(&format!("The checkout broke off: {error}"), ctx),

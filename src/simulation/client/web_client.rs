@@ -14,7 +14,7 @@ use super::session::Session;
 use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::websocket::wrong_message;
 use crate::shared::http::{ConnectionPermit, Peer};
-use crate::shared::run::{Phase, closing};
+use crate::shared::run::closing;
 use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::protocol::{self, ClientRequest};
 use crate::simulation::sessions::{ClientAction, Connection, Resume, ToClient, Token};
@@ -49,6 +49,13 @@ impl WebClient {
         ctx.stop();
     }
 
+    /// Ends the connection and its simulation for what the client has sent.
+    fn reject(&self, problem: &str, code: CloseCode, ctx: &mut Context) {
+        log::info!("client {}: {problem}", self.peer);
+        self.send(ClientAction::Leave);
+        Self::finish(protocol::error(problem), code, ctx);
+    }
+
     /// Has the client's session do this, if there is one.
     fn send(&self, action: ClientAction) {
         if let Some(session) = &self.session {
@@ -58,43 +65,30 @@ impl WebClient {
     }
 
     /// The connection, for a session that this client requests.
-    fn attach(&mut self, ctx: &Context) -> Connection {
+    fn attach(&mut self, ctx: &mut Context) -> Connection {
         let (session, actions) = unbounded_channel();
+        let attached = session.clone();
+        // A session has sent the last text before it drops the other end, unless it has panicked, or ended just now.
+        let gone = async move { attached.closed().await };
+        gone.into_actor(self).map(|(), _, ctx| Self::finish(protocol::ended(None), CloseCode::Normal, ctx)).spawn(ctx);
         self.session = Some(session);
         Connection { peer: self.peer, client: ctx.address().recipient(), actions }
     }
 
     /// Requests from the session of a token to continue with this connection.
     fn resume(&mut self, token: &str, ctx: &mut Context) {
-        let found = Token::parse(token).and_then(|token| Some((token, self.server.sessions.find(&token)?)));
+        let found = Token::parse(token).and_then(|token| Some((token, self.server.sessions.find(token)?)));
         let Some((token, session)) = found else {
             log::info!("client {}: comes back to a simulation that has ended", self.peer);
             return Self::finish(protocol::ended(None), CloseCode::Normal, ctx);
         };
-        let resumed = session.send(Resume { token, connection: self.attach(ctx) });
-        resumed
-            .into_actor(self)
-            .map(|answer, this, ctx| {
-                let Err(refusal) = answer.unwrap_or_else(|_| Err(protocol::ended(None))) else { return };
-                // Its session may have ended because the server stops.
-                let (refusal, code) = match *this.server.phase.borrow() {
-                    Phase::Closing => (protocol::stopping(), CloseCode::Away),
-                    _ => (refusal, CloseCode::Normal),
-                };
-                log::info!("client {}: does not come back: {refusal}", this.peer);
-                Self::finish(refusal, code, ctx);
-            })
-            .spawn(ctx);
+        session.do_send(Resume { token, connection: self.attach(ctx) });
     }
 
     fn handle_request(&mut self, text: &str, ctx: &mut Context) {
         let request = match ClientRequest::parse(text) {
             Ok(request) => request,
-            Err(wrong) => {
-                log::info!("client {}: {wrong}", self.peer);
-                self.send(ClientAction::Leave);
-                return Self::finish(protocol::error(&wrong.to_string()), CloseCode::Normal, ctx);
-            }
+            Err(wrong) => return self.reject(&wrong.to_string(), CloseCode::Normal, ctx),
         };
         match (request, &self.session) {
             (ClientRequest { reset_controller: Some(file), .. }, Some(_)) => {
@@ -154,15 +148,11 @@ impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
                 ctx.stop();
             }
             Ok(Message::Text(_) | Message::Ping(_)) => {
-                log::warn!("client {}: asks too much between two pings", self.peer);
-                self.send(ClientAction::Leave);
-                Self::finish(protocol::error("Too many requests on one connection"), CloseCode::Policy, ctx);
+                self.reject("Too many requests on one connection", CloseCode::Policy, ctx);
             }
             other => {
                 let (problem, code) = wrong_message(other);
-                log::info!("client {}: {problem}", self.peer);
-                self.send(ClientAction::Leave);
-                Self::finish(protocol::error(&problem), code, ctx);
+                self.reject(&problem, code, ctx);
             }
         }
     }

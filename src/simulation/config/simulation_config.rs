@@ -99,11 +99,11 @@ pub struct SimulationConfig {
     /// because a class sits behind one address.
     #[serde(deserialize_with = "optional_whole::<1, 1_000_000, _, _>")]
     pub max_clients_per_address: Option<usize> = None,
-    /// Limit of slots per client address; the same share of the queue applies. Default: all, because a class sits
+    /// Limit of slots per client address; as many of its clients may wait. Default: all, because a class sits
     /// behind one address.
     #[serde(deserialize_with = "optional_whole::<1, 10_000, _, _>")]
     pub max_places_per_address: Option<usize> = None,
-    /// Limit of slots per user (`userHeader`); the same share of the queue applies. Default: all.
+    /// Limit of slots per user (`userHeader`); as many of its clients may wait. Default: all.
     #[serde(deserialize_with = "optional_whole::<1, 10_000, _, _>")]
     pub max_places_per_user: Option<usize> = None,
     /// The header in which a reverse proxy of `trustedProxies` sends the user's name, such as `X-Forwarded-User`.

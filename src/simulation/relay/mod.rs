@@ -1,15 +1,13 @@
 //! Relays a simulation's stream between a client and the port of its Webots on this machine: its WebSocket and the files
 //! that Webots serves.
 
-mod file;
 mod path;
 mod stream;
 mod stream_thread;
 mod upstream;
-mod view_requests;
+mod watcher;
 mod websocket;
 
-pub use file::fetch;
 pub use path::parse_path;
 pub use stream_thread::StreamThread;
 pub use upstream::Upstream;

@@ -18,14 +18,11 @@ pub fn parse_path(path: &str) -> Option<(Token, &str)> {
     }
 }
 
-/// Whether a segment of a path names a file or folder, even if it is decoded twice.
+/// Whether a segment of a path names a file or folder, even if it is decoded twice: no name has a percent sign.
 fn is_safe_segment(part: &str) -> bool {
-    let Ok(once) = percent_decode_str(part).decode_utf8() else { return false };
-    let Ok(twice) = percent_decode_str(&once).decode_utf8() else { return false };
-    [once.as_ref(), twice.as_ref()].into_iter().all(|name| {
-        let is_plain = !name.chars().any(|letter| letter.is_control() || letter == '/' || letter == '\\');
-        is_plain && !matches!(name, "" | "." | "..")
-    })
+    let Ok(name) = percent_decode_str(part).decode_utf8() else { return false };
+    let is_plain = !name.contains(|letter: char| letter.is_control() || matches!(letter, '/' | '\\' | '%'));
+    is_plain && !matches!(name.as_ref(), "" | "." | "..")
 }
 
 #[cfg(test)]
@@ -34,14 +31,14 @@ mod tests {
 
     #[test]
     fn only_what_is_below_the_token_is_passed_on() {
-        let token = Token::new(7);
+        let token = Token::random();
         let path = |rest: &str| format!("/stream/{}{rest}", token.reveal());
         for (rest, passed) in [
             ("", Some("/")),
             ("/", Some("/")),
             ("/worlds/textures/a.png", Some("/worlds/textures/a.png")),
             ("/~WEBOTS_HOME/a%20b.js", Some("/~WEBOTS_HOME/a%20b.js")),
-            ("/100%25.png", Some("/100%25.png")),
+            ("/100%25.png", None),
             ("/a/../b", None),
             ("/..", None),
             ("/./a", None),

@@ -1,84 +1,88 @@
-//! How this server itself reaches a simulation: an HTTP client, one for each worker, and WebSockets.
+//! Simulations, as this server itself reaches them, and the files that they serve.
 
-use std::io;
 use std::net::{IpAddr, SocketAddr};
+use std::sync::Arc;
 use std::time::Duration;
 
-use actix_http::body::BodySize;
-use actix_http::h1::ClientCodec;
-use actix_http::ws::hash_key;
-use actix_http::{ConnectionType, RequestHead, RequestHeadType};
-use actix_rt::net::TcpStream;
-use actix_web::http::header::{self, HeaderValue};
-use actix_web::http::{StatusCode, Uri};
-use actix_web::web::Bytes;
-use base64::Engine;
-use base64::prelude::BASE64_STANDARD;
-use futures_util::{SinkExt, StreamExt};
-use nix::sys::socket::{setsockopt, sockopt};
-use tokio_util::codec::Framed;
+use actix_rt::time::timeout;
+use actix_web::http::StatusCode;
+use actix_web::http::header::{self, HeaderName};
+use actix_web::{HttpRequest, HttpResponse};
+use futures_util::StreamExt;
 
 use super::stream_thread::StreamThread;
 
 /// Timeout of a simulation's answer.
-pub const ANSWER_TIMEOUT: Duration = Duration::from_secs(10);
+pub(super) const ANSWER_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// Reaches simulations on this machine.
-#[derive(Clone)]
+/// Headers of Webots' answer that its client gets.
+const FORWARDED_HEADERS: [HeaderName; 4] =
+    [header::CONTENT_TYPE, header::ETAG, header::CACHE_CONTROL, header::LAST_MODIFIED];
+
+/// Reaches simulations on this machine; one for each worker.
 pub struct Upstream {
-    /// Fetches what it serves.
-    pub(super) client: awc::Client,
+    client: awc::Client,
     address: IpAddr,
     /// Copies all streams.
-    pub(super) stream_thread: StreamThread,
-    silence: Duration,
+    pub(super) stream_thread: Arc<StreamThread>,
+    /// How long a simulation may leave unread what was sent to it: until then nobody notices that its client has left.
+    pub(super) silence: Duration,
+}
+
+/// The answer to a client whose simulation answers nothing that makes sense in time.
+pub(super) fn no_answer() -> HttpResponse {
+    HttpResponse::BadGateway().body("Error: the simulation does not answer.")
 }
 
 impl Upstream {
     /// Reaches them at this address. Streams are copied on this thread. A simulation has `silence` to read what was sent to
-    /// it: until then nobody notices that its client has left.
-    pub fn new(address: IpAddr, stream_thread: StreamThread, silence: Duration) -> Self {
+    /// it.
+    pub fn new(address: IpAddr, stream_thread: Arc<StreamThread>, silence: Duration) -> Self {
         let connector = awc::Connector::new().limit(0);
         // Redirects are not followed, and an answer may take as long as the simulation.
         let client = awc::Client::builder().connector(connector).disable_timeout().disable_redirects();
         Self { client: client.no_default_headers().finish(), address, stream_thread, silence }
     }
 
-    /// The URL of a path and a query at the port of a simulation.
-    pub fn url(&self, port: u16, path: &str, query: Option<&str>) -> String {
-        let (mark, query) = query.map_or(("", ""), |query| ("?", query));
-        format!("http://{}{path}{mark}{query}", SocketAddr::from((self.address, port)))
+    /// The address of the simulation with this port.
+    pub(super) fn simulation(&self, port: u16) -> SocketAddr {
+        SocketAddr::from((self.address, port))
     }
 
-    /// Opens the WebSocket at this URL of a simulation, as awc does, which does not give its TCP connection away. Returns
-    /// the connection, and what was read of it after the handshake.
-    pub async fn open_websocket(&self, url: &str) -> io::Result<(TcpStream, Bytes)> {
-        let invalid = |problem: &str| io::Error::new(io::ErrorKind::InvalidData, problem.to_owned());
-        let uri: Uri = url.parse().map_err(io::Error::other)?;
-        let authority = uri.authority().ok_or_else(|| invalid("no address"))?.as_str().to_owned();
-        let tcp = TcpStream::connect(&authority).await?;
-        // Messages are small, and must not wait until the one before is acknowledged.
-        tcp.set_nodelay(true)?;
-        // What Webots sends is acknowledged at once, though fewer acknowledgements (TCP_QUICKACK) would cost less. Qt leaves Nagle's
-        // algorithm on for what a server accepts: a small message of Webots would wait up to 40 ms for the one before.
-        setsockopt(&tcp, sockopt::TcpUserTimeout, &u32::try_from(self.silence.as_millis()).unwrap_or(u32::MAX))?;
-        let key = BASE64_STANDARD.encode(rand::random::<[u8; 16]>());
-        let mut head = RequestHead::default();
-        head.uri = uri;
-        head.set_connection_type(ConnectionType::Upgrade);
-        head.headers.insert(header::UPGRADE, HeaderValue::from_static("websocket"));
-        head.headers.insert(header::SEC_WEBSOCKET_VERSION, HeaderValue::from_static("13"));
-        for (name, value) in [(header::HOST, &authority), (header::SEC_WEBSOCKET_KEY, &key)] {
-            head.headers.insert(name, HeaderValue::from_str(value).map_err(io::Error::other)?);
+    /// Fetches a file of the simulation with this port, or its video, and forwards the answer as fast as the client reads it.
+    /// `held` is dropped with the answer.
+    pub async fn fetch(&self, port: u16, file: &str, request: &HttpRequest, held: impl std::any::Any) -> HttpResponse {
+        // A connection that is kept could lead to another simulation on the same port later.
+        // Webots compares the names of headers letter by letter (WbTcpServer.cpp of R2025a).
+        let url = format!("http://{}{file}", self.simulation(port));
+        let mut query = self.client.get(url).no_decompress().force_close().camel_case();
+        if let Some(tag) = request.headers().get(header::IF_NONE_MATCH) {
+            query = query.insert_header((header::IF_NONE_MATCH, tag));
         }
-        let mut framed = Framed::new(tcp, ClientCodec::default());
-        framed.send((RequestHeadType::Owned(head), BodySize::None).into()).await?;
-        let answer = framed.next().await.ok_or(io::ErrorKind::UnexpectedEof)?.map_err(io::Error::other)?;
-        let accept = answer.headers.get(header::SEC_WEBSOCKET_ACCEPT).map(HeaderValue::as_bytes);
-        if answer.status != StatusCode::SWITCHING_PROTOCOLS || accept != Some(&hash_key(key.as_bytes())[..]) {
-            return Err(invalid("the handshake has failed"));
+        let answer = match timeout(ANSWER_TIMEOUT, query.send()).await {
+            Ok(Ok(answer)) if !answer.status().is_informational() => answer,
+            _ => return no_answer(),
+        };
+        let mut response = HttpResponse::build(answer.status());
+        for name in FORWARDED_HEADERS {
+            if let Some(value) = answer.headers().get(&name) {
+                response.insert_header((name, value));
+            }
         }
-        let parts = framed.into_parts();
-        Ok((parts.io, parts.read_buf.freeze()))
+        // The content is made by worlds: it gets an origin of its own, so that it can't act as a page of this server, and no
+        // referrer, because its URL has the token.
+        response.insert_header((header::CONTENT_SECURITY_POLICY, "sandbox allow-scripts"));
+        response.insert_header((header::REFERRER_POLICY, "no-referrer"));
+        if matches!(answer.status(), StatusCode::NO_CONTENT | StatusCode::NOT_MODIFIED) {
+            return response.finish();
+        }
+        let length = answer.headers().get(header::CONTENT_LENGTH).and_then(|length| length.to_str().ok()?.parse().ok());
+        if let Some(length) = length {
+            response.no_chunking(length);
+        }
+        response.streaming(answer.map(move |part| {
+            let _ = &held;
+            part
+        }))
     }
 }

@@ -1,18 +1,30 @@
 //! The WebSocket of a stream: its handshake with both ends.
 
+use std::io::{self, ErrorKind};
+
+use actix_http::ws::hash_key;
+use actix_rt::net::TcpStream;
 use actix_rt::time::timeout;
+use actix_web::http::header;
+use actix_web::web::{Bytes, BytesMut};
 use actix_web::{HttpRequest, HttpResponse};
 use actix_web_actors::ws;
+use nix::sys::socket::{setsockopt, sockopt};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
 
-use super::stream::Stream;
-use super::upstream::{ANSWER_TIMEOUT, Upstream};
+use super::stream::{Direction, Stream};
+use super::upstream::{ANSWER_TIMEOUT, Upstream, no_answer};
+use super::watcher;
 use crate::shared::http::{upgrade, websocket};
 
-/// Connects a client with the WebSocket at this URL, or answers why that can't be. A client that is `read_only` can only
-/// request a kind of stream. `held` is dropped with the connection.
+/// Size limit of the head of a simulation's answer, in bytes.
+const MAX_HEAD: usize = 8 * 1024;
+
+/// Connects a client with the WebSocket at this path of the simulation with this port, or answers why that can't be. A client
+/// that is `read_only` can only request a kind of stream. `held` is dropped with the connection.
 pub async fn connect(
     upstream: &Upstream,
-    url: &str,
+    (port, path): (u16, &str),
     request: &HttpRequest,
     read_only: bool,
     held: impl Send + 'static,
@@ -21,24 +33,57 @@ pub async fn connect(
         Ok(response) => response,
         Err(error) => return websocket::refuse(&error),
     };
-    let (webots, from_webots) = match timeout(ANSWER_TIMEOUT, upstream.open_websocket(url)).await {
-        Ok(Ok(opened)) => opened,
-        Ok(Err(_)) => return HttpResponse::BadGateway().body("Error: the simulation does not answer."),
-        Err(_) => return HttpResponse::GatewayTimeout().body("Error: the simulation does not answer."),
-    };
+    let opened = timeout(ANSWER_TIMEOUT, open(upstream, port, path, request)).await;
+    let Ok(Ok((webots, from_webots))) = opened else { return no_answer() };
     let upgraded = upgrade(request);
     let stream_thread = upstream.stream_thread.clone();
     actix_rt::spawn(async move {
         // An error: the client has left before the answer.
         let Ok(client) = upgraded.await else { return };
-        let (Ok(to_client), Ok(to_webots)) = (client.tcp.into_std(), webots.into_std()) else { return };
-        let client_end = (to_client, client.read_buffer);
-        let stream = Stream::new(client_end, (to_webots, from_webots), read_only, Box::new((held, client.permit)));
-        // An error: what the client has sent with its request ends the stream.
-        let Ok(stream) = stream else { return };
-        if let Err(error) = stream_thread.add(stream) {
+        let (to_client, from_client) = (client.tcp, client.read_buffer);
+        let held = (held, client.permit);
+        if read_only {
+            // An error: one of them has left.
+            watcher::relay((to_client, from_client), (webots, from_webots)).await.ok();
+            return drop(held);
+        }
+        let (Ok(to_client), Ok(to_webots)) = (to_client.into_std(), webots.into_std()) else { return };
+        let (up, down) = (Direction::new(to_client, from_client.into()), Direction::new(to_webots, from_webots));
+        if let Err(error) = stream_thread.add(Stream::new(up, down, Box::new(held))) {
             log::warn!("a stream is not relayed: {error}");
         }
     });
     response.finish()
+}
+
+/// Opens the WebSocket of a simulation with the key of its client's request. Returns the connection, and what was read of it
+/// after the handshake.
+async fn open(upstream: &Upstream, port: u16, path: &str, request: &HttpRequest) -> io::Result<(TcpStream, Bytes)> {
+    let key = request.headers().get(header::SEC_WEBSOCKET_KEY).and_then(|key| key.to_str().ok());
+    let (address, key) = (upstream.simulation(port), key.ok_or(ErrorKind::InvalidInput)?);
+    let mut tcp = TcpStream::connect(address).await?;
+    // Messages are small, and must not wait until the one before is acknowledged.
+    tcp.set_nodelay(true)?;
+    // What Webots sends is acknowledged at once, though fewer acknowledgements (TCP_QUICKACK) would cost less. Qt leaves Nagle's
+    // algorithm on for what a server accepts: a small message of Webots would wait up to 40 ms for the one before.
+    setsockopt(&tcp, sockopt::TcpUserTimeout, &u32::try_from(upstream.silence.as_millis()).unwrap_or(u32::MAX))?;
+    let head = format!(
+        "GET {path} HTTP/1.1\r\nHost: {address}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
+         Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: {key}\r\n\r\n"
+    );
+    tcp.write_all(head.as_bytes()).await?;
+    let mut answer = BytesMut::with_capacity(MAX_HEAD);
+    let head = loop {
+        if tcp.read_buf(&mut answer).await? == 0 || answer.len() > MAX_HEAD {
+            return Err(ErrorKind::InvalidData.into());
+        }
+        if let Some(end) = answer.windows(4).position(|four| four == b"\r\n\r\n") {
+            break answer.split_to(end + 4);
+        }
+    };
+    let accept = hash_key(key.as_bytes());
+    if !head.starts_with(b"HTTP/1.1 101 ") || !head.windows(accept.len()).any(|part| part == accept) {
+        return Err(ErrorKind::InvalidData.into());
+    }
+    Ok((tcp, answer.freeze()))
 }

@@ -1,17 +1,51 @@
-//! The sessions that their clients can resume.
+//! The sessions that their clients can resume, and the messages between a connection and its session.
 
 use std::collections::HashMap;
 
 use actix::prelude::*;
+use actix_web_actors::ws::CloseCode;
 use parking_lot::Mutex;
+use tokio::sync::mpsc::UnboundedReceiver;
 
-use super::attachment::Connection;
 use super::token::Token;
+use crate::shared::http::Peer;
 
-/// Asks a session to continue with another connection, which is then attached to it. The answer is the reason of a
-/// refusal, as text for the client.
+/// A connection of a client, for the session that it is attached to.
+pub struct Connection {
+    /// The client's current address.
+    pub peer: Peer,
+    /// Receives what is for the client.
+    pub client: Recipient<ToClient>,
+    /// What the client does. Its end is the end of the connection: the client may come back. A session that drops it has
+    /// ended, or has sent the client the last text.
+    pub actions: UnboundedReceiver<ClientAction>,
+}
+
+/// Messages from a session to its client.
 #[derive(Message)]
-#[rtype(result = "Result<(), String>")]
+#[rtype(result = "()")]
+pub enum ToClient {
+    /// A text of the protocol.
+    Text(String),
+    /// The last text of the protocol, and the code with which the connection then closes.
+    End(String, CloseCode),
+}
+
+/// An action of a client.
+pub enum ClientAction {
+    /// Restore this file below `controllers/`.
+    ResetController(String),
+    /// Keep its simulation, which is paused.
+    Keep,
+    /// End its simulation.
+    Leave,
+    /// End its connection; it may come back.
+    Disconnect,
+}
+
+/// Asks a session to continue with another connection. The session then sends all to it, also the reason of a refusal.
+#[derive(Message)]
+#[rtype(result = "()")]
 pub struct Resume {
     /// The token that proves that the session belongs to the client.
     pub token: Token,
@@ -19,23 +53,22 @@ pub struct Resume {
     pub connection: Connection,
 }
 
-/// The registered sessions, by number.
+/// The registered sessions, by the number of their tokens.
 #[derive(Default)]
 pub struct Sessions(Mutex<HashMap<u64, Recipient<Resume>>>);
 
 impl Sessions {
-    /// Registers a session until it ends. Returns the number for its tokens: random, so that it differs from those of
-    /// earlier runs of the server.
-    pub fn register(&self, session: Recipient<Resume>) -> u64 {
-        let number = rand::random();
+    /// Registers a session until it ends. Returns its first token.
+    pub fn register(&self, session: Recipient<Resume>) -> Token {
+        let token = Token::random();
         let mut sessions = self.0.lock();
         sessions.retain(|_, session| session.connected());
-        sessions.insert(number, session);
-        number
+        sessions.insert(token.number, session);
+        token
     }
 
-    /// The session that a token names, if it has not ended.
-    pub fn find(&self, token: &Token) -> Option<Recipient<Resume>> {
-        self.0.lock().get(&token.number()).cloned().filter(Recipient::connected)
+    /// The session of a token, if it has not ended.
+    pub fn find(&self, token: Token) -> Option<Recipient<Resume>> {
+        self.0.lock().get(&token.number).cloned().filter(Recipient::connected)
     }
 }

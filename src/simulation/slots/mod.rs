@@ -1,14 +1,11 @@
 //! The slots that clients wait for: leases, the queue, and the limit per address; the streams of simulations that have one.
 
-mod access;
-mod party;
 mod present;
-mod slot_event;
 mod slot_lease;
 mod slot_pool;
 mod stream;
 
-pub use slot_event::SlotEvent;
+pub use present::SlotEvent;
 pub use slot_lease::{Slot, SlotLease};
 pub use slot_pool::SlotPool;
 pub use stream::StreamTarget;

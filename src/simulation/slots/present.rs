@@ -1,17 +1,15 @@
-//! A simulation that has a slot or waits for one, and its record.
+//! A simulation that has a slot or waits for one: its record, and the events for its session.
 
 use std::net::IpAddr;
 use std::time::SystemTime;
 
-use actix::Recipient;
+use actix::{Message, Recipient};
 
-use super::access::Access;
-use super::party::Party;
-use super::slot_event::SlotEvent;
 use crate::shared::http::Peer;
 use crate::shared::run::{seconds_since_1970, timestamp};
 use crate::shared::text::{excerpt, without_paths};
 use crate::simulation::ends::{End, EndReason, Ended, Taken};
+use crate::simulation::sessions::Token;
 use crate::simulation::snapshot::{Simulation, Stage};
 
 /// A simulation of this server.
@@ -24,11 +22,59 @@ pub(super) struct Present {
     pub shown: Simulation,
     /// Its client, which counts for its address.
     pub client: Peer,
+    /// Those that its client belongs to, and how many slots each may have, unless it may have all.
+    pub parties: Vec<(Party, usize)>,
     /// The tokens that lead to its stream, while there is one.
-    pub accesses: Vec<Access>,
+    pub accesses: Vec<(Token, Holder)>,
     /// How it ends. Only the first report counts.
     pub how: Option<End>,
     events: Vec<String>,
+}
+
+/// An event of a lease.
+#[derive(Message)]
+#[rtype(result = "()")]
+pub enum SlotEvent {
+    /// This many clients are ahead in the queue.
+    Queued(usize),
+    /// This port may be used until the lease is dropped.
+    Granted(u16),
+    /// The first watcher of the simulation connects, or the last one leaves.
+    Watched(bool),
+    /// The administrator stops the simulation; the words are for its client.
+    Stopped(String),
+}
+
+/// Who has a token that leads to the stream of a simulation.
+#[derive(Clone, Copy, PartialEq)]
+pub(super) enum Holder {
+    /// The client of the simulation.
+    Client,
+    /// Somebody who may watch once.
+    Invited,
+    /// Somebody who watches. The token is valid as long as that connection.
+    Watcher,
+}
+
+/// Clients that share slots: those of one address, and those of one user, whose name a trusted reverse proxy sends.
+#[derive(PartialEq, Eq, Hash)]
+pub(super) enum Party {
+    Address(IpAddr),
+    User(String),
+}
+
+impl Party {
+    /// Why it gets no other slot, as text for the client: it has so many, and so many of its clients wait.
+    pub(super) fn refusal(&self, slots: usize, waiting: usize) -> String {
+        let have = match self {
+            Self::Address(_) => "Clients of your address have",
+            Self::User(_) => "You have",
+        };
+        format!(
+            "{have} {slots} places of this simulation server, and {waiting} more are waiting. The rest is kept for \
+             others. Try again later"
+        )
+    }
 }
 
 /// Number of events that are kept of a simulation.
@@ -40,21 +86,18 @@ impl Present {
     /// A simulation that a client has just asked for.
     pub(super) fn new(shown: Simulation, client: Peer, listener: Recipient<SlotEvent>) -> Self {
         let event = format!("its client asks for {}", shown.world);
-        let mut present =
-            Self { sent_position: None, listener, shown, client, accesses: Vec::new(), how: None, events: Vec::new() };
+        let mut present = Self {
+            sent_position: None,
+            listener,
+            shown,
+            client,
+            parties: Vec::new(),
+            accesses: Vec::new(),
+            how: None,
+            events: Vec::new(),
+        };
         present.note(&event);
         present
-    }
-
-    /// The address for which it counts, if it is known.
-    pub(super) fn address(&self) -> Option<IpAddr> {
-        self.client.rate_limit_key()
-    }
-
-    /// The parties that its client belongs to.
-    pub(super) fn parties(&self) -> Vec<Party> {
-        let user = self.shown.identity.user.clone().map(Party::User);
-        self.address().map(Party::Address).into_iter().chain(user).collect()
     }
 
     /// Lends it a port.

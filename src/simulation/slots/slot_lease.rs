@@ -4,13 +4,13 @@ use std::sync::Arc;
 
 use actix::Recipient;
 
-use super::present::Present;
-use super::slot_event::SlotEvent;
+use super::present::{Holder, Present, SlotEvent};
 use super::slot_pool::SlotPool;
 use crate::shared::domain::ProjectUrl;
 use crate::shared::http::Peer;
 use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::ends::{End, EndReason, Taken};
+use crate::simulation::sessions::Token;
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::snapshot::Simulation;
 
@@ -50,10 +50,6 @@ impl SlotLease {
         self.id
     }
 
-    pub(super) fn change(&self, change: impl FnOnce(&mut Present)) {
-        self.slots.change(self.id, change);
-    }
-
     /// Changes what pages show of the simulation.
     pub fn update(&self, change: impl FnOnce(&mut Simulation)) {
         self.slots.update(self.id, change);
@@ -62,16 +58,23 @@ impl SlotLease {
     /// Logs an event of the simulation under its id, and records what everybody may read of it.
     pub fn log(&self, level: log::Level, event: &str, shown: &str) {
         log::log!(target: "simulation", level, "{}: {event}", self.id);
-        self.change(|present| present.note(shown));
+        self.slots.change(self.id, |present| present.note(shown));
     }
 
     /// Reports how the simulation ends, before the lease is dropped. Only the first report counts. Its tokens
     /// lead nowhere from then on: another simulation may soon have its port.
     pub fn end(&self, reason: EndReason, why: &str, taken: Taken) {
-        self.change(|present| {
+        self.slots.change(self.id, |present| {
             present.accesses.clear();
             present.how.get_or_insert(End { reason, why: why.to_owned(), taken });
         });
+    }
+
+    /// Opens the stream of the simulation, until its end is reported. Returns the token for its client.
+    pub fn open_stream(&self) -> Token {
+        let token = Token::random();
+        self.slots.change(self.id, |present| present.accesses.push((token, Holder::Client)));
+        token
     }
 }
 

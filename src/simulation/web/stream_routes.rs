@@ -20,7 +20,7 @@ async fn stream(request: HttpRequest, server: web::Data<AppState>) -> actix_web:
     let nothing = || ErrorNotFound("Error: there is no such stream.");
     // As the client has written it: what it has encoded stays so.
     let (token, path) = relay::parse_path(request.uri().path()).ok_or_else(nothing)?;
-    let StreamTarget { simulation, port, read_only } = server.slots.stream(&token).ok_or_else(nothing)?;
+    let StreamTarget { simulation, port, read_only } = server.slots.stream(token).ok_or_else(nothing)?;
     if let Some(refusal) = body::refuse(&request) {
         return Ok(refusal);
     }
@@ -34,14 +34,14 @@ async fn stream(request: HttpRequest, server: web::Data<AppState>) -> actix_web:
     let peer = server.config.trusted_proxies.peer(&request);
     let permit = server.connections.admit(ConnectionKind::Stream, peer)?;
     let upstream = request.app_data::<Upstream>().ok_or_else(nothing)?;
-    let url = upstream.url(port, path, request.uri().query());
+    let path = request.uri().query().map_or(path.to_owned(), |query| format!("{path}?{query}"));
     if !is_websocket {
-        return Ok(relay::fetch(upstream, &url, &request, permit).await);
+        return Ok(upstream.fetch(port, &path, &request, permit).await);
     }
     if !read_only {
-        return Ok(relay::connect(upstream, &url, &request, false, permit).await);
+        return Ok(relay::connect(upstream, (port, &path), &request, false, permit).await);
     }
     let guard = server.slots.start_watching(simulation, token).ok_or_else(nothing)?;
     log::info!("{simulation}: client {peer} watches");
-    Ok(relay::connect(upstream, &url, &request, true, (permit, guard)).await)
+    Ok(relay::connect(upstream, (port, &path), &request, true, (permit, guard)).await)
 }
