@@ -77,15 +77,14 @@
 //! | actor or task | ends by itself | after a panic |
 //! |---|---|---|
 //! | Registry, `LoadMonitor` | never | the server logs it and exits with code 1: the service manager restarts it |
-//! | monitor | when its server is removed from the configuration, or no name resolves to that server any more and the server does not answer | its supervisor starts a new one |
-//! | mailer | never | its supervisor starts a new one; unsent notices are lost |
+//! | monitor | when its server is removed from the configuration, or no name resolves to that server any more and the server does not answer | it begins again |
+//! | mailer | never | it begins again; the notices that it held are lost |
 //! | `WebClient` | with its connection | its connection closes, and its session is notified |
 //! | `Session` | with its simulation, or its client | its lease is released, and its client is notified |
 //! | Webots | with its process tree; it is never restarted, its client is notified | its process tree is killed at once, its directory removed, its slot released |
 //!
 //! The `SlotPool` is no actor: a mutex guards it. A panic while that mutex is locked also ends the server with exit code 1.
-//! The registry runs the supervisors ([`shared::run::Supervisor`], one for each kind). More than five panics of a kind
-//! within a minute end the server with exit code 1, too.
+//! Tasks begin again by [`shared::run::permanent::restarted`].
 //!
 //! # Facts about actix 0.13 that this relies on
 //!

@@ -49,7 +49,7 @@ async fn without_one_of_the_three_keys_mails_are_off() {
             "mailServer" => config.mail_server = None,
             _ => config.mail_sender = None,
         }
-        assert!(mail::start(&config).all().next().is_none(), "there is a mailer without {key}");
+        assert!(mail::start(&config).is_empty(), "there is a mailer without {key}");
         let error = test_mail(&config).await.unwrap_err();
         assert_eq!(error, format!("notifications are off: {key} is not set"));
     }

@@ -51,7 +51,7 @@ fn loaded(port: u16, more: &Value) -> SessionConfig {
 
 fn start(port: u16, more: &Value) -> UnboundedSender<Notice> {
     keep_log();
-    mail::start(&loaded(port, more)).all().next().expect("mails are on").clone()
+    mail::start(&loaded(port, more)).pop().expect("mails are on")
 }
 
 async fn test_mail(config: &SessionConfig) -> Result<String, String> {

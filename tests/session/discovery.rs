@@ -168,14 +168,8 @@ async fn names_come_and_go_with_the_configuration() {
     let _servers = stand_ins(&loopback([2, 3]), port);
     names.set("fleet.test", &loopback([2, 3]));
     let session = looking_up(&[], &names).start().await;
-    let any_host = async || {
-        let viewer = http::get(&session.url("/webots-viewer")).await;
-        viewer.header("content-security-policy").unwrap().contains("script-src 'self' http: ")
-    };
-    assert!(!any_host().await);
     session.reload(json!({"simulationServers": [format!("dns+fleet.test:{port}")]}));
     until_states(&session, &["up"; 2]).await;
-    assert!(any_host().await, "a page that is open can't reach servers that come");
     session.reload(json!({"drainedServers": [format!("127.0.0.3:{port}")]}));
     until_states(&session, &["up", "draining"]).await;
     session.reload(json!({"simulationServers": [], "drainedServers": []}));

@@ -6,8 +6,11 @@
 
 use std::collections::hash_map::Entry;
 use std::collections::{BTreeSet, HashMap};
+use std::sync::Arc;
 
 use actix::prelude::*;
+use rustls::ClientConfig;
+use tokio::sync::oneshot;
 
 use super::name_table::NameTable;
 use super::server_monitor::{ProbeResult, ProbeSettings, monitor};
@@ -16,7 +19,7 @@ use crate::session::config::SessionConfig;
 use crate::session::placement::LoadBalancer;
 use crate::shared::domain::PublicAddress;
 use crate::shared::http::tls;
-use crate::shared::run::Supervisor;
+use crate::shared::run::permanent;
 
 /// All servers and names, with the servers' monitors.
 pub struct ServerTable {
@@ -24,33 +27,31 @@ pub struct ServerTable {
     pub names: NameTable,
     /// What is known of placing clients on the servers.
     pub fleet: LoadBalancer<PublicAddress>,
-    /// The tasks that probe the servers.
-    pub monitors: Monitors,
+    /// The tasks that probe the servers: each ends when its sender is dropped.
+    monitors: HashMap<PublicAddress, oneshot::Sender<()>>,
     /// What is known of each server.
     pub records: HashMap<PublicAddress, ServerRecord>,
     /// In the order of the configuration.
     listed: Vec<PublicAddress>,
     settings: ProbeSettings,
+    tls: Option<Arc<ClientConfig>>,
     /// The thread of the monitors, so that requests of clients do not wait for them.
     thread: Arbiter,
     results: Recipient<ProbeResult>,
 }
 
-/// The monitors, by server. They get no messages.
-type Monitors = Supervisor<PublicAddress, ()>;
-
 impl ServerTable {
     /// No servers yet; `results` receives each probe.
     pub fn new(config: &SessionConfig, results: Recipient<ProbeResult>) -> Self {
-        let (settings, thread) = (ProbeSettings::new(config), Arbiter::new());
         Self {
             names: NameTable::default(),
             fleet: LoadBalancer::new(config.policy()),
-            monitors: monitors(&thread, settings, results.clone()),
+            monitors: HashMap::new(),
             records: HashMap::new(),
             listed: Vec::new(),
-            settings,
-            thread,
+            settings: ProbeSettings::new(config),
+            tls: tls::client_config(),
+            thread: Arbiter::new(),
             results,
         }
     }
@@ -59,8 +60,9 @@ impl ServerTable {
     pub fn apply(&mut self, config: &SessionConfig) {
         let settings = ProbeSettings::new(config);
         if std::mem::replace(&mut self.settings, settings) != settings {
-            self.monitors = monitors(&self.thread, settings, self.results.clone());
-            self.records.keys().for_each(|server| self.monitors.add(server.clone()));
+            for server in self.records.keys().cloned().collect::<Vec<_>>() {
+                self.start_monitor(server);
+            }
         }
         self.fleet.set_policy(config.policy());
         self.names.apply(&config.simulation_servers);
@@ -84,13 +86,31 @@ impl ServerTable {
         for server in unlisted.map(|(server, _)| server.clone()).collect::<Vec<_>>() {
             self.forget(&server);
         }
-        for server in &self.listed {
+        let new = self.listed.iter().filter(|server| !self.records.contains_key(*server));
+        for server in new.cloned().collect::<Vec<_>>() {
             if let Entry::Vacant(entry) = self.records.entry(server.clone()) {
+                entry.insert(ServerRecord::new(server.clone(), config.drained_servers.contains(&server)));
                 self.fleet.add(server.clone());
-                self.monitors.add(server.clone());
-                entry.insert(ServerRecord::new(server.clone(), config.drained_servers.contains(server)));
+                self.start_monitor(server);
             }
         }
+    }
+
+    /// Starts the monitor of a server, in place of the one that it has.
+    fn start_monitor(&mut self, server: PublicAddress) {
+        let (sender, stopped) = oneshot::channel();
+        self.monitors.insert(server.clone(), sender);
+        let (settings, tls, results) = (self.settings, self.tls.clone(), self.results.clone());
+        self.thread.spawn_fn(move || {
+            actix_rt::spawn(async move {
+                let name = format!("monitor of server {server}");
+                let probe = async || monitor(server.clone(), settings, tls.clone(), results.clone()).await;
+                tokio::select! {
+                    () = permanent::restarted(&name, probe) => {}
+                    _ = stopped => {}
+                }
+            });
+        });
     }
 
     /// Removes a server and stops its monitor.
@@ -108,20 +128,4 @@ impl ServerTable {
         let unlisted: BTreeSet<_> = unlisted.map(|(server, _)| server).collect();
         self.listed.iter().chain(unlisted).filter_map(|server| self.records.get(server))
     }
-}
-
-/// No monitors yet; they run on this thread.
-fn monitors(thread: &Arbiter, settings: ProbeSettings, results: Recipient<ProbeResult>) -> Monitors {
-    let (thread, tls) = (thread.handle(), tls::client_config());
-    Supervisor::new("monitor of server", move |server: &PublicAddress, mut stopped| {
-        let (server, tls, results) = (server.clone(), tls.clone(), results.clone());
-        thread.spawn_fn(move || {
-            actix_rt::spawn(async move {
-                tokio::select! {
-                    () = monitor(server, settings, tls, results) => {}
-                    _ = stopped.recv() => {}
-                }
-            });
-        });
-    })
 }

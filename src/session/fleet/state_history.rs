@@ -3,18 +3,19 @@
 
 use std::collections::VecDeque;
 
+use tokio::sync::mpsc::UnboundedSender;
+
 use super::fleet_status::NameStatus;
 use super::server_record::{ServerChange, ServerRecord, ServerState, StateChange};
 use crate::session::config::SessionConfig;
 use crate::session::mail::{self, Notice, NoticeKind};
-use crate::shared::run::Supervisor;
 
 /// The last changes, and the mailer that notifies the administrator.
 pub struct StateHistory {
     /// The last changes, the newest first.
     pub recent: VecDeque<StateChange>,
-    /// One for each channel of notices. Unsent notices of one that has panicked are lost.
-    pub mailers: Supervisor<&'static str, Notice>,
+    /// One for each channel of notices.
+    mailers: Vec<UnboundedSender<Notice>>,
 }
 
 /// How many changes are kept.
@@ -59,10 +60,9 @@ impl StateHistory {
     }
 
     fn notify(&self, notice: &Notice) {
-        for mailer in self.mailers.all() {
-            if mailer.send(notice.clone()).is_err() {
-                log::error!("{}: no notice is sent: its mailer has panicked", notice.server);
-            }
+        for mailer in &self.mailers {
+            // Without a receiver the server stops.
+            mailer.send(notice.clone()).ok();
         }
     }
 }

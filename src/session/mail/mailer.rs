@@ -1,39 +1,39 @@
 //! Task: sends notices to the administrator on one channel, by mail or by webhook.
 //!
-//! Started by the registry for each channel that is configured, again if it has panicked. It receives [`Notice`]s.
+//! Started by the registry for each channel that is configured; after a panic it begins again. It receives [`Notice`]s.
 //! [`Outbox`] decides what is sent, and when. One batch is sent at a time; nothing waits for it.
 
 use std::pin::pin;
 use std::time::Instant;
 
-use tokio::sync::mpsc::UnboundedReceiver;
+use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
 use tokio::time::sleep_until;
 
 use super::channel::Channel;
 use super::notice_text::{notice_text, signature, summary};
 use super::outbox::{MailEntry, Notice, Outbox};
 use crate::session::config::SessionConfig;
-use crate::shared::run::Supervisor;
+use crate::shared::run::permanent;
 
-/// Starts a mailer for each channel that is configured.
-pub fn start(config: &SessionConfig) -> Supervisor<&'static str, Notice> {
+/// Starts a mailer for each channel that is configured. Returns where their notices go.
+pub fn start(config: &SessionConfig) -> Vec<UnboundedSender<Notice>> {
     let mail = Channel::mail(config).inspect_err(|why| log::info!("{why}"));
-    let channels: Vec<Channel> = mail.into_iter().chain(Channel::webhook(config)).collect();
-    let names: Vec<&'static str> = channels.iter().map(|channel| channel.name).collect();
     let (signature, outbox) = (signature(config), Outbox::new(&config.timing));
-    let mut mailers = Supervisor::new("mailer of notices by", move |name, notices| {
-        if let Some(channel) = channels.iter().find(|channel| channel.name == *name) {
-            actix_rt::spawn(send_all(channel.clone(), signature.clone(), outbox.clone(), notices));
-        }
-    });
-    for name in names {
-        mailers.add(name);
-    }
-    mailers
+    let start = |channel: Channel| {
+        let (sender, mut notices) = unbounded_channel();
+        let (signature, outbox) = (signature.clone(), outbox.clone());
+        actix_rt::spawn(async move {
+            let name = format!("mailer of notices by {}", channel.name);
+            let send = async || send_all(&channel, &signature, outbox.clone(), &mut notices).await;
+            permanent::restarted(&name, send).await;
+        });
+        sender
+    };
+    mail.into_iter().chain(Channel::webhook(config)).map(start).collect()
 }
 
 /// Sends what comes, until the server ends.
-async fn send_all(channel: Channel, signature: String, mut outbox: Outbox, mut notices: UnboundedReceiver<Notice>) {
+async fn send_all(channel: &Channel, signature: &str, mut outbox: Outbox, notices: &mut UnboundedReceiver<Notice>) {
     loop {
         // A new notice, or the end of the last e-mail, may change when the next one is due.
         let due = outbox.due();
@@ -44,7 +44,7 @@ async fn send_all(channel: Channel, signature: String, mut outbox: Outbox, mut n
             },
             () = sleep_until(due.unwrap_or_else(Instant::now).into()), if due.is_some() => {
                 let batch = outbox.take(Instant::now());
-                let text = notice_text(&batch, &signature);
+                let text = notice_text(&batch, signature);
                 let mut delivery = pin!(channel.deliver(&text));
                 let sent = loop {
                     tokio::select! {
@@ -52,7 +52,7 @@ async fn send_all(channel: Channel, signature: String, mut outbox: Outbox, mut n
                         Some(notice) = notices.recv() => outbox.add(notice, Instant::now()),
                     }
                 };
-                handle_outcome(&channel, &mut outbox, batch, sent);
+                handle_outcome(channel, &mut outbox, batch, sent);
             }
         }
     }

@@ -4,8 +4,8 @@ use actix_web::{HttpRequest, HttpResponse, web};
 
 use crate::session::config::{Announcement, AnnouncementKeys};
 use crate::session::state::AppState;
-use crate::shared::http::routing::{POST, path};
-use crate::shared::http::{body, refuse_action};
+use crate::shared::http::refuse_action;
+use crate::shared::http::routing::{POST, json_body, path};
 
 /// Adds the paths to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
@@ -18,7 +18,7 @@ async fn announcement(request: HttpRequest, payload: web::Payload, server: web::
     if let Some(refusal) = refuse_action(server.admin_auth.as_ref(), &request, peer) {
         return refusal;
     }
-    let order = body::json(&request, payload, "{\"text\": TEXT, \"until\": TIME}").await;
+    let order = json_body(&request, payload, "{\"text\": TEXT, \"until\": TIME}").await;
     let order: AnnouncementKeys = match order {
         Ok(order) => order,
         Err(refusal) => return refusal,

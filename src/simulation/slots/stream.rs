@@ -123,7 +123,8 @@ mod tests {
         let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
         let slots = SlotPool::new(port..=port, 1, None, None, ends);
         let world = ProjectUrl::parse("https://github.com/lab/arm/blob/main/worlds/arm.wbt").unwrap();
-        let (id, client) = (SimulationId::next(), (Peer::Unknown, ClientIdentity::default()));
+        let (id, client) =
+            (SimulationId::next(), (Peer::Proxy(std::net::Ipv4Addr::LOCALHOST.into()), ClientIdentity::default()));
         let lease = SlotLease::acquire(&slots, id, Session.start().recipient(), &world, client).unwrap();
         assert!(slots.watch(id).is_none(), "it has no stream yet");
         let token = lease.open_stream();
