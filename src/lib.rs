@@ -76,14 +76,14 @@
 //! | actor or task | ends by itself | after a panic |
 //! |---|---|---|
 //! | Registry, `LoadMonitor` | never | the server logs it and exits with code 1: the service manager restarts it |
-//! | monitor | when its server is removed from the configuration, or no name resolves to that server any more | its supervisor starts a new one |
-//! | mailer | never | notices are logged as not sent, until the server is restarted |
+//! | monitor | when its server is removed from the configuration, or no name resolves to that server any more | it begins again |
+//! | mailer | never | it begins again; the notices that it held are lost |
 //! | `WebClient` | with its connection | its connection closes, and its session is notified |
 //! | `Session` | with its simulation, or its client | its lease is released, and its client is notified |
 //! | Webots | with its process tree; it is never restarted, its client is notified | its process tree is killed at once, its directory removed, its slot released |
 //!
-//! The `SlotPool` is no actor: a mutex guards it. The registry supervises the monitors ([`shared::run::Supervisor`]). More than
-//! five panics of them within a minute end the server with exit code 1, too.
+//! The `SlotPool` is no actor: a mutex guards it. Tasks begin again by [`shared::run::permanent::restarted`]; after more than
+//! five panics of one within a minute the server exits with code 1.
 //!
 //! # Facts about actix 0.13 that this relies on
 //!

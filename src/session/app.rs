@@ -62,7 +62,7 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     let registry = server.registry.clone();
     actix_rt::spawn(service_manager::feed_watchdog(async move || registry.send(GetStatus).await.is_ok()));
     tokio::select! {
-        () = handle_commands(&mut signals, &file, &server, port) => {}
+        () = handle_commands(&mut signals, &file, &server) => {}
         fault = permanent::stopped("Registry", server.registry.clone()) => return Err(fault.into()),
     }
     log::info!("stopping");
@@ -76,15 +76,11 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
 }
 
 /// Handles signals, until the server must stop.
-async fn handle_commands(signals: &mut Signals, file: &Path, server: &AppState, port: u16) {
+async fn handle_commands(signals: &mut Signals, file: &Path, server: &AppState) {
     loop {
         match signals.next().await {
             ServerCommand::Stop => return,
-            ServerCommand::Reload => {
-                service_manager::reloading();
-                reload(file, server);
-                service_manager::ready(port);
-            }
+            ServerCommand::Reload => reload(file, server),
             ServerCommand::Drain => log::info!("SIGUSR1 changes nothing here: simulation servers are drained"),
         }
     }

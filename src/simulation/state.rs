@@ -13,7 +13,7 @@ use super::sessions::Sessions;
 use super::slots::SlotPool;
 use crate::shared::domain::{AdmissionRules, Load, ProjectUrl};
 use crate::shared::http::{AddressQuota, BasicAuth, ConnectionLimiter, LiveUpdates, Metrics};
-use crate::shared::run::{Phase, service_manager};
+use crate::shared::run::Phase;
 use crate::simulation::checkout::CheckoutService;
 use crate::simulation::container::ContainerService;
 use crate::simulation::isolation::{Launcher, Watcher};
@@ -106,7 +106,6 @@ impl AppState {
         });
         if is_new {
             log::info!("draining: no new clients, the server ends when the last has gone");
-            service_manager::status("draining: it ends when the last simulation has ended");
         }
     }
 

@@ -45,7 +45,8 @@ document.head.appendChild = (node) => {
 };
 
 try {
-  if (!script)
+  // Anybody could send a link with a script to a page that is not embedded.
+  if (window === top || !script)
     throw new Error('no viewer is named');
   await import(script);
   const view = document.createElement('webots-view');

@@ -32,9 +32,8 @@ async fn tells(server: Builder, signals: &[(Signal, &[&str])]) {
 }
 
 #[actix_rt::test]
-async fn a_service_manager_is_told_when_a_server_is_ready_reloads_drains_and_stops() {
-    let reload: (_, &[&str]) = (Signal::SIGHUP, &["RELOADING=1\nMONOTONIC_USEC=", "READY=1\n"]);
-    tells(session_server(&["localhost:1".to_owned()]), &[reload, (Signal::SIGTERM, &["STOPPING=1\n"])]).await;
+async fn a_service_manager_is_told_when_a_server_is_ready_drains_and_stops() {
+    tells(session_server(&["localhost:1".to_owned()]), &[(Signal::SIGTERM, &["STOPPING=1\n"])]).await;
     let drained: (_, &[&str]) = (Signal::SIGUSR1, &["STATUS=draining", "STOPPING=1\nSTATUS=drained"]);
     tells(demo_server(1), &[drained]).await;
     tells(demo_server(1), &[(Signal::SIGTERM, &["STOPPING=1\nSTATUS=stopping"])]).await;

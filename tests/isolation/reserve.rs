@@ -98,7 +98,10 @@ async fn on_a_quiet_machine_simulations_never_use_up_the_reserve_of_the_disk() {
     let folder = open_folder();
     let small = folder.path().join("small");
     if !disk::small_disk(&small, SIZE) {
-        return skip("on_a_quiet_machine_simulations_never_use_up_the_reserve_of_the_disk", "only root may mount a small disk");
+        return skip(
+            "on_a_quiet_machine_simulations_never_use_up_the_reserve_of_the_disk",
+            "only root may mount a small disk",
+        );
     }
     let mut users = vec![("root", "true")];
     users.extend(as_nobody().map(|nobody| ("nobody", nobody)));

@@ -48,8 +48,8 @@ async fn a_certificate_that_is_not_trusted_is_named_with_the_reason() {
     };
     let untrusted = "no connection: its certificate is not trusted: ";
     let table = [
-        (other.issue(&["localhost"]), "it comes from an authority that is not known here"),
-        (lab.issue_as(&["localhost"], dated(2010, 2011)), "it expired on 2011-01-01T00:00:00Z"),
+        (other.issue(&["localhost"]), "UnknownIssuer"),
+        (lab.issue_as(&["localhost"], dated(2010, 2011)), "certificate expired"),
         (lab.issue_as(&["localhost"], dated(2400, 2401)), "certificate not valid yet"),
         (lab.issue(&["lab.example"]), "certificate not valid for name \"localhost\""),
     ];

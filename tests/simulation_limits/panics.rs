@@ -132,7 +132,7 @@ impl Handler<WebotsEvent> for Listener {
 
 /// Asks for a place as a session does.
 fn lease(server: &AppState, listener: &Addr<Listener>, world: &ProjectUrl) -> SlotLease {
-    let client = (Peer::Unknown, ClientIdentity::default());
+    let client = (Peer::Proxy(std::net::Ipv4Addr::LOCALHOST.into()), ClientIdentity::default());
     SlotLease::acquire(&server.slots, SimulationId::next(), listener.clone().recipient(), world, client).unwrap()
 }
 

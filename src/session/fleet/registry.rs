@@ -1,8 +1,7 @@
 //! Actor: owns the state of the fleet; answers picks; publishes whether a server can take a client.
 //!
 //! One for the whole server, created at start; it never ends. It alone decides availability: it receives every report
-//! and every pick, so that a pick counts at once. It looks names up, and starts a monitor for each simulation server, a new one
-//! after a panic.
+//! and every pick, so that a pick counts at once. It looks names up, and starts a monitor for each simulation server.
 
 use std::net::IpAddr;
 use std::num::NonZeroU32;
@@ -83,7 +82,7 @@ const BURST: NonZeroU32 = NonZeroU32::MIN.saturating_add(199);
 const PER_MINUTE: NonZeroU32 = NonZeroU32::MIN.saturating_add(11);
 /// Pause between two lookups of the names.
 const LOOKUP_INTERVAL: Duration = Duration::from_secs(1);
-/// Interval between checks of what changes without a report: placements that expire, monitors that have panicked.
+/// Interval between checks of what changes without a report: placements that expire.
 const TICK: Duration = Duration::from_millis(250);
 
 impl Registry {
@@ -99,15 +98,6 @@ impl Registry {
                 available,
             }
         })
-    }
-
-    fn tick(&mut self, ctx: &mut Context<Self>) {
-        if let Err(too_many) = self.servers.monitors.restart_gone() {
-            // The app stops the server when the registry has stopped.
-            log::error!("{too_many}");
-            ctx.stop();
-        }
-        self.publish();
     }
 
     /// Publishes a change of availability.
@@ -197,7 +187,7 @@ impl Actor for Registry {
         // The requests and reports of a whole fleet may arrive at the same moment.
         ctx.set_mailbox_capacity(4096);
         self.servers.apply(&self.config);
-        ctx.run_interval(TICK, Self::tick);
+        ctx.run_interval(TICK, |registry, _| registry.publish());
         self.look_up_names(ctx);
     }
 }

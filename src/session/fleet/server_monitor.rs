@@ -2,8 +2,8 @@
 //!
 //! Started by the registry for each simulation server. Every `loadRefresh` it requests the server's
 //! state, one request at a time, and sends the result to the registry. If the registry's mailbox is full, the result is
-//! dropped: the next probe replaces it. The task ends when the registry drops its channel; after a panic the registry
-//! starts a new one.
+//! dropped: the next probe replaces it. The task ends when the registry drops its channel; after a panic it
+//! begins again.
 //!
 //! It requests `/status`, or `/load` if the server has no such page: the original has only that. No answer is trusted:
 //! the whole probe has a timeout, the answer a size limit, and the load must be plausible.

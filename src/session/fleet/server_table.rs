@@ -5,6 +5,8 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use actix::prelude::*;
+use rustls::ClientConfig;
+use tokio::sync::oneshot;
 
 use super::name_table::NameTable;
 use super::server_monitor::{ProbeResult, monitor};
@@ -13,7 +15,7 @@ use crate::session::config::SessionConfig;
 use crate::session::placement::LoadBalancer;
 use crate::shared::domain::PublicAddress;
 use crate::shared::http::tls;
-use crate::shared::run::Supervisor;
+use crate::shared::run::permanent;
 
 /// All servers and names, with the servers' monitors.
 pub struct ServerTable {
@@ -21,56 +23,55 @@ pub struct ServerTable {
     pub names: NameTable,
     /// What is known of placing clients on the servers.
     pub fleet: LoadBalancer<PublicAddress>,
-    /// The tasks that probe the servers.
-    pub monitors: Monitors,
+    /// The tasks that probe the servers: each ends when its sender is dropped.
+    monitors: HashMap<PublicAddress, oneshot::Sender<()>>,
     /// What is known of each server.
     pub records: HashMap<PublicAddress, ServerRecord>,
     /// In the order of the configuration.
     listed: Vec<PublicAddress>,
+    tls: Option<Arc<ClientConfig>>,
     /// The thread of the monitors, so that requests of clients do not wait for them.
     thread: Arbiter,
     results: Recipient<ProbeResult>,
 }
 
-/// The monitors, by server. They get no messages.
-type Monitors = Supervisor<PublicAddress, ()>;
-
 impl ServerTable {
     /// No servers yet; `results` receives each probe.
     pub fn new(config: &Arc<SessionConfig>, results: Recipient<ProbeResult>) -> Self {
-        let thread = Arbiter::new();
         Self {
             names: NameTable::default(),
             fleet: LoadBalancer::new(config.policy()),
-            monitors: monitors(&thread, config, results.clone()),
+            monitors: HashMap::new(),
             records: HashMap::new(),
             listed: Vec::new(),
-            thread,
+            tls: tls::client_config(),
+            thread: Arbiter::new(),
             results,
         }
     }
 
-    /// Applies a configuration. Each server is probed at once, by new monitors.
+    /// Applies a configuration. Each server is probed at once, by a new monitor.
     pub fn apply(&mut self, config: &Arc<SessionConfig>) {
-        self.monitors = monitors(&self.thread, config, self.results.clone());
-        self.listed.iter().for_each(|server| self.monitors.add(server.clone()));
+        for server in self.listed.clone() {
+            self.start_monitor(server, config);
+        }
         self.fleet.set_policy(config.policy());
         self.names.apply(&config.simulation_servers);
         self.follow_names(config);
     }
 
     /// Follows the configuration and its names: removes servers that are no longer listed, and adds new ones.
-    pub fn follow_names(&mut self, config: &SessionConfig) {
+    pub fn follow_names(&mut self, config: &Arc<SessionConfig>) {
         self.listed = self.names.servers(&config.simulation_servers);
         let mut before = std::mem::take(&mut self.records);
-        for server in &self.listed {
-            let mut record = before.remove(server).unwrap_or_else(|| {
+        for server in self.listed.clone() {
+            let mut record = before.remove(&server).unwrap_or_else(|| {
                 self.fleet.add(server.clone());
-                self.monitors.add(server.clone());
+                self.start_monitor(server.clone(), config);
                 ServerRecord::new(server.clone())
             });
-            record.drained = config.drained_servers.contains(server);
-            self.records.insert(server.clone(), record);
+            record.drained = config.drained_servers.contains(&server);
+            self.records.insert(server, record);
         }
         for server in before.into_keys() {
             log::info!("{server}: no longer watched");
@@ -79,24 +80,25 @@ impl ServerTable {
         }
     }
 
+    /// Starts the monitor of a server, in place of the one that it has.
+    fn start_monitor(&mut self, server: PublicAddress, config: &Arc<SessionConfig>) {
+        let (sender, stopped) = oneshot::channel();
+        self.monitors.insert(server.clone(), sender);
+        let (config, tls, results) = (Arc::clone(config), self.tls.clone(), self.results.clone());
+        self.thread.spawn_fn(move || {
+            actix_rt::spawn(async move {
+                let name = format!("monitor of server {server}");
+                let probe = async || monitor(server.clone(), &config, tls.clone(), results.clone()).await;
+                tokio::select! {
+                    () = permanent::restarted(&name, probe) => {}
+                    _ = stopped => {}
+                }
+            });
+        });
+    }
+
     /// What is known of all servers, in the order of the configuration.
     pub fn in_order(&self) -> impl Iterator<Item = &ServerRecord> {
         self.listed.iter().filter_map(|server| self.records.get(server))
     }
-}
-
-/// No monitors yet; they run on this thread.
-fn monitors(thread: &Arbiter, config: &Arc<SessionConfig>, results: Recipient<ProbeResult>) -> Monitors {
-    let (thread, config, tls) = (thread.handle(), Arc::clone(config), tls::client_config());
-    Supervisor::new("monitor of server", move |server: &PublicAddress, mut stopped| {
-        let (server, config, tls, results) = (server.clone(), Arc::clone(&config), tls.clone(), results.clone());
-        thread.spawn_fn(move || {
-            actix_rt::spawn(async move {
-                tokio::select! {
-                    () = monitor(server, &config, tls, results) => {}
-                    _ = stopped.recv() => {}
-                }
-            });
-        });
-    })
 }

@@ -13,6 +13,7 @@ use crate::session::mail::{self, Notice, NoticeKind};
 pub struct StateHistory {
     /// The last changes, the newest first.
     pub recent: VecDeque<StateChange>,
+    /// One for each channel of notices.
     mailers: Vec<UnboundedSender<Notice>>,
 }
 

@@ -1,7 +1,7 @@
 //! Task: sends notices to the administrator on one channel, by mail or by webhook.
 //!
-//! Started with the registry for each channel that is configured. It receives [`Notice`]s. [`Outbox`] decides what is
-//! sent, and when. One batch is sent at a time; notices that come meanwhile wait in the channel.
+//! Started with the registry for each channel that is configured; after a panic it begins again. It receives [`Notice`]s.
+//! [`Outbox`] decides what is sent, and when. One batch is sent at a time; notices that come meanwhile wait in the channel.
 
 use std::time::Instant;
 
@@ -12,20 +12,27 @@ use super::channel::Channel;
 use super::notice_text::{notice_text, signature, summary};
 use super::outbox::{Notice, Outbox, WaitingNotice};
 use crate::session::config::SessionConfig;
+use crate::shared::run::permanent;
 
-/// Starts a mailer for each channel that is configured.
+/// Starts a mailer for each channel that is configured. Returns where their notices go.
 pub fn start(config: &SessionConfig) -> Vec<UnboundedSender<Notice>> {
     let mail = Channel::mail(config).inspect_err(|why| log::info!("{why}"));
-    let start = |channel| {
-        let (sender, notices) = unbounded_channel();
-        actix_rt::spawn(send_all(channel, signature(config), Outbox::new(&config.timing), notices));
+    let (signature, timing) = (signature(config), config.timing.clone());
+    let start = |channel: Channel| {
+        let (sender, mut notices) = unbounded_channel();
+        let (signature, timing) = (signature.clone(), timing.clone());
+        actix_rt::spawn(async move {
+            let name = format!("mailer of notices by {}", channel.name);
+            let send = async || send_all(&channel, &signature, Outbox::new(&timing), &mut notices).await;
+            permanent::restarted(&name, send).await;
+        });
         sender
     };
     mail.into_iter().chain(Channel::webhook(config)).map(start).collect()
 }
 
 /// Sends what comes, until the server ends.
-async fn send_all(channel: Channel, signature: String, mut outbox: Outbox, mut notices: UnboundedReceiver<Notice>) {
+async fn send_all(channel: &Channel, signature: &str, mut outbox: Outbox, notices: &mut UnboundedReceiver<Notice>) {
     loop {
         let due = outbox.due();
         tokio::select! {
@@ -35,8 +42,8 @@ async fn send_all(channel: Channel, signature: String, mut outbox: Outbox, mut n
             },
             () = sleep_until(due.unwrap_or_else(Instant::now).into()), if due.is_some() => {
                 let batch = outbox.take(Instant::now());
-                let sent = channel.deliver(&notice_text(&batch, &signature)).await;
-                handle_outcome(&channel, &mut outbox, batch, sent);
+                let sent = channel.deliver(&notice_text(&batch, signature)).await;
+                handle_outcome(channel, &mut outbox, batch, sent);
             }
         }
     }

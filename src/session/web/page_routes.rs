@@ -8,12 +8,11 @@ use askama::Template;
 
 use super::pages::{self, Monitor, Viewer, WebotsViewer};
 use crate::asset;
+use crate::session::fleet::FleetStatus;
 use crate::session::state::AppState;
 use crate::shared::http::assets::{self, Asset};
 use crate::shared::http::routing::{GET, READ, path};
-use crate::shared::http::{
-    ConnectionKind, OWN_FILES, PageView, VIEWER, any_host, fleet_sources, foreign_scripts, html,
-};
+use crate::shared::http::{ConnectionKind, FOREIGN_SCRIPTS, OWN_FILES, PageView, VIEWER, html};
 use crate::shared::run::timestamp;
 
 /// Assets of this server's pages, besides those that both servers share.
@@ -58,18 +57,9 @@ async fn viewer(server: web::Data<AppState>) -> HttpResponse {
     html(Viewer { examples: &server.config.examples, script }.render(), VIEWER)
 }
 
-/// Webots' own viewer is third-party code, and a link to this page can name another script on a host of the fleet. So
-/// it runs in an embedded page with an origin of its own.
-async fn webots_viewer(server: web::Data<AppState>) -> Result<HttpResponse> {
-    let (status, urls) = (server.status().await?, &server.client_urls);
-    let mut sources = match &urls.public {
-        Some(public) => vec![public.http_door()],
-        // Names may resolve to other servers by the time the page starts a simulation.
-        None if !status.names.is_empty() => vec![any_host(urls.ssl)],
-        None => fleet_sources(status.servers.iter().map(|one| &one.record.address), urls.ssl),
-    };
-    sources.extend(server.config.viewer_script.as_ref().map(|script| script.origin().ascii_serialization()));
-    Ok(html(WebotsViewer.render(), &foreign_scripts(&sources)))
+/// Webots' own viewer is third-party code: it runs in an embedded page with an origin of its own.
+async fn webots_viewer() -> HttpResponse {
+    html(WebotsViewer.render(), FOREIGN_SCRIPTS)
 }
 
 async fn asset(request: HttpRequest) -> HttpResponse {

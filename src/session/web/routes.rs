@@ -15,8 +15,8 @@ use super::status::status_page;
 use super::web_client::WebClient;
 use crate::session::fleet::PickError;
 use crate::session::state::AppState;
-use crate::shared::http::routing::{self, GET, POST, READ, path, retry_after};
-use crate::shared::http::{CONTENT_TYPE, ConnectionKind, body, refuse_action, websocket};
+use crate::shared::http::routing::{self, GET, POST, READ, json_body, path, retry_after};
+use crate::shared::http::{CONTENT_TYPE, ConnectionKind, refuse_action, websocket};
 use crate::shared::text::one_line;
 
 /// The body of `POST /announcement`.
@@ -127,7 +127,7 @@ async fn announcement(request: HttpRequest, payload: web::Payload, server: web::
     if let Some(refusal) = refuse_action(server.admin_auth.as_ref(), &request, peer) {
         return refusal;
     }
-    let text = match body::json(&request, payload, "{\"text\": TEXT}").await {
+    let text = match json_body(&request, payload, "{\"text\": TEXT}").await {
         Ok(Announcement { text }) => one_line(text.trim()),
         Err(refusal) => return refusal,
     };

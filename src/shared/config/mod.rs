@@ -8,6 +8,6 @@ mod value;
 pub use loading::{Configuration, LoadedConfig, load, require};
 pub use secret::Secret;
 pub use value::{
-    ExpandedPath, expand, expanded, is_web_url, minutes_or_zero, one_or_many, optional_whole, percent, seconds,
+    ExpandedPath, expand, expanded, is_web_url, minutes, one_or_many, optional_whole, percent, seconds,
     seconds_or_zero, whole,
 };

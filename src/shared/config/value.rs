@@ -129,25 +129,12 @@ pub mod seconds_or_zero {
     }
 }
 
-/// A duration in minutes, or 0 for none.
-pub mod minutes_or_zero {
-    use super::{Deserializer, Duration, Serializer, between};
-
-    /// Reads a number of minutes from 0 to a day.
-    ///
-    /// # Errors
-    /// When the value is something else.
-    pub fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Duration, D::Error> {
-        between(deserializer, 0.0..=1440.0, "minutes").map(|number| Duration::from_secs_f64(60.0 * number))
-    }
-
-    /// Writes the minutes.
-    ///
-    /// # Errors
-    /// When the output fails.
-    pub fn serialize<S: Serializer>(duration: &Duration, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.serialize_f64(duration.as_secs_f64() / 60.0)
-    }
+/// Reads a number of minutes from 0 to a day.
+///
+/// # Errors
+/// When the value is something else.
+pub fn minutes<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+    between(deserializer, 0.0..=1440.0, "minutes")
 }
 
 /// Reads a number of this range.

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 /// A machine's load in percent: finite and not negative. It may exceed 100.
 #[derive(Debug, Clone, Copy, Default, PartialEq, PartialOrd, Serialize, Deserialize)]
-#[serde(try_from = "f64", into = "f64")]
+#[serde(try_from = "f64")]
 pub struct Load(f64);
 
 impl Load {
@@ -46,12 +46,6 @@ impl TryFrom<f64> for Load {
 
 fn no_load(what: impl fmt::Display) -> String {
     format!("{what} is no load; a load is a finite number of percent that is not negative")
-}
-
-impl From<Load> for f64 {
-    fn from(load: Load) -> Self {
-        load.0
-    }
 }
 
 impl fmt::Display for Load {

@@ -99,16 +99,17 @@ impl ServerReport {
     /// A report without `docker` comes from a Python server. The Python session server expects it to run every world
     /// that it does not rule out, and so does this one.
     pub fn accepts(&self, world: &ProjectUrl) -> bool {
-        let Some(docker) = self.docker else {
-            let blocked = self.blocked_repositories.iter().any(|prefix| prefix.covers(world));
-            let open = self.allowed_repositories.is_empty() || self.share_idle_time > 0.0;
-            return !blocked && (open || self.allowed_repositories.iter().any(|prefix| prefix.covers(world)));
+        let is_open = self.allowed_repositories.is_empty() || self.share_idle_time > 0.0;
+        let share_idle_time = match self.docker {
+            Some(_) => self.share_idle_time,
+            None if is_open => f64::INFINITY,
+            None => 0.0,
         };
         let rules = AdmissionRules {
             allowed: self.allowed_repositories.as_slice(),
             blocked: self.blocked_repositories.as_slice(),
-            docker,
-            share_idle_time: self.share_idle_time,
+            docker: self.docker.unwrap_or(true),
+            share_idle_time,
         };
         rules.admit(world, self.load).is_ok()
     }

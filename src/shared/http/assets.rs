@@ -1,24 +1,16 @@
 //! Style sheets, scripts and images of the pages, which are embedded in the program.
 
+use actix_files::file_extension_to_mime;
 use actix_web::{HttpRequest, HttpResponse};
 
-/// A file that pages refer to as `assets/NAME`.
-#[derive(Debug, Clone, Copy)]
-pub struct Asset {
-    /// Its file name; the extension determines its type.
-    pub name: &'static str,
-    /// Its content.
-    pub text: &'static str,
-}
+/// A file that pages refer to as `assets/NAME`: its name, whose extension determines its type, and its content.
+pub type Asset = (&'static str, &'static str);
 
 /// Embeds a file of `templates/assets` at build time.
 #[macro_export]
 macro_rules! asset {
     ($name:literal) => {
-        $crate::shared::http::assets::Asset {
-            name: $name,
-            text: include_str!(concat!("../../../templates/assets/", $name)),
-        }
+        ($name, include_str!(concat!("../../../templates/assets/", $name)))
     };
 }
 
@@ -40,22 +32,12 @@ pub const COMMON: &[Asset] = &[
     asset!("webots_viewer.js"),
 ];
 
-impl Asset {
-    fn media_type(self) -> &'static str {
-        match self.name.rsplit_once('.') {
-            Some((_, "css")) => "text/css; charset=utf-8",
-            Some((_, "js")) => "text/javascript; charset=utf-8",
-            Some((_, "svg")) => "image/svg+xml",
-            _ => "text/plain; charset=utf-8",
-        }
-    }
-}
-
 /// Answers a request for one of these files. Browsers fetch it again for each page.
 pub fn answer(request: &HttpRequest, assets: &[Asset]) -> HttpResponse {
     let name = request.match_info().get("name").unwrap_or_default();
-    match assets.iter().chain(COMMON).find(|asset| asset.name == name) {
-        Some(asset) => HttpResponse::Ok().content_type(asset.media_type()).body(asset.text),
-        None => HttpResponse::NotFound().body("Error: there is no such file."),
-    }
+    let Some((_, text)) = assets.iter().chain(COMMON).find(|(known, _)| *known == name) else {
+        return HttpResponse::NotFound().body("Error: there is no such file.");
+    };
+    let extension = name.rsplit('.').next().unwrap_or_default();
+    HttpResponse::Ok().content_type(file_extension_to_mime(extension)).body(*text)
 }

@@ -10,7 +10,7 @@ use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
 use subtle::ConstantTimeEq;
 
-use super::address_quota::AddressQuota;
+use super::limits::AddressQuota;
 use super::peer::Peer;
 use super::routing::retry_after;
 use crate::shared::config::Secret;

@@ -21,7 +21,7 @@ use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::sync::oneshot;
 use tokio_util::io::poll_read_buf;
 
-use super::connections::ConnectionPermit;
+use super::limits::ConnectionPermit;
 
 /// Size of one read from the socket, in bytes.
 const READ_AT_ONCE: usize = 4 * 1024;

@@ -16,7 +16,7 @@ use futures_util::stream::{self, StreamExt};
 use serde::Serialize;
 use tokio::sync::{Mutex, watch};
 
-use super::connections::ConnectionPermit;
+use super::limits::ConnectionPermit;
 use crate::shared::run::{Phase, closing};
 
 /// Interval between two renderings.

@@ -47,11 +47,6 @@ impl Liveness {
         self.answers += 1;
         self.answers <= ANSWERS
     }
-
-    /// Whether the peer has answered no ping for this long.
-    fn is_gone(&self, silence: Duration) -> bool {
-        self.alive.elapsed() >= silence
-    }
 }
 
 /// Pings a peer each `ping`, and stops the actor after `silence` without an answer; `of` returns the actor's liveness.
@@ -66,7 +61,7 @@ where
         // The timeout usually ends between two pings.
         if left < ping {
             ctx.run_later(left, move |actor, ctx| {
-                if of(actor).is_gone(silence) {
+                if of(actor).alive.elapsed() >= silence {
                     log::info!("a client was silent for too long");
                     ctx.stop();
                 }

@@ -1,14 +1,24 @@
-//! What the routes of both servers share: allowed methods, CORS headers, the answer for unknown paths.
+//! What the routes of both servers share: allowed methods, CORS headers, bodies of requests, the answer for unknown paths.
+//! Bodies of actions are small, of a known length and in time; other requests have none.
+
+use std::time::Duration;
 
 use actix_web::dev::HttpServiceFactory;
 use actix_web::http::header::{self, HeaderName, HeaderValue};
 use actix_web::http::{Method, StatusCode};
 use actix_web::middleware::DefaultHeaders;
-use actix_web::{FromRequest, Handler, HttpResponse, Resource, Responder, guard, web};
+use actix_web::web::Payload;
+use actix_web::{FromRequest, Handler, HttpRequest, HttpResponse, Resource, Responder, guard, web};
 use rand::RngExt;
+use serde::de::DeserializeOwned;
+
+use super::client_stream::MAX_BODY;
 
 /// Range of `Retry-After`, in seconds.
 const RETRY_AFTER: std::ops::RangeInclusive<u16> = 2..=6;
+
+/// Timeout of a body.
+const BODY_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// For reads. Monitoring programs like to request the head alone (RFC 9110, section 9.3.2).
 pub const READ: &[Method] = &[Method::GET, Method::HEAD];
@@ -40,6 +50,39 @@ fn wrong_method(methods: &[Method]) -> HttpResponse {
 /// The header `Retry-After`, in seconds. Random, so that a class that was refused at once does not retry at once.
 pub fn retry_after() -> (HeaderName, HeaderValue) {
     (header::RETRY_AFTER, HeaderValue::from(rand::rng().random_range(RETRY_AFTER)))
+}
+
+/// Refuses a request with a body where none is read.
+pub fn refuse_body(request: &HttpRequest) -> Option<HttpResponse> {
+    let headers = request.headers();
+    let has_length = headers.get(header::CONTENT_LENGTH).is_some_and(|length| length != "0");
+    let has_body = has_length || headers.contains_key(header::TRANSFER_ENCODING);
+    has_body.then(|| HttpResponse::BadRequest().body("Error: a request for this has no body."))
+}
+
+/// Reads the JSON of a body; an empty one is the default. `form` is the expected form, for the error message.
+///
+/// # Errors
+/// The answer to a request whose body can't be read.
+pub async fn json_body<T: DeserializeOwned + Default>(
+    request: &HttpRequest,
+    payload: Payload,
+    form: &str,
+) -> Result<T, HttpResponse> {
+    let headers = request.headers();
+    let length = headers.get(header::CONTENT_LENGTH).and_then(|length| length.to_str().ok()?.parse().ok());
+    if headers.contains_key(header::TRANSFER_ENCODING) || length.is_some_and(|length: usize| length > MAX_BODY) {
+        let words = format!("Error: a body has a Content-Length of at most {MAX_BODY} bytes.");
+        return Err(HttpResponse::PayloadTooLarge().force_close().body(words));
+    }
+    let wrong = || HttpResponse::BadRequest().body(format!("Error: the body is not {form}."));
+    let read = actix_web::rt::time::timeout(BODY_TIMEOUT, payload.to_bytes_limited(MAX_BODY)).await;
+    match read {
+        Ok(Ok(Ok(body))) if body.is_empty() => Ok(T::default()),
+        Ok(Ok(Ok(body))) => serde_json::from_slice(&body).map_err(|_| wrong()),
+        Ok(_) => Err(wrong()),
+        Err(_) => Err(HttpResponse::RequestTimeout().force_close().body("Error: the body did not come in time.")),
+    }
 }
 
 /// All routes of a server, usable by pages of any origin; `hint` lists the usual paths for the 404 page.

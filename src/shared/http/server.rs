@@ -20,7 +20,7 @@ use actix_web::rt::net::TcpStream;
 use socket2::{Domain, SockRef, Socket, TcpKeepalive, Type};
 
 use super::client_stream::ClientStream;
-use super::connections::{ConnectionKind, ConnectionLimiter};
+use super::limits::{ConnectionKind, ConnectionLimiter};
 use super::peer::TrustedProxies;
 
 /// Backlog of connections to be accepted. The kernel's own limit applies if it is smaller.
@@ -107,10 +107,7 @@ fn accept(
 ) -> Result<(ClientStream, Option<SocketAddr>), DispatchError> {
     let address = tcp.peer_addr()?;
     let peer = options.trusted_proxies.of_connection(address.ip());
-    let permit = connections.admit(ConnectionKind::Tcp, peer).map_err(|error| {
-        log::debug!("{address}: {error}");
-        io::Error::other(error)
-    })?;
+    let permit = connections.admit(ConnectionKind::Tcp, peer).map_err(io::Error::other)?;
     // Messages are small, and must not wait for the acknowledgement of the one before.
     tcp.set_nodelay(true)?;
     let socket = SockRef::from(&tcp);

@@ -4,12 +4,10 @@
 //! environment variables `SSL_CERT_FILE` and `SSL_CERT_DIR` is set, it is that file or directory alone.
 
 use std::sync::Arc;
-use std::time::{Duration, SystemTime};
 
 use awc::error::{ConnectError, SendRequestError};
-use rustls::{CertificateError, ClientConfig, Error, RootCertStore};
+use rustls::{ClientConfig, Error, RootCertStore};
 
-use crate::shared::run::timestamp;
 use crate::shared::text::excerpt;
 
 /// Longest text about a certificate, which may be anybody's, in characters.
@@ -24,10 +22,7 @@ pub fn client_config() -> Option<Arc<ClientConfig>> {
         log::warn!("some certificate authorities can't be read: {problem}");
     }
     let mut roots = RootCertStore::empty();
-    let (_, unusable) = roots.add_parsable_certificates(found.certs);
-    if unusable > 0 {
-        log::warn!("{unusable} certificates of authorities can't be used");
-    }
+    roots.add_parsable_certificates(found.certs);
     if roots.is_empty() {
         log::warn!("no certificate authority is known: no https server will be trusted");
     }
@@ -43,23 +38,9 @@ pub fn reason(error: &SendRequestError) -> Option<String> {
         return None;
     };
     let reason = match error.get_ref()?.downcast_ref::<Error>()? {
-        Error::InvalidCertificate(problem) => format!("its certificate is not trusted: {}", distrust(problem)),
+        Error::InvalidCertificate(problem) => format!("its certificate is not trusted: {problem}"),
         Error::InvalidMessage(_) => "it does not speak https there".to_owned(),
         other => format!("encryption failed: {other}"),
     };
     Some(excerpt(&reason, MAX_REASON_LENGTH))
-}
-
-fn distrust(problem: &CertificateError) -> String {
-    match problem {
-        CertificateError::UnknownIssuer => {
-            "it comes from an authority that is not known here (update-ca-certificates and SSL_CERT_FILE make one known)"
-                .to_owned()
-        }
-        CertificateError::ExpiredContext { not_after, .. } => {
-            let end = SystemTime::UNIX_EPOCH.checked_add(Duration::from_secs(not_after.as_secs()));
-            format!("it expired on {}", end.map(timestamp).unwrap_or_default())
-        }
-        other => other.to_string(),
-    }
 }

@@ -9,7 +9,7 @@ use bytestring::ByteString;
 use futures_util::stream::{self, Stream, StreamExt};
 use tokio_util::codec::Decoder;
 
-use super::body;
+use super::routing::refuse_body;
 
 /// Size limit of a client's message, in bytes.
 const MAX_MESSAGE: usize = 8 * 1024;
@@ -126,7 +126,7 @@ pub fn open<A>(request: &HttpRequest, payload: Payload, actor: A) -> HttpRespons
 where
     A: Actor<Context = WebsocketContext<A>> + StreamHandler<Result<Message, ProtocolError>>,
 {
-    if let Some(refusal) = body::refuse(request) {
+    if let Some(refusal) = refuse_body(request) {
         return refusal;
     }
     match ws::handshake(request) {

@@ -9,8 +9,8 @@ use super::rotated_file::RotatedFile;
 use super::timestamp::timestamp_in_milliseconds;
 use crate::shared::text::one_line;
 
-/// Number of rotated files that are kept, as in the Python servers.
-const OLD_FILES: usize = 10;
+/// Size from which the log is rotated, in bytes.
+const MAX_SIZE: u64 = 2_500_000;
 
 /// Starts logging to a file, which is rotated; without one to standard output, debug lines included. The environment variable `RUST_LOG` overrides which lines are written.
 ///
@@ -19,19 +19,15 @@ const OLD_FILES: usize = 10;
 pub fn start(file: Option<&Path>) -> std::io::Result<()> {
     // The HTTP decoder logs each malformed message as an error. Any client could flood the log with these. Resolver
     // errors are logged by the caller.
-    let default_level = match file {
-        None => {
-            "debug,actix_http=info,actix_http::h1::decoder=off,actix_server=info,mio=info,rustls=info,h2=info,\
-             hickory_net=off,hickory_proto=off,hickory_resolver=off"
-        }
-        Some(_) => {
-            "info,actix_http::h1::decoder=off,actix_server=warn,hickory_net=off,hickory_proto=off,hickory_resolver=off"
-        }
+    let level = match file {
+        None => "debug,actix_http=info,actix_server=info,mio=info,rustls=info,h2=info",
+        Some(_) => "info,actix_server=warn",
     };
-    let mut builder = Builder::from_env(Env::default().default_filter_or(default_level));
+    let level = format!("{level},actix_http::h1::decoder=off,hickory_net=off,hickory_proto=off,hickory_resolver=off");
+    let mut builder = Builder::from_env(Env::default().default_filter_or(level));
     builder.target(match file {
         None => Target::Stdout,
-        Some(path) => Target::Pipe(Box::new(RotatedFile::open(path, OLD_FILES)?)),
+        Some(path) => Target::Pipe(Box::new(RotatedFile::open(path, MAX_SIZE, "")?)),
     });
     builder.format(|out, record| {
         let time = timestamp_in_milliseconds(std::time::SystemTime::now());

@@ -3,17 +3,14 @@
 mod logging;
 mod open_files;
 pub mod permanent;
-mod pid_file;
 mod rotated_file;
 pub mod service_manager;
 mod signals;
 pub mod start;
-mod supervisor;
 mod timestamp;
 
 pub use open_files::{limit_clients, raise_open_files};
 pub use rotated_file::RotatedFile;
 pub use signals::{Phase, ServerCommand, Signals, closing};
 pub use start::AppError;
-pub use supervisor::Supervisor;
 pub use timestamp::{seconds_since_1970, serialize_timestamp, timestamp, timestamp_in_milliseconds};

@@ -2,21 +2,12 @@
 
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
 
-/// The limit that is assumed if the system does not report it.
-const USUAL: u64 = 1024;
-
 /// Raises the limit of open files to `wanted`, or as close as the system allows. A higher limit stays. Returns the
 /// limit.
 pub fn raise_open_files(wanted: u64) -> u64 {
-    let limits = getrlimit(Resource::RLIMIT_NOFILE);
-    let raised = limits.and_then(|(now, most)| {
-        let limit = now.max(wanted.min(most));
-        setrlimit(Resource::RLIMIT_NOFILE, limit, most).map(|()| limit)
-    });
-    raised.unwrap_or_else(|error| {
-        log::warn!("the limit of open files can't be raised: {error}");
-        limits.map_or(USUAL, |(now, _)| now)
-    })
+    let Ok((now, most)) = getrlimit(Resource::RLIMIT_NOFILE) else { return 1024 };
+    let limit = now.max(wanted.min(most));
+    setrlimit(Resource::RLIMIT_NOFILE, limit, most).map_or(now, |()| limit)
 }
 
 /// Returns the limit of clients: `max_clients`, or fewer if this many open `files` are enough only for `possible` ones.

@@ -1,14 +1,18 @@
-//! Actors that must run as long as the server.
+//! Actors and tasks that must run as long as the server.
 
-use std::time::Duration;
+use std::panic::AssertUnwindSafe;
+use std::time::{Duration, Instant};
 
 use actix::prelude::*;
+use futures_util::FutureExt;
 
-/// Interval between two checks of an actor.
+/// Interval between two checks of an actor, and between the end of a task and its next start.
 const INTERVAL: Duration = Duration::from_millis(500);
+/// Panics of a task within a minute after which a new one would help no more.
+const MAX_PANICS: u32 = 5;
 
 /// Waits until an actor has stopped, and returns a message about it. Such an actor has panicked, which is a bug in this
-/// program, or has given up on others that panic.
+/// program.
 ///
 /// actix does not restart an actor after a panic, and every later message to it fails. The server must exit, and its
 /// service manager restarts it.
@@ -17,4 +21,38 @@ pub async fn stopped<A: Actor>(name: &str, actor: Addr<A>) -> String {
         actix_rt::time::sleep(INTERVAL).await;
     }
     format!("the actor {name} is gone")
+}
+
+/// Runs a task, and starts it again each time that it has panicked. More than [`MAX_PANICS`] within a minute end the
+/// server with exit code 1, so that its service manager restarts it.
+pub async fn restarted(name: &str, mut task: impl AsyncFnMut()) {
+    let (mut since, mut panics) = (Instant::now(), 0);
+    while AssertUnwindSafe(task()).catch_unwind().await.is_err() {
+        if since.elapsed() > Duration::from_mins(1) {
+            (since, panics) = (Instant::now(), 0);
+        }
+        panics += 1;
+        if panics > MAX_PANICS {
+            log::error!("{name} has panicked more than {MAX_PANICS} times in a minute");
+            std::process::exit(1);
+        }
+        log::error!("{name} has panicked, a new one is started");
+        actix_rt::time::sleep(INTERVAL).await;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[actix_rt::test]
+    async fn a_task_that_panics_is_started_again() {
+        let mut starts = 0;
+        restarted("a task", async || {
+            starts += 1;
+            assert!(starts == 2, "this panic is part of a test");
+        })
+        .await;
+        assert_eq!(starts, 2);
+    }
 }

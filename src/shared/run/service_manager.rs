@@ -10,19 +10,6 @@ pub fn ready(port: u16) {
     send(&[NotifyState::Ready, NotifyState::Status(&format!("listens on port {port}"))]);
 }
 
-/// Reports that the server reloads its configuration. [`ready`] reports the end.
-pub fn reloading() {
-    match NotifyState::monotonic_usec_now() {
-        Ok(now) => send(&[NotifyState::Reloading, now]),
-        Err(error) => log::warn!("the service manager can't be told of the reload: {error}"),
-    }
-}
-
-/// Reports what the server is doing, for `systemctl status`.
-pub fn status(what: &str) {
-    send(&[NotifyState::Status(what)]);
-}
-
 /// Reports that the server stops in an orderly way, and why.
 pub fn stopping(why: &str) {
     send(&[NotifyState::Stopping, NotifyState::Status(why)]);

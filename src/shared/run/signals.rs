@@ -1,14 +1,13 @@
 //! Signals to a server, and the phases of its life cycle.
 
+use std::future::poll_fn;
+use std::io;
+use std::task::Poll;
+
 use actix_rt::signal::unix::{Signal, SignalKind, signal};
 
 /// The signals of a server. They are caught until this is dropped.
-pub struct Signals {
-    terminate: Signal,
-    interrupt: Signal,
-    hang_up: Signal,
-    user: Signal,
-}
+pub struct Signals(Vec<(Signal, ServerCommand)>);
 
 /// The command of a signal, or of an administrator's request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -26,23 +25,27 @@ impl Signals {
     ///
     /// # Errors
     /// When the system does not allow it.
-    pub fn catch() -> std::io::Result<Self> {
-        Ok(Self {
-            terminate: signal(SignalKind::terminate())?,
-            interrupt: signal(SignalKind::interrupt())?,
-            hang_up: signal(SignalKind::hangup())?,
-            user: signal(SignalKind::user_defined1())?,
-        })
+    pub fn catch() -> io::Result<Self> {
+        let commands = [
+            (SignalKind::terminate(), ServerCommand::Stop),
+            (SignalKind::interrupt(), ServerCommand::Stop),
+            (SignalKind::hangup(), ServerCommand::Reload),
+            (SignalKind::user_defined1(), ServerCommand::Drain),
+        ];
+        let caught = commands.into_iter().map(|(kind, command)| Ok((signal(kind)?, command)));
+        caught.collect::<io::Result<_>>().map(Self)
     }
 
     /// Waits for the next request.
     pub async fn next(&mut self) -> ServerCommand {
-        tokio::select! {
-            _ = self.terminate.recv() => ServerCommand::Stop,
-            _ = self.interrupt.recv() => ServerCommand::Stop,
-            _ = self.hang_up.recv() => ServerCommand::Reload,
-            _ = self.user.recv() => ServerCommand::Drain,
-        }
+        poll_fn(|context| {
+            let received = self.0.iter_mut().find_map(|(signal, command)| match signal.poll_recv(context) {
+                Poll::Ready(_) => Some(*command),
+                Poll::Pending => None,
+            });
+            received.map_or(Poll::Pending, Poll::Ready)
+        })
+        .await
     }
 }
 

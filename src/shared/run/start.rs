@@ -1,12 +1,13 @@
 //! Start of a program: configuration, log, then the server, and the exit code.
 
-use std::io::Write;
+use std::fs::{File, TryLockError};
+use std::io::{self, Read, Write};
 use std::mem::ManuallyDrop;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use super::logging;
-use super::{pid_file, service_manager};
+use super::service_manager;
 use crate::shared::config::{self, Configuration, LoadedConfig};
 use crate::shared::text::one_line;
 
@@ -31,11 +32,13 @@ pub struct CommonArgs {
 
 /// Reads a configuration file. An invalid one ends the program, which prints what is invalid in it, in one line.
 pub fn read<C: Configuration>(file: &Path) -> LoadedConfig<C> {
-    config::load(file).unwrap_or_else(|error| {
-        // A key may contain any text.
-        eprintln!("error: {}", one_line(&error));
-        std::process::exit(WRONG_CONFIGURATION)
-    })
+    config::load(file).unwrap_or_else(|error| refuse(&error))
+}
+
+fn refuse(why: &str) -> ! {
+    // A key may contain any text.
+    eprintln!("error: {}", one_line(why));
+    std::process::exit(WRONG_CONFIGURATION)
 }
 
 /// Prints the effective configuration to standard output, and warnings to the error output.
@@ -43,12 +46,9 @@ pub fn check<C: Configuration>(loaded: &LoadedConfig<C>) {
     for warning in &loaded.warnings {
         eprintln!("warning: {}", one_line(warning));
     }
-    let text = serde_json::to_string_pretty(&loaded.config).unwrap_or_else(|error| {
-        eprintln!("error: {error}");
-        std::process::exit(WRONG_CONFIGURATION)
-    });
+    let text = serde_json::to_string_pretty(&loaded.config).unwrap_or_else(|error| refuse(&error.to_string()));
     // The reader may have closed the pipe.
-    writeln!(std::io::stdout(), "{text}").ok();
+    writeln!(io::stdout(), "{text}").ok();
 }
 
 /// Starts the log in a file, without one on standard output, writes the PID file if requested, and runs a server until it stops.
@@ -59,7 +59,7 @@ pub fn serve(
     server: impl Future<Output = Result<(), AppError>>,
 ) -> ExitCode {
     // The file is locked until the end of the process.
-    let _pid_file = match options.pid_file.as_deref().map(pid_file::write).transpose() {
+    let _pid_file = match options.pid_file.as_deref().map(write_pid).transpose() {
         Ok(file) => file,
         Err(error) => return failed(&format!("the process id can't be written: {error}")),
     };
@@ -83,12 +83,30 @@ pub fn serve(
     }
 }
 
+/// Writes the process id to a file, and locks the file (`flock`) until the returned file is closed. The kernel closes
+/// it when the process ends for any reason.
+fn write_pid(path: &Path) -> io::Result<File> {
+    let mut file = File::options().read(true).write(true).create(true).truncate(false).open(path)?;
+    match file.try_lock() {
+        Ok(()) => {}
+        Err(TryLockError::WouldBlock) => {
+            let mut pid = String::new();
+            file.read_to_string(&mut pid)?;
+            return Err(io::Error::other(format!("a server that runs holds it: process {}", pid.trim())));
+        }
+        Err(TryLockError::Error(error)) => return Err(error),
+    }
+    file.set_len(0)?;
+    writeln!(file, "{}", std::process::id())?;
+    Ok(file)
+}
+
 /// Reports to the log, standard output and the service manager that a server is reachable: its HTTP URL and its
 /// WebSocket URL.
 pub fn announce(server: &str, http: &str, websocket: &str, port: u16) {
     log::info!("{server} {} listens on port {port}: {http}", env!("CARGO_PKG_VERSION"));
     // The reader may have closed the pipe.
-    writeln!(std::io::stdout(), "{server:<18} {http}/monitor   {websocket}").ok();
+    writeln!(io::stdout(), "{server:<18} {http}/monitor   {websocket}").ok();
     service_manager::ready(port);
 }
 

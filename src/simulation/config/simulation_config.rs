@@ -4,6 +4,7 @@ use std::net::{IpAddr, Ipv6Addr};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use actix_web::http::header::HeaderName;
 use serde::{Deserialize, Serialize};
 
 use super::container::{ContainerDisplay, ContainerSettings, EDITOR_PORT};
@@ -15,11 +16,11 @@ use super::timing::Timing;
 use super::urls::Streaming;
 use crate::shared::config::keys::keys;
 use crate::shared::config::{
-    Configuration, ExpandedPath, Secret, expanded, is_web_url, minutes_or_zero, one_or_many, optional_whole, percent,
-    require, seconds, whole,
+    Configuration, ExpandedPath, Secret, expanded, is_web_url, minutes, one_or_many, optional_whole, percent, require,
+    seconds, whole,
 };
 use crate::shared::domain::{PublicUrl, UrlPrefix, complete_host};
-use crate::shared::http::{Origin, TrustedProxies, UserHeader};
+use crate::shared::http::{Origin, TrustedProxies};
 use crate::simulation::machine::display::{self, DisplayName};
 
 keys! {
@@ -108,7 +109,7 @@ pub struct SimulationConfig {
     pub max_places_per_user: Option<usize> = None,
     /// The header in which a reverse proxy of `trustedProxies` sends the user's name, such as `X-Forwarded-User`.
     /// Default: none.
-    pub user_header: Option<UserHeader> = None,
+    pub user_header: Option<String> = None,
     /// Reverse proxies, as addresses or networks, whose header `X-Forwarded-For` is trusted.
     /// Default: `["127.0.0.0/8", "::1/128"]`.
     pub trusted_proxies: TrustedProxies = TrustedProxies::default(),
@@ -116,8 +117,8 @@ pub struct SimulationConfig {
     #[serde(deserialize_with = "whole::<360, 31_536_000, _, _>")]
     pub timeout: u64 = 7200,
     /// Minutes after which a simulation that is paused is closed; 0: never. Default: 0.
-    #[serde(with = "minutes_or_zero")]
-    pub idle_timeout: Duration = Duration::ZERO,
+    #[serde(deserialize_with = "minutes")]
+    pub idle_timeout: f64 = 0.0,
     /// Write `simulation/monitor.csv`. Default: true.
     pub monitor_log_enabled: bool = true,
     /// Whether a world's URL may name any commit by its hash, not only one that is in a branch or tag. Git hosts also
@@ -242,6 +243,11 @@ impl Configuration for SimulationConfig {
         require(self.timing.silence > self.timing.ping, "timing.silence", || {
             format!("{} s is not more than timing.ping", self.timing.silence.as_secs_f64())
         })?;
+        if let Some(header) = &self.user_header {
+            require(HeaderName::try_from(header).is_ok(), "userHeader", || {
+                format!("{header:?} is no name of a header, such as X-Forwarded-User")
+            })?;
+        }
         for address in &self.notify {
             require(is_web_url(address), "notify", || {
                 format!("{address:?} is no URL; allowed are http and https URLs")

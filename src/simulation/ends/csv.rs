@@ -10,15 +10,15 @@ use crate::shared::text::one_line;
 
 /// The first line.
 const HEADING: &str = "id,begin,end,client,repository,world,port,level,peak memory (bytes),processor time (s),reason,user,label (unverified)\n";
-/// How many older files are kept beside the newest.
-const OLD_FILES: usize = 10;
+/// Size from which the file is rotated, in bytes.
+const MAX_SIZE: u64 = 2_500_000;
 
 /// Appends a line to the file at this path.
 ///
 /// # Errors
 /// When it can't be written.
 pub(super) fn append(path: &Path, level: &str, ended: &Ended) -> io::Result<()> {
-    RotatedFile::open(path, OLD_FILES)?.with_heading(HEADING).write_all(line(level, ended).as_bytes())
+    RotatedFile::open(path, MAX_SIZE, HEADING)?.write_all(line(level, ended).as_bytes())
 }
 
 fn line(level: &str, ended: &Ended) -> String {

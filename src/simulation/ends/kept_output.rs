@@ -123,7 +123,13 @@ mod tests {
         let mut simulation = Simulation::new(SimulationId::next(), &world, ClientIdentity::default());
         simulation.log = Some(logs.join(FOLDER_OF_RUNNING).join(format!("{}.log", simulation.id)));
         let how = End { reason, why: String::new(), taken: Taken::default() };
-        Ended { simulation, client: Peer::Unknown, at: 0, events: vec!["12:00:00 it began".to_owned()], how }
+        Ended {
+            simulation,
+            client: Peer::Proxy(std::net::Ipv4Addr::LOCALHOST.into()),
+            at: 0,
+            events: vec!["12:00:00 it began".to_owned()],
+            how,
+        }
     }
 
     #[test]

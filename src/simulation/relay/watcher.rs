@@ -20,11 +20,11 @@ const BUFFER: usize = 16 * 1024;
 /// # Errors
 /// When one has left, or the watcher violates the protocol.
 pub(super) async fn relay(
-    (mut watcher, sent): (TcpStream, Vec<u8>),
+    (mut watcher, sent): (TcpStream, Bytes),
     (mut webots, answered): (TcpStream, Bytes),
 ) -> io::Result<()> {
     let (mut frames, mut to_webots) = (FrameReader::default(), Codec::new().client_mode());
-    let (mut from_watcher, mut from_webots) = (BytesMut::from(&sent[..]), BytesMut::from(answered));
+    let (mut from_watcher, mut from_webots) = (BytesMut::from(sent), BytesMut::from(answered));
     let mut has_answered = false;
     loop {
         has_answered |= !from_webots.is_empty();

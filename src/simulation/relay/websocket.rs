@@ -48,7 +48,7 @@ pub async fn connect(
             return drop(held);
         }
         let (Ok(to_client), Ok(to_webots)) = (to_client.into_std(), webots.into_std()) else { return };
-        let (up, down) = (Direction::new(to_client, from_client.into()), Direction::new(to_webots, from_webots));
+        let (up, down) = (Direction::new(to_client, from_client), Direction::new(to_webots, from_webots));
         if let Err(error) = stream_thread.add(Stream::new(up, down, Box::new(held))) {
             log::warn!("a stream is not relayed: {error}");
         }

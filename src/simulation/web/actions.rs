@@ -5,8 +5,8 @@ use actix_web::http::header;
 use actix_web::{HttpRequest, HttpResponse, web};
 use serde::Deserialize;
 
-use crate::shared::http::routing::{GET, POST, path};
-use crate::shared::http::{body, refuse_action, require_administrator};
+use crate::shared::http::routing::{GET, POST, json_body, path};
+use crate::shared::http::{refuse_action, require_administrator};
 use crate::shared::text::excerpt;
 use crate::simulation::protocol;
 use crate::simulation::state::AppState;
@@ -51,7 +51,7 @@ async fn stop(
     if let Some(refusal) = refusal(&request, &server) {
         return Ok(refusal);
     }
-    let StopRequest { reason } = match body::json(&request, body, "{\"reason\": TEXT}").await {
+    let StopRequest { reason } = match json_body(&request, body, "{\"reason\": TEXT}").await {
         Ok(order) => order,
         Err(refusal) => return Ok(refusal),
     };

@@ -16,7 +16,7 @@ use super::webots_viewer;
 use crate::asset;
 use crate::shared::http::assets::{self, Asset};
 use crate::shared::http::routing::{GET, READ, path};
-use crate::shared::http::{ConnectionKind, OWN_FILES, PageView, VIEWER, foreign_scripts, html, require_administrator};
+use crate::shared::http::{ConnectionKind, FOREIGN_SCRIPTS, OWN_FILES, PageView, VIEWER, html, require_administrator};
 use crate::simulation::container;
 use crate::simulation::ends::{last_lines, output_file};
 use crate::simulation::machine::{Tree, Usages};
@@ -179,5 +179,5 @@ async fn watch(
 
 /// Webots' own viewer shows what worlds bring: it runs in an embedded page with an origin of its own.
 async fn viewer() -> HttpResponse {
-    html(WebotsViewer.render(), &foreign_scripts(&[]))
+    html(WebotsViewer.render(), FOREIGN_SCRIPTS)
 }

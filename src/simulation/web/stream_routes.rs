@@ -5,8 +5,8 @@ use actix_web::http::header;
 use actix_web::{HttpRequest, HttpResponse, web};
 
 use super::origins::check_origin;
-use crate::shared::http::routing::{GET, path};
-use crate::shared::http::{ConnectionKind, body};
+use crate::shared::http::ConnectionKind;
+use crate::shared::http::routing::{GET, path, refuse_body};
 use crate::simulation::relay::{self, Upstream};
 use crate::simulation::slots::StreamTarget;
 use crate::simulation::state::AppState;
@@ -21,7 +21,7 @@ async fn stream(request: HttpRequest, server: web::Data<AppState>) -> actix_web:
     // As the client has written it: what it has encoded stays so.
     let (token, path) = relay::parse_path(request.uri().path()).ok_or_else(nothing)?;
     let StreamTarget { simulation, port, read_only } = server.slots.stream(token).ok_or_else(nothing)?;
-    if let Some(refusal) = body::refuse(&request) {
+    if let Some(refusal) = refuse_body(&request) {
         return Ok(refusal);
     }
     let headers = request.headers();

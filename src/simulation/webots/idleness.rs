@@ -27,7 +27,8 @@ impl Webots {
                 self.send(WebotsEvent::IdleEnd(None));
             }
         }
-        let limit = self.spec.config.idle_timeout;
+        let minutes = self.spec.config.idle_timeout;
+        let limit = Duration::from_secs_f64(60.0 * minutes);
         if limit.is_zero() || self.runs || !self.listening {
             return;
         }
@@ -35,7 +36,6 @@ impl Webots {
         let timer = ctx.run_later(limit.saturating_sub(notice), move |this, ctx| {
             this.send(WebotsEvent::IdleEnd(Some(Instant::now() + notice)));
             let timer = ctx.run_later(notice, move |this, _| {
-                let minutes = limit.as_secs_f64() / 60.0;
                 this.stop(EndReason::Idle, &format!("The simulation was paused for {minutes} minutes"));
             });
             this.idle_end = Some(IdleEnd { timer, is_announced: true });

@@ -48,8 +48,8 @@ pub struct End {
     pub taken: Taken,
 }
 
-/// Number of rotated files of its output.
-const OLD_LOGS: usize = 1;
+/// Size from which the file of its output is rotated, in bytes.
+const MAX_LOG: u64 = 500_000;
 /// Timeout of reading the rest of an output.
 const LAST_OUTPUT: Duration = Duration::from_secs(1);
 
@@ -87,7 +87,7 @@ pub fn launch(
 ) -> std::io::Result<(Launched, impl Future<Output = End> + use<>)> {
     let folder = spec.config.log_dir.0.join("simulation").join(FOLDER_OF_RUNNING);
     let log = folder.join(format!("{}.log", spec.slot.lease.id()));
-    let file = RotatedFile::open(&log, OLD_LOGS).inspect_err(|error| {
+    let file = RotatedFile::open(&log, MAX_LOG, "").inspect_err(|error| {
         let why = format!("what Webots prints is not kept: {} can't be written: {error}", log.display());
         spec.slot.lease.log(log::Level::Warn, &why, &why);
     });

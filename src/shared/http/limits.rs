@@ -1,14 +1,17 @@
-//! Limits of connections: in all, and for each client address.
+//! Limits of connections, in all and for each client address, and of what an address may do in a time: so that one does
+//! not use up everything.
 
 use std::collections::HashMap;
+use std::collections::hash_map::Entry;
 use std::net::IpAddr;
+use std::num::NonZeroU32;
 use std::sync::Arc;
 
 use actix_web::HttpResponse;
 use actix_web::http::StatusCode;
+use governor::{DefaultKeyedRateLimiter, Quota, RateLimiter};
 use parking_lot::Mutex;
 
-use super::address_quota::share;
 use super::peer::Peer;
 use super::routing::retry_after;
 
@@ -35,6 +38,12 @@ const MAX_CLIENTS_PER_ADDRESS: usize = 1000;
 /// Limit of pages that listen to `/events`.
 const MAX_PAGES: usize = 1000;
 
+/// Default limit for one address, of `all` slots, connections and the like: three quarters. A class often sits behind
+/// one address, and so may a client that would take everything.
+pub fn share(all: usize) -> usize {
+    all - all / 4
+}
+
 /// Counts the open connections of a server. Clones share their counts.
 #[derive(Debug, Clone)]
 pub struct ConnectionLimiter {
@@ -42,18 +51,20 @@ pub struct ConnectionLimiter {
     max_clients: usize,
     /// Limit of web clients per address.
     per_address: usize,
-    open: Arc<Mutex<HashMap<Key, usize>>>,
+    open: Counts,
 }
 
 /// What a number of open connections is about: those of an address, or all of a kind.
 type Key = (ConnectionKind, Option<IpAddr>);
+/// Numbers of open connections.
+type Counts = Arc<Mutex<HashMap<Key, usize>>>;
 
 /// One connection that is counted until this is dropped.
 #[derive(Debug)]
 pub struct ConnectionPermit {
     kind: ConnectionKind,
     address: Option<IpAddr>,
-    open: Arc<Mutex<HashMap<Key, usize>>>,
+    open: Counts,
 }
 
 /// Why a connection is refused, as text for the client.
@@ -125,12 +136,11 @@ impl Drop for ConnectionPermit {
     fn drop(&mut self) {
         let mut open = self.open.lock();
         for key in keys(self.kind, self.address) {
-            let left = open.get_mut(&key).map(|count| {
-                *count -= 1;
-                *count
-            });
-            if left == Some(0) {
-                open.remove(&key);
+            if let Entry::Occupied(mut count) = open.entry(key) {
+                *count.get_mut() -= 1;
+                if *count.get() == 0 {
+                    count.remove();
+                }
             }
         }
     }
@@ -143,6 +153,31 @@ impl actix_web::ResponseError for ConnectionLimitError {
             Self::FromAddress => StatusCode::TOO_MANY_REQUESTS,
         };
         HttpResponse::build(status).insert_header(retry_after()).body(self.to_string())
+    }
+}
+
+/// Largest number of addresses that are tracked.
+const MAX_ADDRESSES: usize = 10_000;
+
+/// Rate limit per client address.
+#[derive(Debug)]
+pub struct AddressQuota(DefaultKeyedRateLimiter<IpAddr>);
+
+impl AddressQuota {
+    /// An unused quota: `burst` times at once, and `per_minute` times in each minute after that.
+    pub fn new(burst: NonZeroU32, per_minute: NonZeroU32) -> Self {
+        Self(RateLimiter::keyed(Quota::per_minute(per_minute).allow_burst(burst)))
+    }
+
+    /// Takes one from the quota of an address. Returns whether it had one left; always true if the address is unknown,
+    /// or if too many addresses are tracked.
+    pub fn take(&self, address: Option<IpAddr>) -> bool {
+        let Some(address) = address else { return true };
+        if self.0.len() >= MAX_ADDRESSES {
+            // Drops the addresses whose whole quota is available again.
+            self.0.retain_recent();
+        }
+        self.0.len() >= MAX_ADDRESSES || self.0.check_key(&address).is_ok()
     }
 }
 
@@ -181,5 +216,14 @@ mod tests {
         drop(permit);
         assert_eq!(connections.open.lock().len(), 2);
         assert_eq!(connections.count(ConnectionKind::Client), 1);
+    }
+
+    #[test]
+    fn the_addresses_that_are_remembered_are_bounded() {
+        let quota = AddressQuota::new(NonZeroU32::new(200).unwrap(), NonZeroU32::new(12).unwrap());
+        for number in 0..12_000 {
+            assert!(quota.take(Some(std::net::Ipv4Addr::from_bits(number).into())));
+        }
+        assert!(quota.0.len() <= MAX_ADDRESSES);
     }
 }
