@@ -44,12 +44,10 @@ pub enum Cause {
 const MESSAGES: &[(Cause, &[&str])] = &[
     (Cause::Machine, &["No space left on device", "Disk quota exceeded", "Read-only file system"]),
     (Cause::Machine, &["Input/output error", "Too many open files", "Cannot allocate memory"]),
-    (Cause::Machine, &["Resource temporarily unavailable"]),
     // These hosts come from the configuration: URLs with other hosts are refused before.
     (Cause::Machine, &["Could not resolve host", "Failed to connect to", "Couldn't connect to"]),
-    (Cause::Machine, &["SSL certificate", "certificate verification failed"]),
-    (Cause::Moved, &["returned error: 301", "returned error: 302", "returned error: 303"]),
-    (Cause::Moved, &["returned error: 307", "returned error: 308"]),
+    (Cause::Machine, &["SSL certificate", "certificate verification failed", "Resource temporarily unavailable"]),
+    (Cause::Moved, &["returned error: 30"]),
     (Cause::TooLarge, &["invalid index-pack output"]),
     (Cause::NoRepository, &["could not read Username", "not found", "does not appear to be a git repository"]),
     (Cause::NoRepository, &["does not exist"]),

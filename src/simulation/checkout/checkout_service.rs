@@ -48,9 +48,8 @@ impl CheckoutService {
         let git = Arc::new(Git::new(run, Arc::clone(&config)));
         let cache = Arc::new(RepositoryCache::open(dir, git)?);
         let resolver = Arc::new(CommitResolver::new(Arc::clone(&cache), Arc::clone(&config), rules));
-        let runtime = Handle::current();
+        let (runtime, copies) = (Handle::current(), Semaphore::new(COPIES));
         let keeper = AbortOnDropHandle::new(runtime.spawn(cache.keep_within_budget()));
-        let copies = Semaphore::new(COPIES);
         Ok(Self { resolver, config, runtime, copies, _keeps_within_budget: keeper })
     }
 
@@ -93,7 +92,7 @@ impl CheckoutService {
                 done => break done?,
             }
         };
-        progress(steps::DONE.to_owned());
+        progress("checkout done".to_owned());
         Ok(project)
     }
 

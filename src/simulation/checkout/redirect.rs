@@ -14,9 +14,6 @@ use crate::simulation::config::{Mirrors, Remote};
 /// Limit of redirects for a world.
 pub const MAX_REDIRECTS: usize = 5;
 
-/// The first path that git requests from a Git host.
-const FIRST_QUESTION: &str = "/info/refs";
-
 /// The world in the repository to which its Git host redirects, and the remote of that repository.
 ///
 /// # Errors
@@ -68,7 +65,8 @@ fn target(
     target.set_query(None);
     target.set_fragment(None);
     let elsewhere = || format!("to {target}, from where this simulation server takes no worlds");
-    let repository = target.as_str().strip_suffix(FIRST_QUESTION).ok_or_else(elsewhere)?;
+    // The first path that git requests.
+    let repository = target.as_str().strip_suffix("/info/refs").ok_or_else(elsewhere)?;
     let moved = mirrors.moved(world, repository).ok_or_else(elsewhere)?;
     rules.admit(&moved, Load::ZERO).map_err(|refusal| format!("to {}. {refusal}", moved.repository()))?;
     Ok((moved, Remote { location: repository.to_owned(), protocol: "https" }))

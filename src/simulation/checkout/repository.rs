@@ -85,12 +85,11 @@ impl Repository {
     ) -> Result<(), CheckoutError> {
         let (this, key) = (Arc::clone(self), arguments.clone());
         let fetch = |sender: watch::Sender<String>| async move {
-            let lock = Arc::clone(&this.lock);
-            let guard = if let Ok(guard) = Arc::clone(&lock).try_lock_owned() {
+            let guard = if let Ok(guard) = Arc::clone(&this.lock).try_lock_owned() {
                 guard
             } else {
                 sender.send_replace("waiting for another fetch".to_owned());
-                lock.lock_owned().await
+                Arc::clone(&this.lock).lock_owned().await
             };
             this.has_grown.store(true, Relaxed);
             this.create().await?;

@@ -7,7 +7,7 @@ use std::fs::File;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Weak};
-use std::time::SystemTime;
+use std::time::{Duration, Instant, SystemTime};
 
 use sha2::{Digest, Sha256};
 use tokio::sync::{Mutex, Notify};
@@ -40,9 +40,14 @@ pub struct RepositoryCache {
 pub const COMMITS: &str = "";
 /// Contents of a repository: the commits of all branches and tags, without files if the remote supports that.
 pub const HISTORY: &str = " history";
+/// Time for which a killed server may still hold the lock: a child forked just before keeps the descriptor until
+/// `execve`.
+const LOCK_WAIT: Duration = Duration::from_secs(1);
+/// Interval between two attempts to lock.
+const RETRY_INTERVAL: Duration = Duration::from_millis(20);
 
 impl CacheDir {
-    /// Creates the directory if necessary, and locks it.
+    /// Creates the directory if necessary, and locks it. Blocks for up to a second, which is acceptable during start.
     ///
     /// # Errors
     /// When the directory can't be created, or another server uses it.
@@ -50,8 +55,13 @@ impl CacheDir {
         std::fs::create_dir_all(folder)?;
         let folder = folder.canonicalize()?;
         let lock = File::options().write(true).create(true).truncate(false).open(folder.join("lock"))?;
-        let used = "another simulation server uses it, and each needs one of its own";
-        lock.try_lock().map_err(|_| io::Error::other(used))?;
+        let deadline = Instant::now() + LOCK_WAIT;
+        while lock.try_lock().is_err() {
+            if Instant::now() > deadline {
+                return Err(io::Error::other("another simulation server uses it, and each needs one of its own"));
+            }
+            std::thread::sleep(RETRY_INTERVAL);
+        }
         Ok(Self { folder, _lock: lock })
     }
 }

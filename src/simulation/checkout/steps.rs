@@ -9,9 +9,6 @@ const STEPS: u64 = 9;
 /// The first and the last step of a fetch; the steps between them follow the received objects.
 const FETCH: (u64, u64) = (2, 7);
 
-/// The last text.
-pub const DONE: &str = "checkout done";
-
 fn step(number: u64, what: &str) -> String {
     format!("Step {number}/{STEPS} : {what}")
 }
