@@ -48,13 +48,12 @@ fn nothing_is_warned_about_where_all_is_there() {
     assert_eq!(config["xvfb"], true);
     let expected = format!(
         "webots: {}\ndisplay: each Webots gets a virtual display of its own (xvfb), without the graphics card\n\
-         git: git version 2.39.5 --version\ngit-lfs: git version 2.39.5 --version\nXvfb: {}/Xvfb\n\
+         git: git version 2.39.5 --version\ngit-lfs: git version 2.39.5 --version\n\
          isolation: sandbox\nnetwork: ",
-        webots.path().display(),
-        programs.path().display()
+        webots.path().display()
     );
     // The network is the machine's or one of each simulation's own.
-    assert!(told.starts_with(&expected) && told.lines().count() == 7, "{told}");
+    assert!(told.starts_with(&expected) && told.lines().count() == 6, "{told}");
 }
 
 #[test]
@@ -63,17 +62,17 @@ fn what_is_missing_is_warned_about() {
     for (keys, warnings) in [
         (
             json!({"webotsHome": "/nowhere", "xvfb": true}),
-            "webots: there is no program /nowhere/webots; webotsHome is the folder that Webots is installed in\n\
+            "webots: This simulation server has no Webots that it can run at \"/nowhere/webots\". Its administrator can set webotsHome\n\
+             display: This simulation server gives each Webots a display of its own (xvfb), but has no Xvfb.\n\
              git: git is not there: no world can be checked out\n\
              git-lfs: git-lfs is not there: large files of Git LFS will be missing\n\
-             Xvfb: it is not there, but xvfb is true: no Webots can start.\n\
              isolation: none, worlds' programs may do whatever this user may: bubblewrap (bwrap) is not there; on Debian, \
              Ubuntu and Fedora the package bubblewrap has it",
         ),
         (
             json!({"isolation": "sandbox", "display": ":59000"}),
             "isolation: the server does not start: isolation is \"sandbox\", but bubblewrap\n\
-             webots: neither webotsHome nor the environment variable WEBOTS_HOME is set",
+             webots: This simulation server does not know where Webots is installed. Its administrator can set webotsHome",
         ),
     ] {
         let (_, told) = check(&keys, path(empty.path()));
@@ -88,35 +87,6 @@ fn what_is_missing_is_warned_about() {
         let (_, told) = check(&keys, path(empty.path()));
         assert!(told.contains(words), "{told}");
     }
-}
-
-#[test]
-fn displays_that_do_not_fit_the_gpus_are_warned_about() {
-    let library = crate::simulation::readings::gpu_driver();
-    let webots = Webots::script("exit 0");
-    let table = [
-        (json!([]), "4", "GPUs: simulations are spread over Stand-in A, Stand-in B, Stand-in C, Stand-in D\n"),
-        (
-            json!([":90.0", ":90.1"]),
-            "4",
-            "warning: GPUs: displays names 2 of 4 GPUs' X screens: the other GPUs get no simulation\n",
-        ),
-        (json!([":90.0", ":90.1"]), "1", "warning: GPUs: displays names 2 X screens, but there are 1 GPUs\n"),
-        (
-            json!([]),
-            "0",
-            "warning: GPUs: gpus is \"spread\", but no NVIDIA GPU is read, so none is chosen: NVIDIA's driver knows none\n",
-        ),
-    ];
-    for (displays, count, words) in table {
-        let keys = json!({"webots": webots.path(), "gpus": "spread", "displays": displays});
-        let (_, told) = check(&keys, |command| {
-            command.env("LD_LIBRARY_PATH", library.path()).env("NVML_COUNT", count);
-        });
-        assert!(told.contains(words), "{words} is not in\n{told}");
-    }
-    let (_, told) = check(&json!({"displays": [":90.0"]}), |_| ());
-    assert!(told.contains("displays has no effect") && !told.contains("GPUs: "), "{told}");
 }
 
 #[test]
