@@ -167,7 +167,8 @@ pub fn webots_program(config: &SimulationConfig) -> Result<PathBuf, String> {
     }
     let how = "Its administrator can set webotsHome in the server's configuration, or the environment variable \
                WEBOTS_HOME";
-    let Some(program) = config.webots_program() else {
+    let in_home = config.webots_home.as_ref().map(|home| home.0.join("webots"));
+    let Some(program) = config.webots.as_ref().map(|program| program.0.clone()).or(in_home) else {
         return Err(format!("This simulation server does not know where Webots is installed. {how}."));
     };
     let program = std::path::absolute(&program).unwrap_or(program);

@@ -177,12 +177,6 @@ pub struct SimulationConfig {
 }
 
 impl SimulationConfig {
-    /// Returns the program that is started for each client; `None` if neither `webots` nor `webotsHome` is set.
-    pub fn webots_program(&self) -> Option<PathBuf> {
-        let own = self.webots.as_ref().map(|program| program.0.clone());
-        own.or_else(|| Some(self.webots_home.as_ref()?.0.join("webots")))
-    }
-
     /// Returns the files that may contain secrets: the configuration file, and those that it names.
     pub fn secret_files(&self) -> impl Iterator<Item = &Path> {
         let password = self.admin_password.as_ref().and_then(Secret::file);
