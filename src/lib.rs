@@ -32,7 +32,7 @@
 //!
 //! Each server also has a folder `config` (every key; time limits in `timing`), its `app` (start and end) and its `state`
 //! (what its paths share). Files of `simulation` are the wire [`protocol`](simulation::protocol), the `snapshot` of all
-//! simulations, the `simulation_id`, the `client_identity`, the `failed_starts`, the `announcer` (key `notify`), `preflight` (`--check`) and `readiness` (`/health`).
+//! simulations, the `simulation_id`, the `client_identity`, the `announcer` (key `notify`), `preflight` (`--check`) and `readiness` (`/health`).
 //! The programs are in `src/bin`.
 //! Imports point down only, in the order that `tests/project/layering.rs` lists. `session` and `simulation` never see each
 //! other. A child never names its parent. The parent gives it a `Recipient` for the child's events, which the child's file

@@ -5,10 +5,11 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use webots_fleet::shared::run::start;
-use webots_fleet::simulation::config::{IsolationSetting, SimulationConfig};
+use webots_fleet::simulation::app::{self, Application};
+use webots_fleet::simulation::config::SimulationConfig;
 use webots_fleet::simulation::container;
+use webots_fleet::simulation::preflight;
 use webots_fleet::simulation::process::guardian;
-use webots_fleet::simulation::{app, preflight};
 
 /// Runs one Webots per web client.
 #[derive(Parser)]
@@ -42,7 +43,7 @@ fn main() -> ExitCode {
     let arguments = Arguments::parse();
     if let Some(Part::Sweep { config }) = &arguments.part {
         let config = start::read::<SimulationConfig>(config).config;
-        if config.isolation == IsolationSetting::Container {
+        if config.docker {
             container::sweep_all(&container::ResourceOwner::of(&config.cache_dir.0));
         }
         return ExitCode::SUCCESS;
@@ -62,5 +63,6 @@ fn main() -> ExitCode {
     }
     let log = loaded.config.log_dir.0.join("simulation/output.log");
     let log = (!loaded.config.debug).then_some(log.as_path());
-    start::serve(log, &arguments.options, &loaded.warnings, app::run(loaded.config.clone()))
+    let server = async { app::serve(Application::new(loaded.config.clone())?).await };
+    start::serve(log, &arguments.options, &loaded.warnings, server)
 }

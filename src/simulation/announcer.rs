@@ -6,6 +6,7 @@ use std::time::Duration;
 use super::config::SimulationConfig;
 use crate::shared::domain::UrlPrefix;
 use crate::shared::http::tls;
+use crate::shared::text::excerpt;
 
 /// Number of attempts for each address.
 const TRIES: u32 = 6;
@@ -14,12 +15,8 @@ const ANSWER: Duration = Duration::from_secs(10);
 
 /// Size limit of an answer, in bytes.
 const MAX_ANSWER_SIZE: usize = 64 * 1024;
-
-/// An answer that refuses an announcement, although its status is 200.
-#[derive(serde::Deserialize)]
-struct Refusal {
-    error: serde_json::Value,
-}
+/// How much of it is logged, in characters.
+const SHOWN: usize = 200;
 
 /// Starts the announcements of a server.
 pub fn start(config: &SimulationConfig) {
@@ -44,11 +41,12 @@ async fn announce(address: String, form: Vec<(&'static str, String)>, pause: Dur
         let problem = match client.post(&address).send_form(&form).await {
             Ok(mut answer) if answer.status().is_success() => {
                 let body = answer.body().limit(MAX_ANSWER_SIZE).await.unwrap_or_default();
-                let Ok(Refusal { error }) = serde_json::from_slice(&body) else {
-                    log::info!("announced to {address}");
-                    return;
-                };
-                format!("it answered {error}")
+                // Some refuse with status 200 and words.
+                log::info!(
+                    "announced to {address}, which answered {:?}",
+                    excerpt(&String::from_utf8_lossy(&body), SHOWN)
+                );
+                return;
             }
             Ok(answer) => format!("it answered {}", answer.status()),
             Err(error) => tls::reason(&error).unwrap_or_else(|| error.to_string()),

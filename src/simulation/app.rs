@@ -9,7 +9,7 @@ use actix_web::{App, web};
 use tokio::sync::watch;
 
 use super::announcer;
-use super::config::{IsolationSetting, SimulationConfig};
+use super::config::SimulationConfig;
 use super::ends::Ends;
 use super::readiness;
 use super::slots::SlotPool;
@@ -38,14 +38,6 @@ const OWN_FILES: usize = 128;
 /// Largest number of open files of a simulation, besides its client's connection: pipes and processes of git and
 /// Webots, its log.
 const FILES_PER_SIMULATION: usize = 8;
-
-/// Runs the server until a signal or an administrator stops it.
-///
-/// # Errors
-/// When the server can't start, or an actor that must live has stopped.
-pub async fn run(config: SimulationConfig) -> Result<(), AppError> {
-    serve(Application::new(config)?).await
-}
 
 /// A server that is ready to serve: its port is bound, and its actors run.
 pub struct Application {
@@ -98,7 +90,7 @@ pub async fn serve(assembly: Application) -> Result<(), AppError> {
         trusted_proxies: server.config.trusted_proxies.clone(),
     };
     let simulations = server.launcher.reached().unwrap_or_else(|| server.config.address_of_simulations());
-    let stream_thread = StreamThread::start().map_err(|why| format!("streams can't be relayed: {why}"))?;
+    let stream_thread = StreamThread::start()?;
     let silence = options.silence;
     let app = move || {
         let upstream = Upstream::new(simulations, stream_thread.clone(), silence);
@@ -164,8 +156,7 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
     let run = RunDir::open(&folder).map_err(cache_fault)?;
     let launcher = Launcher::start(&config)?;
     let no_containers = |why| format!("isolation is \"container\", but {why}");
-    let in_containers = config.isolation == IsolationSetting::Container;
-    let containers = in_containers.then(|| ContainerService::open(Arc::clone(&config), run.path()));
+    let containers = config.docker.then(|| ContainerService::open(Arc::clone(&config), run.path()));
     let containers = containers.transpose().map_err(no_containers)?.map(Arc::new);
     let rules = AdmissionRules {
         allowed: config.allowed_repositories.clone(),
@@ -177,18 +168,15 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
     let checkouts = checkouts.map_err(cache_fault)?;
     let metrics = Metrics::default();
     let logs = config.log_dir.0.join("simulation");
-    let ends = Ends::start(logs, launcher.level.to_string(), &metrics);
-    let ends = ends.map_err(|why| format!("ends of simulations can't be recorded: {why}"))?;
+    let ends = Ends::start(logs, launcher.level.to_string(), &metrics)?;
     let (per_address, per_user) = (config.max_places_per_address, config.max_places_per_user);
     let slots = SlotPool::new(config.streaming_ports(), config.waiting_line, per_address, per_user, ends.clone());
     let csv = config.monitor_log_enabled.then(|| config.log_dir.0.join("simulation/monitor.csv"));
-    let spread = config.spreads().then(|| Arc::new(Spread::over(config.displays_of_gpus().len())));
-    let (load_monitor, readings) = LoadMonitor::new(slots.clone(), run.path(), csv, spread.clone());
-    let load_monitor = load_monitor.start();
+    let spread = Arc::new(Spread::over(config.displays_of_gpus().len()));
+    let (load_monitor, readings) = LoadMonitor::new(slots.clone(), run.path(), csv, spread.clone())?;
+    let load_monitor = LoadMonitor::start_in_arbiter(&Arbiter::new().handle(), |_| load_monitor);
     announcer::start(&config);
-    let usage = UsageMonitor::default();
-    let watcher = Watcher::start(run.path().to_owned(), config.disk_reserve, usage.clone());
-    let watcher = watcher.map_err(|error| format!("simulations can't be watched: {error}"))?;
+    let watcher = Watcher::start(run.path().to_owned(), config.disk_reserve)?;
     let starts = metrics.counter("webots_simulation_starts_total", "Simulations that were asked for", "outcome")?;
     for outcome in ["ready", "refused", "full"] {
         starts.with_label_values(&[outcome]);
@@ -205,7 +193,7 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
         sessions: Arc::default(),
         load_monitor,
         readings,
-        spread,
+        spread: config.spreads().then_some(spread),
         checkouts: Arc::new(checkouts),
         launcher: Arc::new(launcher),
         containers,
@@ -219,7 +207,7 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
         start_quota: quota::starts(config.max_connections),
         live: LiveUpdates::default(),
         administrators: LiveUpdates::default(),
-        usage,
+        usage: UsageMonitor::default(),
         watcher,
         started: Instant::now(),
         config,

@@ -8,7 +8,6 @@ pub mod client_identity;
 pub mod config;
 pub mod container;
 pub mod ends;
-pub mod failed_starts;
 mod isolation;
 pub mod machine;
 pub mod preflight;

@@ -58,9 +58,6 @@ pub struct Simulation {
     pub launched: Option<u64>,
     /// The root of its process tree, once it is launched.
     pub pid: Option<i32>,
-    /// The directory of its control group, if it has one.
-    #[serde(skip)]
-    pub cgroup: Option<PathBuf>,
     /// The streaming port, once there is one.
     pub port: Option<u16>,
     /// The number of its GPU, where simulations are spread over several.
@@ -87,7 +84,6 @@ impl Simulation {
             since: seconds_since_1970(),
             launched: None,
             pid: None,
-            cgroup: None,
             port: None,
             gpu: None,
             away_until: None,

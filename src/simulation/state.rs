@@ -8,7 +8,7 @@ use tokio::sync::watch;
 
 use super::config::SimulationConfig;
 use super::ends::Ends;
-use super::failed_starts::FailedStarts;
+use super::readiness::FailedStarts;
 use super::sessions::Sessions;
 use super::slots::SlotPool;
 use crate::shared::domain::{AdmissionRules, Load, ProjectUrl};
@@ -123,9 +123,7 @@ impl AppState {
         if self.is_draining() {
             return Err("This simulation server is about to end, and takes no new clients".to_owned());
         }
-        if let Some(problem) = self.problem() {
-            return Err(problem);
-        }
+        self.problem().map_or(Ok(()), Err)?;
         self.rules.admit(&world, self.load()).map_err(|refusal| refusal.to_string())?;
         Ok(world)
     }

@@ -37,13 +37,12 @@ fn nothing_is_warned_about_where_all_is_there() {
     assert_eq!(config["xvfb"], true);
     let expected = format!(
         "webots: {}\ndisplay: each Webots gets a virtual display of its own (xvfb), without the graphics card\n\
-         git: git version 2.39.5 --version\ngit-lfs: git version 2.39.5 --version\nXvfb: {}/Xvfb\n\
+         git: git version 2.39.5 --version\ngit-lfs: git version 2.39.5 --version\n\
          isolation: sandbox\nnetwork: ",
-        webots.path().display(),
-        programs.path().display()
+        webots.path().display()
     );
     // The network is the machine's or one of each simulation's own.
-    assert!(told.starts_with(&expected) && told.lines().count() == 7, "{told}");
+    assert!(told.starts_with(&expected) && told.lines().count() == 6, "{told}");
 }
 
 #[test]
@@ -54,22 +53,21 @@ fn what_is_missing_or_does_not_fit_is_warned_about() {
     for (keys, told_of, untold) in [
         (
             json!({"webotsHome": "/nowhere", "xvfb": true}),
-            "warning: webots: there is no program /nowhere/webots; webotsHome is the folder that Webots is installed in\n\
-             warning: git: git is not there: no world can be checked out\n\
-             warning: git-lfs: git-lfs is not there: large files of Git LFS will be missing\n\
-             warning: Xvfb: it is not there, but xvfb is true: no Webots can start.\n\
-             warning: isolation: none, worlds' programs may do whatever this user may: bubblewrap (bwrap) is not there; on \
-             Debian, Ubuntu and Fedora the package bubblewrap has it",
-            "GPUs: ",
+            "webots: This simulation server has no Webots that it can run at \"/nowhere/webots\". Its administrator can set webotsHome\n\
+             display: This simulation server gives each Webots a display of its own (xvfb), but has no Xvfb.\n\
+             git: git is not there: no world can be checked out\n\
+             git-lfs: git-lfs is not there: large files of Git LFS will be missing\n\
+             isolation: none, worlds' programs may do whatever this user may: bubblewrap (bwrap) is not there; on Debian, \
+             Ubuntu and Fedora the package bubblewrap has it",
+            pose,
         ),
         (
             json!({"isolation": "sandbox", "display": ":59000"}),
-            "warning: isolation: the server does not start: isolation is \"sandbox\", but bubblewrap\n\
-             warning: webots: neither webotsHome nor the environment variable WEBOTS_HOME is set",
+            "isolation: the server does not start: isolation is \"sandbox\", but bubblewrap\n\
+             webots: This simulation server does not know where Webots is installed. Its administrator can set webotsHome",
             pose,
         ),
         (json!({"sandbox": {"readable": "/nowhere/at/all"}}), "sandbox: /nowhere/at/all is not there", pose),
-        (json!({"displays": [":90.0"]}), "displays has no effect", "GPUs: "),
         (
             json!({"isolation": "none", "allowedRepositories": []}),
             "isolation: none\nallowedRepositories is not set: no world will run here",
@@ -94,30 +92,6 @@ fn what_is_missing_or_does_not_fit_is_warned_about() {
         });
         assert!(told_of.lines().all(|words| told.contains(words)), "{told_of} is not in\n{told}");
         assert!(!told.contains(untold), "{untold} is in\n{told}");
-    }
-}
-
-#[test]
-fn displays_that_do_not_fit_the_gpus_are_warned_about() {
-    let library = crate::simulation::readings::gpu_driver();
-    for (displays, count, words) in [
-        (json!([]), "4", "GPUs: simulations are spread over Stand-in A, Stand-in B, Stand-in C, Stand-in D\n"),
-        (
-            json!([":90.0", ":90.1"]),
-            "4",
-            "warning: GPUs: displays names 2 of 4 GPUs' X screens: the other GPUs get no simulation\n",
-        ),
-        (json!([":90.0", ":90.1"]), "1", "warning: GPUs: displays names 2 X screens, but there are 1 GPUs\n"),
-        (
-            json!([]),
-            "0",
-            "warning: GPUs: gpus is \"spread\", but no NVIDIA GPU is read, so none is chosen: NVIDIA's driver knows none\n",
-        ),
-    ] {
-        let (_, told) = check(&json!({"gpus": "spread", "displays": displays}), |command| {
-            command.env("LD_LIBRARY_PATH", library.path()).env("NVML_COUNT", count);
-        });
-        assert!(told.contains(words), "{words} is not in\n{told}");
     }
 }
 

@@ -111,7 +111,7 @@ async fn without_webots_everything_runs_and_a_client_is_told_what_to_do() {
     // Without a name: local.
     let started = project.server_sh(&["start"]).await;
     assert_eq!(started.code, Some(0), "{started:#?}");
-    assert!(started.errors.contains("warning: webots: there is no program"), "{started:#?}");
+    assert!(started.errors.contains("warning: webots: This simulation server has no Webots"), "{started:#?}");
     let mut client = Client::connect(&format!("ws://localhost:{}/client", project.simulation)).await;
     let world = "https://github.com/cyberbotics/webots/blob/released/projects/languages/python/worlds/example.wbt";
     client.send(&serde_json::json!({"start": {"url": world}}).to_string()).await;

@@ -13,8 +13,8 @@ const ROOMS: [(&str, &str); 3] = [
     ("session", "placement config mail fleet state web app"),
     (
         "simulation",
-        "client_identity simulation_id snapshot ends failed_starts sessions slots relay protocol process machine config checkout \
-         isolation container preflight announcer webots readiness state client web app",
+        "client_identity simulation_id snapshot ends sessions slots relay protocol process machine config checkout \
+         isolation container readiness preflight announcer webots state client web app",
     ),
 ];
 

@@ -29,7 +29,6 @@ int nvmlDeviceGetCount_v2(unsigned *count) { unloaded |= marked("NVML_UNLOADED")
 int nvmlDeviceGetHandleByIndex_v2(unsigned index, void **device) { *device = (void *)(unsigned long)(index + 1); return 0; }
 int nvmlDeviceGetUtilizationRates(void *device, rates *out) {
   hang("read");
-  if (number(device) == atoi(at("NVML_LOST_INDEX")) && marked("NVML_LOST")) return 15;
   char compute[] = "NVML_COMPUTE_0";
   compute[sizeof compute - 2] += number(device);
   out->gpu = atoi(at(compute));
@@ -37,6 +36,7 @@ int nvmlDeviceGetUtilizationRates(void *device, rates *out) {
   return 0;
 }
 int nvmlDeviceGetMemoryInfo_v2(void *device, memory *out) {
+  if (number(device) == atoi(at("NVML_LOST_INDEX")) && marked("NVML_LOST")) return 15;
   out->total = 8ULL << 30;
   out->used = device == (void *)1 ? 6ULL << 30 : 1ULL << 30;
   out->reserved = 0;

@@ -51,9 +51,9 @@ async fn gpus_that_are_lost_are_told_and_come_back() {
     let library = gpu_driver();
     let mark = library.path().join("mark");
     for (variable, words, left) in [
-        ("NVML_LOST", "NVIDIA's driver has lost 1 of 2 GPUs", 1),
-        ("NVML_GONE", "no GPU answers any more, of 2 that did", 0),
-        ("NVML_ONE", "1 of 2 GPUs don't answer any more", 1),
+        ("NVML_LOST", "1 of 2 GPUs don't answer", 1),
+        ("NVML_GONE", "2 of 2 GPUs don't answer", 0),
+        ("NVML_ONE", "1 of 2 GPUs don't answer", 1),
     ] {
         let server = with(library.path()).env(variable, mark.to_str().unwrap()).start().await;
         let gpus = async || server.status().await["gpus"].as_array().unwrap().len();
@@ -101,7 +101,7 @@ async fn a_server_that_requires_gpus_is_ready_only_with_them() {
     std::fs::write(&mark, "").unwrap();
     until("it is not ready", async || server.health().await.0 == 503).await;
     let (_, told) = server.health().await;
-    assert!(told.contains("(requireGpu), but NVIDIA's driver has lost 1 of 2 GPUs"), "{told}");
+    assert!(told.contains("(requireGpu), but 1 of 2 GPUs don't answer"), "{told}");
     std::fs::remove_file(&mark).unwrap();
     until("it is ready again", async || server.health().await.1 == "ok").await;
     let server = demo_server(1).set("requireGpu", true).start().await;
@@ -219,5 +219,4 @@ async fn without_being_told_simulations_are_not_spread() {
     let _client = Client::ready(&server).await;
     let told = given(&server).await;
     assert!(told.iter().all(|one| *one == (None, String::new(), ":91".to_owned())), "{told:?}");
-    assert!(server.log().contains("displays has no effect"), "{}", server.log());
 }

@@ -125,8 +125,8 @@ async fn paths_may_have_spaces_and_quotes() {
         assert!(!xvfb || told.contains("with a display | "), "{told}");
         assert!(told.contains(" p q's [opened] p q's/worlds/b  \"c\".wbt"), "{told}");
         assert!(!told.contains("the cache's"), "{told}");
-        let failed = PathBuf::from(at("the log's")).join("simulation/failed");
-        let kept = || std::fs::read_dir(&failed).into_iter().flatten().flatten().map(|file| file.path());
+        let ended = PathBuf::from(at("the log's")).join("simulation/ended");
+        let kept = || std::fs::read_dir(&ended).into_iter().flatten().flatten().map(|file| file.path());
         let has_it = |log: &PathBuf| std::fs::read_to_string(log).is_ok_and(|text| text.contains("[opened]"));
         until("its output is kept", async || kept().filter(has_it).count() == 1 + usize::from(xvfb)).await;
         until("its folder is gone", async || instance_folders_in(Path::new(&at("the cache's"))).is_empty()).await;

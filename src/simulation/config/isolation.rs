@@ -27,12 +27,7 @@ pub enum IsolationSetting {
 
 impl fmt::Display for IsolationSetting {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        out.write_str(match self {
-            Self::None => "none",
-            Self::Sandbox => "sandbox",
-            Self::Auto => "auto",
-            Self::Container => "container",
-        })
+        self.serialize(out)
     }
 }
 

@@ -1,7 +1,6 @@
 //! The simulation server's configuration: every key, its default, and the rules between keys.
 
 mod container;
-mod gpus;
 mod isolation;
 mod mirrors;
 mod resources;
@@ -10,10 +9,9 @@ mod timing;
 mod urls;
 
 pub use container::{ContainerDisplay, ContainerNetwork, ContainerSettings, EDITOR_PORT};
-pub use gpus::GpuUse;
 pub use isolation::{IsolationSetting, SandboxFolders, SandboxNetwork, VariableName};
 pub use mirrors::{Mirrors, Remote};
-pub use resources::ResourceLimits;
+pub use resources::{GpuUse, ResourceLimits};
 pub use simulation_config::SimulationConfig;
 pub use timing::Timing;
 pub use urls::Streaming;

@@ -1,4 +1,4 @@
-//! The key `limits`: the resource limits of one simulation.
+//! The keys `limits` and `gpus`: what one simulation may take of the machine.
 
 use serde::{Deserialize, Serialize};
 
@@ -31,4 +31,15 @@ pub struct ResourceLimits {
     #[serde(deserialize_with = "optional_whole::<1, 100_000_000, _, _>")]
     pub cores: Option<u64> = None,
 }
+}
+
+/// Which GPU a simulation gets, of several.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum GpuUse {
+    /// What drivers choose, which is the first; containers get all.
+    #[default]
+    First,
+    /// The one with the least load when it starts.
+    Spread,
 }

@@ -8,20 +8,19 @@ use actix_web::http::header::HeaderName;
 use serde::{Deserialize, Serialize};
 
 use super::container::{ContainerDisplay, ContainerSettings, EDITOR_PORT};
-use super::gpus::GpuUse;
 use super::isolation::{IsolationSetting, SandboxFolders, VariableName};
 use super::mirrors::Mirrors;
-use super::resources::ResourceLimits;
+use super::resources::{GpuUse, ResourceLimits};
 use super::timing::Timing;
 use super::urls::Streaming;
 use crate::shared::config::keys::keys;
 use crate::shared::config::{
-    Configuration, ExpandedPath, Secret, expanded, is_web_url, minutes, one_or_many, optional_whole, percent, require,
-    seconds, whole,
+    Configuration, ExpandedPath, Secret, expanded, minutes, one_or_many, optional_whole, percent, require, seconds,
+    whole,
 };
 use crate::shared::domain::{PublicUrl, UrlPrefix, complete_host};
 use crate::shared::http::{Origin, TrustedProxies};
-use crate::simulation::machine::display::{self, DisplayName};
+use crate::simulation::machine::display;
 
 keys! {
 /// Every key of the simulation server. The original's keys keep their meaning.
@@ -147,9 +146,9 @@ pub struct SimulationConfig {
     pub gpus: GpuUse = GpuUse::default(),
     /// The X screen that each GPU drives, in the order of `nvidia-smi`; with `gpus: "spread"`. Default: none.
     #[serde(deserialize_with = "one_or_many")]
-    pub displays: Vec<DisplayName> = Vec::new(),
+    pub displays: Vec<String> = Vec::new(),
     /// The display that Webots opens its window on. Default: the environment variable `DISPLAY`, else `:0`.
-    pub display: Option<DisplayName> = None,
+    pub display: Option<String> = None,
     /// Give each Webots a virtual display of its own (needs `Xvfb`). Default: false.
     pub xvfb: bool = false,
     /// Seconds after six missed heartbeats until a simulation is ended. Default: 60.
@@ -169,14 +168,6 @@ pub struct SimulationConfig {
 }
 
 impl SimulationConfig {
-    /// Returns the program that is started for each client; `None` if neither `webots` nor `webotsHome` is set.
-    pub fn webots_program(&self) -> Option<PathBuf> {
-        if let Some(program) = &self.webots {
-            return Some(program.0.clone());
-        }
-        self.webots_home.as_ref().map(|home| home.0.join("webots"))
-    }
-
     /// Returns the files that may contain secrets: the configuration file, and those that it names.
     pub fn secret_files(&self) -> impl Iterator<Item = &Path> {
         let password = self.admin_password.as_ref().and_then(Secret::file);
@@ -185,15 +176,13 @@ impl SimulationConfig {
 
     /// Whether simulations are spread over the GPUs of the machine.
     pub fn spreads(&self) -> bool {
-        self.gpus == GpuUse::Spread && (self.container.gpu || self.isolation != IsolationSetting::Container)
+        self.gpus == GpuUse::Spread && (self.container.gpu || !self.docker)
     }
 
     /// The displays of the GPUs, where Webots opens its windows on them.
-    pub fn displays_of_gpus(&self) -> &[DisplayName] {
-        let is_virtual = match self.isolation {
-            IsolationSetting::Container => self.container.display == ContainerDisplay::Virtual,
-            _ => self.xvfb,
-        };
+    pub fn displays_of_gpus(&self) -> &[String] {
+        let in_container = self.container.display == ContainerDisplay::Virtual;
+        let is_virtual = if self.docker { in_container } else { self.xvfb };
         if self.spreads() && !is_virtual { &self.displays } else { &[] }
     }
 
@@ -201,6 +190,12 @@ impl SimulationConfig {
     pub fn display_on(&self, gpu: Option<u32>) -> String {
         let own = self.displays_of_gpus().get(gpu.unwrap_or_default() as usize);
         display::effective(own.or(self.display.as_ref()))
+    }
+
+    /// The displays on which simulations open their windows.
+    pub fn all_displays(&self) -> Vec<String> {
+        let count = self.displays_of_gpus().len().max(1);
+        (0..count).map(|gpu| self.display_on(u32::try_from(gpu).ok())).collect()
     }
 }
 
@@ -247,16 +242,6 @@ impl Configuration for SimulationConfig {
             require(HeaderName::try_from(header).is_ok(), "userHeader", || {
                 format!("{header:?} is no name of a header, such as X-Forwarded-User")
             })?;
-        }
-        for address in &self.notify {
-            require(is_web_url(address), "notify", || {
-                format!("{address:?} is no URL; allowed are http and https URLs")
-            })?;
-        }
-        if !self.displays.is_empty() && self.displays_of_gpus().is_empty() {
-            let why =
-                "they count with gpus: \"spread\" only, and not where each Webots has a virtual display of its own";
-            warnings.push(format!("displays has no effect: {why}"));
         }
         if self.allowed_repositories.is_empty() {
             let effect = if self.docker && self.share_idle_time > 0.0 {

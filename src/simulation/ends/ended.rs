@@ -1,10 +1,66 @@
-//! A simulation that has ended.
+//! A simulation that has ended, and why: one of a small fixed set of reasons, for counters and tables.
 
 use std::time::Duration;
 
-use super::end_reason::EndReason;
 use crate::shared::http::Peer;
 use crate::simulation::snapshot::Simulation;
+
+/// Why a simulation has ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum EndReason {
+    /// Its client has left, or was disconnected.
+    Left,
+    /// Webots has exited by itself, without an error.
+    Finished,
+    /// It has reached the time limit.
+    TimeLimit,
+    /// It was paused for too long.
+    Idle,
+    /// The server was stopped.
+    Stopped,
+    /// The administrator has stopped it.
+    Administrator,
+    /// Its world could not be checked out.
+    NoCheckout,
+    /// Webots did not become ready.
+    NoWebots,
+    /// Webots was ready, and has ended with an error.
+    Crashed,
+    /// Webots sent no heartbeat.
+    Hung,
+    /// It has exceeded a limit of memory, disk or processes.
+    Limit,
+    /// An error of this server, its machine or its Docker.
+    Fault,
+}
+
+impl EndReason {
+    /// All of them, with their names in `/metrics`, in `simulations.csv` and on the monitor.
+    pub const ALL: [(Self, &'static str); 12] = [
+        (Self::Left, "left"),
+        (Self::Finished, "finished"),
+        (Self::TimeLimit, "time_limit"),
+        (Self::Idle, "idle"),
+        (Self::Stopped, "stopped"),
+        (Self::Administrator, "administrator"),
+        (Self::NoCheckout, "no_checkout"),
+        (Self::NoWebots, "no_webots"),
+        (Self::Crashed, "crashed"),
+        (Self::Hung, "hung"),
+        (Self::Limit, "limit"),
+        (Self::Fault, "fault"),
+    ];
+
+    /// Its name.
+    pub fn label(self) -> &'static str {
+        Self::ALL.iter().find(|(reason, _)| *reason == self).map_or("", |(_, label)| label)
+    }
+
+    /// Whether its cause may have to be found, so that its output is kept for longer. A failed checkout has no output.
+    pub fn is_abnormal(self) -> bool {
+        matches!(self, Self::NoWebots | Self::Crashed | Self::Hung | Self::Limit | Self::Fault)
+    }
+}
 
 /// The resources that a simulation has used, as far as they are known.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]

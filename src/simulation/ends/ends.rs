@@ -10,8 +10,7 @@ use parking_lot::Mutex;
 use prometheus::IntCounterVec;
 use tokio::sync::oneshot;
 
-use super::end_reason::EndReason;
-use super::ended::Ended;
+use super::ended::{EndReason, Ended};
 use super::{csv, kept_output};
 use crate::shared::http::Metrics;
 

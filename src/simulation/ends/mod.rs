@@ -1,12 +1,10 @@
 //! How simulations have ended: counted, in `simulations.csv`, on the monitor, and with their output in files.
 
 mod csv;
-mod end_reason;
 mod ended;
 mod ends;
 mod kept_output;
 
-pub use end_reason::EndReason;
-pub use ended::{End, Ended, Taken};
+pub use ended::{End, EndReason, Ended, Taken};
 pub use ends::Ends;
 pub use kept_output::{FOLDER_OF_RUNNING, last_lines, output_file};

@@ -12,7 +12,6 @@ use procfs::process::Process;
 
 use crate::simulation::config::ResourceLimits;
 use crate::simulation::ends::Taken;
-use crate::simulation::machine::{cgroup_time, number_in};
 
 /// The control groups below this server's own.
 pub struct Cgroups(PathBuf);
@@ -126,6 +125,18 @@ pub(super) fn taken_by_container(container: &str) -> Taken {
     };
     let all = names.iter().flat_map(|name| [taken_in(&root.join(name)), of_version_1(name)]);
     all.fold(Taken::default(), |all, one| Taken { memory: all.memory.or(one.memory), time: all.time.or(one.time) })
+}
+
+/// The CPU time of all that has run in a cgroup v2.
+fn cgroup_time(folder: &Path) -> Option<Duration> {
+    let times = std::fs::read_to_string(folder.join("cpu.stat")).ok()?;
+    let time = times.lines().find_map(|line| line.strip_prefix("usage_usec "))?;
+    time.trim().parse().ok().map(Duration::from_micros)
+}
+
+/// The number in a file of the kernel.
+fn number_in(file: &Path) -> Option<u64> {
+    std::fs::read_to_string(file).ok()?.trim().parse().ok()
 }
 
 /// Ends all that is in a group. What is forked meanwhile is ended too.

@@ -12,7 +12,10 @@ use std::path::{Path, PathBuf};
 
 use which::which;
 
-use crate::simulation::machine::display::{COOKIE, EVERY_HOST};
+/// The only authorization method that all programs and displays know.
+const COOKIE: &str = "MIT-MAGIC-COOKIE-1";
+/// In an authority file: the entry counts for every host. `FamilyWild` of X11/Xauth.h.
+const EVERY_HOST: u16 = 0xffff;
 
 /// The display of a simulation.
 pub enum Display {

@@ -138,8 +138,7 @@ impl OwnNetwork {
 
 /// A display of the configuration that is reached by TCP.
 fn remote_display(config: &SimulationConfig) -> Option<String> {
-    let of_gpus = (0..config.displays_of_gpus().len()).map(|index| config.display_on(u32::try_from(index).ok()));
-    let mut displays = of_gpus.chain([config.display_on(None)]).filter(|_| !config.xvfb);
+    let mut displays = config.all_displays().into_iter().filter(|_| !config.xvfb);
     displays.find(|display| display::socket(display).is_none())
 }
 

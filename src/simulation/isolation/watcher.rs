@@ -20,7 +20,7 @@ use tokio::sync::oneshot;
 use super::disk::Disk;
 use super::disk_use::{DiskUse, words};
 use super::peak::Peak;
-use crate::simulation::machine::{Tree, UsageMonitor};
+use crate::simulation::machine::usages;
 
 /// Monitors simulations. Its thread ends when the last clone is dropped.
 #[derive(Debug, Clone)]
@@ -64,9 +64,9 @@ impl Watcher {
     ///
     /// # Errors
     /// When the system can't start a thread.
-    pub fn start(run: PathBuf, reserve: u64, usage: UsageMonitor) -> io::Result<Self> {
+    pub fn start(run: PathBuf, reserve: u64) -> io::Result<Self> {
         let (watches, receiver) = channel();
-        let mut table = Table { disk: Disk::new(run, reserve), usage, all: Vec::new() };
+        let mut table = Table { disk: Disk::new(run, reserve), all: Vec::new() };
         std::thread::Builder::new().name("watcher".to_owned()).spawn(move || table.run(&receiver))?;
         Ok(Self(watches))
     }
@@ -95,7 +95,6 @@ impl Watched {
 /// All monitored simulations.
 struct Table {
     disk: Disk,
-    usage: UsageMonitor,
     all: Vec<Watched>,
 }
 
@@ -177,7 +176,7 @@ impl Table {
         let is_counted =
             |watch: &Watch| watch.processes.is_some() || watch.peak.as_ref().is_some_and(|peak| peak.is_of_tree());
         let trees = self.all.iter().map(|one| &one.watch).filter(|watch| is_counted(watch));
-        let usages = self.usage.read(&trees.map(|watch| Tree::of(watch.disk.root)).collect::<Vec<_>>());
+        let usages = usages(&trees.map(|watch| watch.disk.root).collect::<Vec<_>>());
         for one in &mut self.all {
             let usage = usages.get(&one.watch.disk.root);
             one.watch.peak.iter().for_each(|peak| peak.look(usage));

@@ -1,91 +1,107 @@
-//! The GPUs of the machine: those that answer, and whether some are lost. Pure; the caller passes the time.
+//! The NVIDIA GPUs of the machine (NVML): those that answer, and whether some are lost. A thread reads them, because their
+//! driver may hang.
 
+use std::ffi::OsStr;
 use std::time::{Duration, Instant};
 
-use super::sensors::{Gpu, GpuReading};
+use nvml_wrapper::Nvml;
+use nvml_wrapper::error::NvmlError;
+use tokio::sync::watch;
 
-/// Time for which a reading is used, and timeout of silent GPUs.
+use super::sensors::{Gpu, percent};
+
+/// Interval between two readings.
+const PERIOD: Duration = Duration::from_secs(1);
+/// Time for which a reading is used.
 const SILENCE: Duration = Duration::from_secs(10);
+/// Time after which a driver that is missing, or has lost a GPU, is opened again: it may have been loaded since then.
+const OPEN_AGAIN: Duration = Duration::from_secs(10);
+/// The driver installs its library under this name; only the development package installs the one without version.
+const LIBRARY: &str = "libnvidia-ml.so.1";
 
-/// What is known of the GPUs.
-#[derive(Debug, Default)]
-pub(super) struct Gpus {
-    /// The last reading, and its time.
-    reading: Option<(Instant, GpuReading)>,
-    /// The largest number that have answered at once, and when that many last did.
-    answered: Option<(Instant, usize)>,
-    problem: Option<String>,
+/// A reading of all GPUs.
+#[derive(Debug)]
+pub(super) struct GpuReading {
+    /// Its time.
+    pub at: Instant,
+    /// The GPUs that answer.
+    pub gpus: Vec<Gpu>,
+    /// Number of GPUs, with those that don't answer: they may have fallen off their bus.
+    pub known: usize,
 }
 
-impl Gpus {
-    /// Records a reading.
-    pub(super) fn read(&mut self, now: Instant, reading: GpuReading) {
-        if self.answered.is_none() && !reading.gpus.is_empty() {
-            let names: Vec<&str> = reading.gpus.iter().map(|gpu| gpu.name.as_str()).collect();
-            log::info!("GPUs: {}", names.join(", "));
-        }
-        if reading.gpus.len() >= self.answered.map_or(1, |(_, most)| most) {
-            self.answered = Some((now, reading.gpus.len()));
-        }
-        self.reading = Some((now, reading));
-    }
+/// Starts the thread, and returns its last reading. It ends when nobody receives that any more.
+pub(super) fn follow() -> std::io::Result<watch::Receiver<Option<GpuReading>>> {
+    let (sender, last) = watch::channel(None);
+    std::thread::Builder::new().name("gpus".to_owned()).spawn(move || read(&sender))?;
+    Ok(last)
+}
 
-    /// Returns the GPUs that answer, and the problem if some have answered before and don't any more. Logs changes.
-    pub(super) fn current(&mut self, now: Instant) -> (Vec<Gpu>, Option<String>) {
-        let is_recent = |at: Instant| now.saturating_duration_since(at) <= SILENCE;
-        let reading = self.reading.clone().filter(|(at, _)| is_recent(*at));
-        let GpuReading { gpus, lost } = reading.map(|(_, reading)| reading).unwrap_or_default();
-        let problem = match self.answered {
-            _ if lost > 0 => Some(format!(
-                "NVIDIA's driver has lost {lost} of {} GPUs (see Xid in the kernel's log)",
-                lost + gpus.len()
-            )),
-            Some((at, count)) if !is_recent(at) && gpus.is_empty() => {
-                Some(format!("no GPU answers any more, of {count} that did"))
+fn read(sender: &watch::Sender<Option<GpuReading>>) {
+    let (mut known, mut told) = (0, false);
+    while !sender.is_closed() {
+        let opened = Instant::now();
+        match Nvml::builder().lib_path(OsStr::new(LIBRARY)).init() {
+            Ok(nvml) => {
+                let mut is_complete = true;
+                while !sender.is_closed() && (is_complete || opened.elapsed() < OPEN_AGAIN) {
+                    let count = nvml.device_count().unwrap_or(0);
+                    let gpus: Vec<Gpu> = (0..count).filter_map(|index| read_one(&nvml, index).ok()).collect();
+                    known = known.max(count as usize);
+                    is_complete = gpus.len() == known;
+                    sender.send_replace(Some(GpuReading { at: Instant::now(), gpus, known }));
+                    std::thread::sleep(PERIOD);
+                }
             }
-            Some((at, count)) if !is_recent(at) => {
-                Some(format!("{} of {count} GPUs don't answer any more", count.saturating_sub(gpus.len())))
+            Err(error) => {
+                if !std::mem::replace(&mut told, true) {
+                    log::info!("no NVIDIA GPU is read: {error}");
+                }
+                std::thread::sleep(OPEN_AGAIN);
             }
-            _ => None,
-        };
-        match &problem {
-            Some(why) if self.problem.is_none() => {
-                log::error!("{why}; those that don't answer don't count for the load");
-            }
-            None if self.problem.is_some() => log::info!("the GPUs answer again"),
-            _ => {}
         }
-        self.problem.clone_from(&problem);
-        (gpus, problem)
     }
+}
+
+/// Reads one GPU. Some report no utilisation: then it is 0.
+fn read_one(nvml: &Nvml, index: u32) -> Result<Gpu, NvmlError> {
+    let device = nvml.device_by_index(index)?;
+    let memory = device.memory_info()?;
+    let utilisation = device.utilization_rates().ok();
+    Ok(Gpu {
+        index,
+        id: device.uuid().unwrap_or_else(|_| index.to_string()),
+        name: device.name().unwrap_or_else(|_| "NVIDIA GPU".to_owned()),
+        compute: utilisation.as_ref().map_or(0.0, |rates| f64::from(rates.gpu)),
+        memory_traffic: utilisation.map_or(0.0, |rates| f64::from(rates.memory)),
+        memory: percent(memory.used, memory.total),
+        memory_total: memory.total,
+    })
+}
+
+/// The GPUs that answer, and the problem if others don't.
+pub(super) fn current(last: Option<&GpuReading>) -> (Vec<Gpu>, Option<String>) {
+    let Some(GpuReading { at, gpus, known }) = last else { return (Vec::new(), None) };
+    let gpus = if at.elapsed() <= SILENCE { gpus.clone() } else { Vec::new() };
+    let missing = known.saturating_sub(gpus.len());
+    let problem = format!("{missing} of {known} GPUs don't answer (see Xid in the kernel's log)");
+    (gpus, (missing > 0).then_some(problem))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn reading(gpus: usize, lost: usize) -> GpuReading {
-        GpuReading { gpus: vec![Gpu::default(); gpus], lost }
-    }
-
     #[test]
-    fn gpus_that_were_seen_and_are_gone_are_told() {
-        let begin = Instant::now();
-        let at = |second| begin + Duration::from_secs(second);
-        let mut gpus = Gpus::default();
-        assert_eq!(gpus.current(at(100)), (vec![], None), "a machine without GPUs has lost none");
-        gpus.read(at(0), reading(2, 0));
-        assert_eq!((gpus.current(at(10)).0.len(), gpus.current(at(10)).1), (2, None));
-        for second in 11..=20 {
-            gpus.read(at(second), reading(0, 0));
-        }
-        let (left, why) = gpus.current(at(20));
-        assert_eq!((left.len(), why.as_deref()), (0, Some("no GPU answers any more, of 2 that did")));
-        gpus.read(at(21), reading(2, 0));
-        assert_eq!(gpus.current(at(21)).1, None);
-        // The driver hangs.
-        assert_eq!(gpus.current(at(31)).0.len(), 2);
-        let (left, why) = gpus.current(at(32));
-        assert!(left.is_empty() && why.is_some());
+    fn gpus_that_are_lost_or_silent_are_told() {
+        let after = |seconds, gpus| {
+            let at = Instant::now().checked_sub(Duration::from_secs(seconds)).unwrap();
+            let (gpus, problem) = current(Some(&GpuReading { at, gpus: vec![Gpu::default(); gpus], known: 2 }));
+            (gpus.len(), problem.map_or(String::new(), |why| why.chars().take(6).collect()))
+        };
+        assert_eq!(current(None), (vec![], None), "a machine without GPUs has lost none");
+        assert_eq!(after(0, 2), (2, String::new()));
+        assert_eq!(after(9, 1), (1, "1 of 2".to_owned()));
+        assert_eq!(after(11, 2), (0, "2 of 2".to_owned()), "the driver hangs");
     }
 }

@@ -7,6 +7,6 @@ pub mod sensors;
 mod spread;
 mod usage;
 
-pub use load_monitor::{LoadMonitor, Readings, Sample};
+pub use load_monitor::{LoadMonitor, Readings};
 pub use spread::Spread;
-pub use usage::{Tree, Usage, UsageMonitor, Usages, cgroup_time, number_in};
+pub use usage::{Usage, UsageMonitor, Usages, usages};

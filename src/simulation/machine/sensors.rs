@@ -1,12 +1,10 @@
-//! Readings of the machine (sysinfo, procfs) and of its NVIDIA GPUs (NVML).
+//! Readings of the machine (sysinfo, procfs) and of a GPU, and the load that follows from them.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use nix::sys::statvfs::statvfs;
-use nvml_wrapper::Nvml;
-use nvml_wrapper::error::NvmlError;
 use procfs::net::{DeviceStatus, dev_status};
 use serde::Serialize;
 use sysinfo::{CpuRefreshKind, MemoryRefreshKind, RefreshKind, System};
@@ -52,15 +50,6 @@ pub struct Gpu {
     pub memory_total: u64,
 }
 
-/// A reading of all GPUs.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct GpuReading {
-    /// Those that answer.
-    pub gpus: Vec<Gpu>,
-    /// Number of GPUs that the driver has lost: they have fallen off their bus.
-    pub lost: usize,
-}
-
 impl Gpu {
     /// How busy it is, in percent.
     pub fn load(&self) -> f64 {
@@ -69,35 +58,10 @@ impl Gpu {
 }
 
 /// The load of a machine: `max(CPU, (swap + memory + GPU memory) / 3, GPU compute)`, all in percent, as the original
-/// has it. Of several GPUs that one counts which a new client could use.
-pub fn load(machine: &Machine, gpu: Option<&Gpu>) -> Load {
-    let percent = gpu.map_or_else(|| load_with(machine, &Gpu::default()), |gpu| load_with(machine, gpu));
-    Load::try_from(percent).unwrap_or(Load::ZERO)
-}
-
-/// The load that a machine would have with this GPU alone, in percent.
-fn load_with(machine: &Machine, gpu: &Gpu) -> f64 {
-    machine.cpu.max((machine.swap + machine.memory + gpu.memory) / 3.0).max(gpu.compute)
-}
-
-/// The GPU that a new client could use best.
-pub fn least_busy<'gpus>(machine: &Machine, gpus: &'gpus [Gpu]) -> Option<&'gpus Gpu> {
-    gpus.iter().min_by(|one, other| load_with(machine, one).total_cmp(&load_with(machine, other)))
-}
-
-/// The reading that determines the load, as text.
-pub fn busiest(machine: &Machine, gpu: Option<&Gpu>) -> &'static str {
-    let total = load(machine, gpu).percent();
-    let close = |value: f64| (value - total).abs() < 1e-9;
-    if close(machine.cpu) {
-        "the CPU"
-    } else if gpu.is_some_and(|gpu| close(gpu.compute)) {
-        "the GPU"
-    } else if gpu.is_none() {
-        "a third of memory and swap"
-    } else {
-        "a third of memory, swap and GPU memory"
-    }
+/// has it. Of several GPUs that one counts which a new client could use; a machine without one has one that is idle.
+pub fn load(machine: &Machine, gpu: &Gpu) -> Load {
+    let memories = (machine.swap + machine.memory + gpu.memory) / 3.0;
+    Load::try_from(machine.cpu.max(memories).max(gpu.compute)).unwrap_or(Load::ZERO)
 }
 
 /// The machine's name, system and hardware, which do not change.
@@ -193,68 +157,13 @@ fn disk_use(folder: &Path) -> f64 {
 }
 
 #[expect(clippy::cast_precision_loss, reason = "a percentage needs no more digits than f64 has")]
-fn percent(part: u64, whole: u64) -> f64 {
+pub(super) fn percent(part: u64, whole: u64) -> f64 {
     if whole == 0 { 0.0 } else { 100.0 * part as f64 / whole as f64 }
 }
 
 #[expect(clippy::cast_precision_loss, reason = "a rate needs no more digits than f64 has")]
 fn megabytes(bytes: u64) -> f64 {
     bytes as f64 / 1e6
-}
-
-/// Reads the NVIDIA GPUs.
-pub struct GpuSensor {
-    nvml: Nvml,
-}
-
-impl GpuSensor {
-    /// Loads NVIDIA's library.
-    ///
-    /// # Errors
-    /// When it is not installed or finds no driver: then there is no GPU to read.
-    pub fn open() -> Result<Self, NvmlError> {
-        // The driver installs the name with the version; only the development package installs the other one.
-        let versioned = Nvml::builder().lib_path(std::ffi::OsStr::new("libnvidia-ml.so.1")).init();
-        Ok(Self { nvml: versioned.or_else(|_| Nvml::init())? })
-    }
-
-    /// Reads all GPUs.
-    pub fn read(&self) -> GpuReading {
-        let count = self.nvml.device_count().unwrap_or(0);
-        let mut reading = GpuReading::default();
-        for index in 0..count {
-            match self.read_one(index) {
-                Ok(gpu) => reading.gpus.push(gpu),
-                Err(NvmlError::GpuLost) => reading.lost += 1,
-                Err(_) => {}
-            }
-        }
-        reading
-    }
-
-    /// Reads one GPU. A value that it does not report is 0: some report no utilisation.
-    fn read_one(&self, index: u32) -> Result<Gpu, NvmlError> {
-        let device = self.nvml.device_by_index(index)?;
-        let utilisation = unless_lost(device.utilization_rates())?;
-        let memory = unless_lost(device.memory_info())?;
-        Ok(Gpu {
-            index,
-            id: device.uuid().unwrap_or_else(|_| index.to_string()),
-            name: device.name().unwrap_or_else(|_| "NVIDIA GPU".to_owned()),
-            compute: utilisation.as_ref().map_or(0.0, |rates| f64::from(rates.gpu)),
-            memory_traffic: utilisation.as_ref().map_or(0.0, |rates| f64::from(rates.memory)),
-            memory: memory.as_ref().map_or(0.0, |memory| percent(memory.used, memory.total)),
-            memory_total: memory.map_or(0, |memory| memory.total),
-        })
-    }
-}
-
-/// A value that a GPU may not report, unless the GPU is lost.
-fn unless_lost<T>(value: Result<T, NvmlError>) -> Result<Option<T>, NvmlError> {
-    match value {
-        Err(NvmlError::GpuLost) => Err(NvmlError::GpuLost),
-        value => Ok(value.ok()),
-    }
 }
 
 #[cfg(test)]
@@ -272,19 +181,17 @@ mod tests {
     }
 
     #[test]
-    fn the_load_is_that_of_the_busiest_part_and_the_least_busy_gpu() {
+    fn the_load_is_that_of_the_busiest_part() {
         let machine = |cpu, memory, swap| Machine { cpu, memory, swap, ..Machine::default() };
         let gpu = |compute, memory| Gpu { compute, memory, ..Gpu::default() };
         let table = [
-            (machine(20.0, 30.0, 0.0), vec![], 20.0, "the CPU"),
-            (machine(5.0, 60.0, 0.0), vec![], 20.0, "a third of the memory"),
-            (machine(5.0, 90.0, 60.0), vec![gpu(10.0, 90.0)], 80.0, "memories full together"),
-            (machine(5.0, 30.0, 0.0), vec![gpu(70.0, 0.0)], 70.0, "the GPU"),
-            (machine(5.0, 30.0, 0.0), vec![gpu(70.0, 0.0), gpu(15.0, 0.0)], 15.0, "the other GPU is free"),
-            (machine(5.0, 30.0, 0.0), vec![gpu(0.0, 99.0), gpu(15.0, 0.0)], 15.0, "the first GPU's memory is full"),
+            (machine(20.0, 30.0, 0.0), gpu(0.0, 0.0), 20.0, "the CPU"),
+            (machine(5.0, 60.0, 0.0), gpu(0.0, 0.0), 20.0, "a third of the memory"),
+            (machine(5.0, 90.0, 60.0), gpu(10.0, 90.0), 80.0, "memories full together"),
+            (machine(5.0, 30.0, 0.0), gpu(70.0, 0.0), 70.0, "the GPU"),
         ];
-        for (machine, gpus, expected, why) in table {
-            let load = load(&machine, least_busy(&machine, &gpus));
+        for (machine, gpu, expected, why) in table {
+            let load = load(&machine, &gpu);
             assert!((load.percent() - expected).abs() < 1e-9, "{why}: {load}");
         }
     }

@@ -1,32 +1,20 @@
-//! CPU and memory of each simulation: from its control group, otherwise from its process tree, or from a source of its
-//! isolation level.
+//! CPU and memory of each simulation, from its process tree.
 //!
-//! One pass over `/proc` serves all simulations and all callers, at most once in 1.8 s, and only on demand.
+//! One pass over `/proc` serves all simulations. Pages read at most once in 1.8 s, and only on demand.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
-use std::path::{Path, PathBuf};
+use std::collections::{BTreeMap, HashMap, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use parking_lot::Mutex;
 use procfs::process::{Stat, all_processes};
 
-/// The processes of a simulation.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Tree {
-    /// The root of the process tree.
-    pub root: i32,
-    /// The directory of their control group, if they have one.
-    pub cgroup: Option<PathBuf>,
-}
-
 /// The resource usage of a simulation's processes.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Usage {
     /// Percent of one core: what Docker reports, or a mean since the last reading, `None` at the first.
     pub cpu: Option<f64>,
-    /// Memory in bytes: what their control group is charged for, or the resident memory, in which memory that processes
-    /// share counts for each.
+    /// Memory in bytes: what Docker reports, or the resident memory, in which memory that processes share counts for each.
     pub memory: u64,
     /// Number of processes and threads.
     pub threads: u64,
@@ -37,86 +25,44 @@ pub struct Usage {
 /// Readings of process trees, by the process at the root.
 pub type Usages = BTreeMap<i32, Usage>;
 
-/// Reads process trees on demand.
+/// Keeps the last reading for the pages. Clones share it.
 #[derive(Debug, Clone, Default)]
-pub struct UsageMonitor(Arc<Mutex<Readings>>);
+pub struct UsageMonitor(Arc<Mutex<Option<(Instant, Usages)>>>);
 
-#[derive(Debug, Default)]
-struct Readings {
-    read: Option<Instant>,
-    /// The trees of that reading. Some may have no usage.
-    roots: BTreeSet<i32>,
-    usages: Usages,
-}
-
-/// Time for which a reading is cached.
+/// Time for which a reading is kept.
 const AGE: Duration = Duration::from_millis(1800);
 
-impl Tree {
-    /// A tree without a control group.
-    pub fn of(root: i32) -> Self {
-        Self { root, cgroup: None }
-    }
-}
-
 impl UsageMonitor {
-    /// The usage of each of these trees, never much older than two seconds. Blocks for some milliseconds.
-    pub fn read(&self, trees: &[Tree]) -> Usages {
-        self.read_by(&trees.iter().map(|tree| tree.root).collect::<Vec<_>>(), || sums_of(trees))
-    }
-
-    /// The same for simulations whose processes only `measure` finds. It is called if the last reading is too old, and
-    /// leaves out the use of the CPU unless it knows it.
-    pub fn read_by(&self, roots: &[i32], measure: impl FnOnce() -> Usages) -> Usages {
-        if roots.is_empty() {
-            return Usages::new();
-        }
+    /// The usage of all simulations, never much older than two seconds. `measure` is called if the last reading is too old,
+    /// and leaves out the use of the CPU unless it knows it.
+    pub fn read(&self, measure: impl FnOnce() -> Usages) -> Usages {
         let mut last = self.0.lock();
-        let known = roots.iter().all(|root| last.roots.contains(root));
-        if known && last.read.is_some_and(|read| read.elapsed() < AGE) {
-            return last.usages.clone();
+        if let Some((at, usages)) = &*last
+            && at.elapsed() < AGE
+        {
+            return usages.clone();
         }
-        last.roots = roots.iter().copied().collect();
         let mut usages = measure();
-        // If Docker hangs, this may have taken longer than a reading is cached.
-        let passed = last.read.map(|read| read.elapsed().as_secs_f64()).filter(|passed| *passed > 0.0);
-        last.read = Some(Instant::now());
         for (root, usage) in &mut usages {
-            let before = last.usages.get(root).zip(passed);
-            let mean =
-                before.map(|(before, passed)| 100.0 * usage.time.saturating_sub(before.time).as_secs_f64() / passed);
+            let before = last.as_ref().and_then(|(at, usages)| Some((at.elapsed(), usages.get(root)?)));
+            let mean = before.map(|(passed, before)| {
+                100.0 * usage.time.saturating_sub(before.time).as_secs_f64() / passed.as_secs_f64()
+            });
             usage.cpu = usage.cpu.or(mean);
         }
-        last.usages.clone_from(&usages);
+        // If Docker hangs, this may have taken longer than a reading is kept.
+        *last = Some((Instant::now(), usages.clone()));
         usages
     }
 }
 
-fn sums_of(trees: &[Tree]) -> Usages {
-    let mut processes = None;
-    let sums = trees.iter().map(|Tree { root, cgroup }| {
-        let sum = cgroup.as_deref().and_then(cgroup_sum);
-        (*root, sum.unwrap_or_else(|| tree_sum(*root, processes.get_or_insert_with(all_by_parent))))
-    });
-    sums.collect()
-}
-
-/// The usage of a cgroup v2 so far; `None` if the kernel does not count all of it there.
-fn cgroup_sum(folder: &Path) -> Option<Usage> {
-    let (memory, threads) = (number_in(&folder.join("memory.current"))?, number_in(&folder.join("pids.current"))?);
-    Some(Usage { cpu: None, memory, threads, time: cgroup_time(folder)? })
-}
-
-/// The CPU time of all that has run in a cgroup v2.
-pub fn cgroup_time(folder: &Path) -> Option<Duration> {
-    let times = std::fs::read_to_string(folder.join("cpu.stat")).ok()?;
-    let time = times.lines().find_map(|line| line.strip_prefix("usage_usec "))?;
-    time.trim().parse().ok().map(Duration::from_micros)
-}
-
-/// The number in a file of the kernel.
-pub fn number_in(file: &Path) -> Option<u64> {
-    std::fs::read_to_string(file).ok()?.trim().parse().ok()
+/// The usage of the process trees with these roots. Blocks for some milliseconds.
+pub fn usages(roots: &[i32]) -> Usages {
+    if roots.is_empty() {
+        return Usages::new();
+    }
+    let below = all_by_parent();
+    roots.iter().map(|root| (*root, tree_sum(*root, &below))).collect()
 }
 
 /// All processes, each below its parent and below the leader of its group.
@@ -150,39 +96,4 @@ fn tree_sum(root: i32, below: &HashMap<i32, Vec<Stat>>) -> Usage {
 
 fn ticks_per_second() -> u32 {
     u32::try_from(procfs::ticks_per_second()).unwrap_or(100)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_simulation_without_a_reading_is_not_asked_for_again_at_once() {
-        let (monitor, mut asked) = (UsageMonitor::default(), 0);
-        let mut read = |roots: &[i32]| {
-            let usages = monitor.read_by(roots, || {
-                asked += 1;
-                Usages::from([(1, Usage::default())])
-            });
-            (usages.into_keys().collect::<Vec<_>>(), asked)
-        };
-        let begin = Instant::now();
-        assert_eq!(read(&[1, 2]), (vec![1], 1));
-        let again = read(&[1, 2]);
-        // A machine may be suspended for longer than a reading is cached.
-        assert!(again == (vec![1], 1) || begin.elapsed() >= AGE, "{again:?}");
-        assert_eq!(read(&[1, 2, 3]).1, again.1 + 1, "a new simulation is read at once");
-    }
-
-    #[test]
-    fn a_control_group_is_read_where_it_counts_everything() {
-        let group = tempfile::tempdir().unwrap();
-        let me = i32::try_from(std::process::id()).unwrap();
-        let read = || UsageMonitor::default().read(&[Tree { root: me, cgroup: Some(group.path().to_owned()) }])[&me];
-        std::fs::write(group.path().join("cpu.stat"), "usage_usec 5000000\nuser_usec 1\n").unwrap();
-        std::fs::write(group.path().join("pids.current"), "7777\n").unwrap();
-        assert_ne!(read().threads, 7777, "there is no memory.current");
-        std::fs::write(group.path().join("memory.current"), "123\n").unwrap();
-        assert_eq!(read(), Usage { cpu: None, memory: 123, threads: 7777, time: Duration::from_secs(5) });
-    }
 }

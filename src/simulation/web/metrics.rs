@@ -22,7 +22,6 @@ pub fn gauges<'text>(server: &AppState, snapshot: &Snapshot) -> Vec<Gauge<'text>
         readings.gpus.iter().map(|gpu| (labels(gpu), value(gpu))).collect()
     };
     let flag = |is_set: bool| f64::from(u8::from(is_set));
-    let away = snapshot.simulations.iter().filter(|one| one.away_until.is_some()).count();
     let failed = "Starts in a row that failed for a reason of this server's own";
     let lost = "1 while GPUs have answered and some or all don't any more";
     vec![
@@ -34,11 +33,6 @@ pub fn gauges<'text>(server: &AppState, snapshot: &Snapshot) -> Vec<Gauge<'text>
         ),
         Gauge::plain("webots_simulation_failed_starts", failed, f64::from(server.failed_starts.count())),
         Gauge::plain("webots_simulation_draining", "1 while no new clients are taken", flag(server.is_draining())),
-        Gauge::plain(
-            "webots_simulation_away",
-            "Simulations that wait for their clients",
-            f64::from(u32::try_from(away).unwrap_or(u32::MAX)),
-        ),
         Gauge::plain("webots_simulation_places", "Simulations that fit", f64::from(instances.places)),
         Gauge {
             name: "webots_simulation_instances",

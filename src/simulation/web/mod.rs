@@ -1,9 +1,8 @@
 //! The interface to browsers and programs: routes, pages, `/status` and `/metrics`.
 
+mod access;
 mod actions;
-mod administrator;
 mod metrics;
-mod origins;
 mod page_routes;
 mod pages;
 mod routes;

@@ -10,7 +10,7 @@ use actix_web::{HttpRequest, HttpResponse, web};
 use askama::Template;
 use serde::Deserialize;
 
-use super::administrator::Visitor;
+use super::access::Visitor;
 use super::pages;
 use super::webots_viewer;
 use crate::asset;
@@ -19,7 +19,7 @@ use crate::shared::http::routing::{GET, READ, path};
 use crate::shared::http::{ConnectionKind, FOREIGN_SCRIPTS, OWN_FILES, PageView, VIEWER, html, require_administrator};
 use crate::simulation::container;
 use crate::simulation::ends::{last_lines, output_file};
-use crate::simulation::machine::{Tree, Usages};
+use crate::simulation::machine::{self, Usages};
 use crate::simulation::snapshot::{Simulation, Snapshot};
 use crate::simulation::state::AppState;
 
@@ -75,18 +75,18 @@ async fn view(server: &AppState, visitor: Visitor) -> Result<PageView, askama::E
 }
 
 async fn usages(server: &AppState, snapshot: &Snapshot) -> Usages {
+    if snapshot.simulations.is_empty() {
+        return Usages::new();
+    }
     let (usage, simulations) = (server.usage.clone(), snapshot.simulations.iter());
     let read = if let Some(containers) = &server.containers {
         // The process is `docker`, which waits for the containers.
         let roots: BTreeMap<u16, i32> = simulations.filter_map(|one| Some((one.port?, one.pid?))).collect();
         let owner = containers.run.clone();
-        let read =
-            move || usage.read_by(&roots.values().copied().collect::<Vec<_>>(), || container::measure(&owner, &roots));
-        actix_rt::task::spawn_blocking(read)
+        actix_rt::task::spawn_blocking(move || usage.read(|| container::measure(&owner, &roots)))
     } else {
-        let tree = |one: &Simulation| Some(Tree { root: one.pid?, cgroup: one.cgroup.clone() });
-        let trees: Vec<Tree> = simulations.filter_map(tree).collect();
-        actix_rt::task::spawn_blocking(move || usage.read(&trees))
+        let roots: Vec<i32> = simulations.filter_map(|one| one.pid).collect();
+        actix_rt::task::spawn_blocking(move || usage.read(|| machine::usages(&roots)))
     };
     read.await.unwrap_or_default()
 }
@@ -107,8 +107,7 @@ async fn events(request: HttpRequest, server: web::Data<AppState>) -> actix_web:
 }
 
 async fn history(server: web::Data<AppState>) -> HttpResponse {
-    let readings = server.readings.borrow().clone();
-    HttpResponse::Ok().json(pages::history(&readings))
+    HttpResponse::Ok().json(&server.readings.borrow().history)
 }
 
 async fn asset(request: HttpRequest) -> HttpResponse {

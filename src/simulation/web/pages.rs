@@ -5,13 +5,13 @@ use std::time::{Duration, SystemTime};
 use askama::Template;
 use url::Url;
 
-use super::administrator::Visitor;
+use super::access::Visitor;
 use crate::shared::domain::Instances;
 use crate::shared::http::{PageView, TableRow};
 use crate::shared::run::timestamp;
 use crate::shared::text::one_line;
 use crate::simulation::ends::Ended;
-use crate::simulation::machine::{Readings, Sample, Usage, Usages};
+use crate::simulation::machine::{Readings, Usage, Usages};
 use crate::simulation::snapshot::{Simulation, Snapshot, Stage};
 use crate::simulation::state::AppState;
 
@@ -85,8 +85,8 @@ pub fn view(
     let ends = ends.collect::<Result<Vec<TableRow>, askama::Error>>()?;
     let (instances, load, problem) = (snapshot.instances, server.load().percent(), server.problem());
     let glance = Glance { server, readings: &readings, instances, load, problem }.render()?;
-    let sample = readings.history.back().map(Sample::columns).unwrap_or_default();
-    Ok(PageView { parts: [("glance", glance)].into(), tables: [("simulations", rows), ("ends", ends)].into(), sample })
+    let (parts, tables) = ([("glance", glance)].into(), [("simulations", rows), ("ends", ends)].into());
+    Ok(PageView { parts, tables, sample: readings.sample.clone() })
 }
 
 /// The whole of `/monitor`, with these parts.
@@ -110,12 +110,6 @@ impl Monitor<'_> {
         let of_containers = containers.and_then(|containers| containers.shortcoming.as_deref());
         of_level.or_else(|| of_containers.map(|why| ("", why)))
     }
-}
-
-/// The charts' numbers of the last ten minutes, the oldest first.
-pub fn history(readings: &Readings) -> Vec<Vec<f64>> {
-    let values = |sample: &Sample| sample.columns().iter().filter_map(|text| text.parse().ok()).collect();
-    readings.history.iter().map(values).collect()
 }
 
 fn time(seconds_since_1970: u64) -> String {
@@ -149,18 +143,10 @@ fn words(stage: Stage) -> (&'static str, &'static str) {
     }
 }
 
-#[expect(clippy::cast_precision_loss, reason = "three digits are shown")]
+#[expect(clippy::cast_precision_loss, reason = "few digits are shown")]
 fn bytes(count: u64) -> String {
-    let count = count as f64;
-    let units = [("TiB", 2_f64.powi(40)), ("GiB", 2_f64.powi(30)), ("MiB", 2_f64.powi(20))];
-    match units.iter().find(|(_, size)| count >= *size) {
-        Some((unit, size)) => {
-            let number = count / size;
-            if number < 10.0 { format!("{number:.1} {unit}") } else { format!("{number:.0} {unit}") }
-        }
-        None if count > 0.0 => format!("{:.0} KiB", count / 1024.0),
-        None => "none".to_owned(),
-    }
+    let mebibytes = count as f64 / 2_f64.powi(20);
+    if mebibytes < 1024.0 { format!("{mebibytes:.0} MiB") } else { format!("{:.1} GiB", mebibytes / 1024.0) }
 }
 
 /// A duration as text in hours and minutes; the page's script adds the seconds.
@@ -181,7 +167,7 @@ mod tests {
 
     #[test]
     fn sizes_and_times_are_short() {
-        let sizes = [(0, "none"), (2048, "2 KiB"), (5 << 20, "5.0 MiB"), (130 << 20, "130 MiB"), (3 << 30, "3.0 GiB")];
+        let sizes = [(0, "0 MiB"), (5 << 20, "5 MiB"), (3 << 30, "3.0 GiB"), (2500 << 30, "2500.0 GiB")];
         for (count, text) in sizes {
             assert_eq!(bytes(count), text);
         }

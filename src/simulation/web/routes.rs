@@ -5,10 +5,9 @@ use std::sync::Arc;
 use actix_web::error::ErrorInternalServerError;
 use actix_web::{HttpRequest, HttpResponse, web};
 
+use super::access::{Visitor, check_origin};
 use super::actions;
-use super::administrator::Visitor;
 use super::metrics;
-use super::origins::check_origin;
 use super::page_routes;
 use super::status::status_page;
 use super::stream_routes;

@@ -32,7 +32,7 @@ pub fn status_page(server: &AppState, snapshot: &Snapshot) -> impl Serialize + u
         failed_starts: server.failed_starts.count(),
         problem: server.problem(),
     };
-    let mut more = json!({
+    let more = json!({
         "isolation": server.launcher.level,
         // That of their programs, where it is not Docker's.
         "network": server.launcher.network(),
@@ -45,8 +45,5 @@ pub fn status_page(server: &AppState, snapshot: &Snapshot) -> impl Serialize + u
         "viewer": webots_viewer::folder(&server.config).map(|_| webots_viewer::PATH),
         "simulations": snapshot.simulations,
     });
-    if let Value::Object(more) = &mut more {
-        more.retain(|_, value| !value.is_null());
-    }
     StatusPage { report, more }
 }

@@ -4,7 +4,7 @@ use actix_web::error::ErrorNotFound;
 use actix_web::http::header;
 use actix_web::{HttpRequest, HttpResponse, web};
 
-use super::origins::check_origin;
+use super::access::check_origin;
 use crate::shared::http::ConnectionKind;
 use crate::shared::http::routing::{GET, path, refuse_body};
 use crate::simulation::relay::{self, Upstream};

@@ -19,16 +19,12 @@ pub fn folder(config: &SimulationConfig) -> Option<PathBuf> {
     Some(home.join(FOLDER)).filter(|folder| folder.join(SCRIPT).is_file())
 }
 
-/// A file below a directory; `None` if the path or a symlink resolves to a path outside of it.
+/// A file below a directory; `None` if the path leads out of it.
 pub fn file_below(folder: &Path, path: &str) -> Option<PathBuf> {
     let path = percent_decode_str(path).decode_utf8().ok()?;
     let path = Path::new(path.as_ref());
-    if !path.components().all(|part| matches!(part, Component::Normal(_))) {
-        return None;
-    }
-    let folder = folder.canonicalize().ok()?;
-    let file = folder.join(path).canonicalize().ok()?;
-    (file.starts_with(&folder) && file.is_file()).then_some(file)
+    let is_below = path.components().all(|part| matches!(part, Component::Normal(_)));
+    Some(folder.join(path)).filter(|file| is_below && file.is_file())
 }
 
 #[cfg(test)]
@@ -44,7 +40,6 @@ mod tests {
         for file in ["WebotsView.js", "css/wwi.css", "../secret.js"] {
             fs::write(folder.join(file), "").unwrap();
         }
-        std::os::unix::fs::symlink("../secret.js", folder.join("link.js")).unwrap();
         let table = [
             ("WebotsView.js", true),
             ("css/wwi.css", true),
@@ -55,7 +50,6 @@ mod tests {
             ("%2e%2e/secret.js", false),
             ("css/../../secret.js", false),
             ("/etc/passwd", false),
-            ("link.js", false),
             ("WebotsView.js%00", false),
             ("%ff", false),
         ];

@@ -27,8 +27,6 @@ pub enum LaunchTarget {
 pub struct Launched {
     /// Its processes.
     pub group: ProcessGroup,
-    /// The directory of its control group, if it has one.
-    pub cgroup: Option<PathBuf>,
     /// The last lines of its output.
     pub tail: Tail,
     /// The file of its output.
@@ -100,7 +98,6 @@ pub fn launch(
         LaunchTarget::Machine(display) => spec.spawn_spec(display)?,
     };
     let (group, ended) = ProcessGroup::start(&process, output.into(), errors.into())?;
-    let of_cgroup = cgroup.as_ref().map(|cgroup| cgroup.folder.clone());
     let peak = cgroup.is_none().then(|| peak_of(&target));
     let seen = peak.clone();
     let ended = async move {
@@ -119,7 +116,7 @@ pub fn launch(
         actix_rt::time::timeout(LAST_OUTPUT, all_read).await.ok();
         End { reason, cause: in_container.or(on_machine.then_some(Cause::OutOfMemory)), taken }
     };
-    Ok((Launched { group, cgroup: of_cgroup, tail, log, peak }, ended))
+    Ok((Launched { group, tail, log, peak }, ended))
 }
 
 /// Hears what a Webots takes that runs on this.

@@ -132,14 +132,14 @@ impl Webots {
         if self.spec.is_port_taken() {
             return Err(std::io::ErrorKind::AddrInUse.into());
         }
-        let (Launched { group, cgroup, tail, log, peak }, ended) =
+        let (Launched { group, tail, log, peak }, ended) =
             launched::launch(&self.spec, target, ctx.address().recipient())?;
         let (program, world) = (self.spec.program.display(), self.spec.project.world.path.display());
         let pid = group.leader();
         self.log(Level::Info, &format!("started {program} for {world} (process {pid})"));
         self.spec.slot.lease.update(move |one| {
             (one.stage, one.launched) = (Stage::Launching, Some(seconds_since_1970()));
-            (one.pid, one.cgroup, one.log) = (Some(pid), cgroup, log);
+            (one.pid, one.log) = (Some(pid), log);
         });
         (self.tail, self.group) = (tail, Some(group));
         ended.into_actor(self).map(|end, this, ctx| this.ended(&end, ctx)).spawn(ctx);
