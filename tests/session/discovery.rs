@@ -110,7 +110,7 @@ async fn a_name_server_that_fails_or_has_nothing_to_tell_changes_nothing_and_is_
     let session = looking_up(std::slice::from_ref(&name), &names)
         .mails_to(smtp.port)
         .set("timing", json!({"gather": 0.1, "flapping": 0.1, "placement": 0.2}))
-        .set("loadRefresh", 0.05)
+        .set("loadRefresh", 0.02)
         .start()
         .await;
     until_states(&session, &["up"; 2]).await;
