@@ -45,7 +45,6 @@ fn a_participant_s_program_runs_connected_and_is_not_missed_when_it_ends() {
         (Some(""), "", "Traceback"),
         (Some(crash), "line 4, in deep", "remote_controller_launcher"),
         (Some("raise SystemExit('enough')"), "The controller has ended: enough", "Traceback"),
-        (Some("import sys; sys.exit(0)"), "", "ended"),
         (Some("raise KeyError('x' * 100_000)"), "xxxx'", "Traceback"),
         (Some("if True print()"), "SyntaxError", "remote_controller_launcher"),
         (None, "There is no participant/participant.py", "Traceback"),

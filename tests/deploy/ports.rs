@@ -18,8 +18,8 @@ fn matched(pattern: &str) -> Vec<u16> {
 fn the_rules_forward_the_ports_of_the_configuration_and_no_others() {
     let config: Value = serde_json::from_str(include_str!("../../deploy/config/simulation/main.json")).unwrap();
     let [port, places] = ["port", "maxConnections"].map(|key| u16::try_from(config[key].as_u64().unwrap()).unwrap());
+    let pattern = Regex::new(r"\^/\((?:\?<fleet_port>)?([0-9|\[\]-]+\|[0-9|\[\]-]+)\)/").unwrap();
     for (name, rules) in RULES {
-        let pattern = Regex::new(r"\^/\((?:\?<fleet_port>)?([0-9|\[\]-]+\|[0-9|\[\]-]+)\)/").unwrap();
         let patterns: Vec<&str> = pattern.captures_iter(rules).map(|found| found.get(1).unwrap().as_str()).collect();
         // Of this machine, and of another in what has a '#' in front; WebSockets have rules of their own in Apache.
         let each = if name == "apache.conf" { 2 } else { 1 };

@@ -82,12 +82,10 @@ async fn an_editor_is_at_the_port_of_its_webots_and_500_more(fleet: &Fleet) {
 }
 
 /// What is asked for, and what arrives through Apache and through nginx; nothing where they refuse.
-const PATHS: [(&str, Option<&str>, Option<&str>); 13] = [
+const PATHS: [(&str, Option<&str>, Option<&str>); 11] = [
     ("/textures/my%20file.png", Some("/textures/my%20file.png"), Some("/textures/my%20file.png")),
     ("/%C3%BC+%2B.png?x=a%20b&y=%2F", Some("/%C3%BC++.png?x=a%20b&y=%2F"), Some("/%C3%BC++.png?x=a%20b&y=%2F")),
-    ("/a%25b.png", Some("/a%25b.png"), Some("/a%25b.png")),
     ("/a%252fb.png", Some("/a%252fb.png"), Some("/a%252fb.png")),
-    ("/a%23b.png", Some("/a%23b.png"), Some("/a%23b.png")),
     // Apache takes a question mark in a name for an attack.
     ("/a%3Fb.png", None, Some("/a%3Fb.png")),
     // A name with a slash is that of a folder, or of nothing.
@@ -188,11 +186,9 @@ async fn pages_are_sent_on_to_https_and_the_bare_name(browser: &Browser) {
     // What was asked for arrives as it was sent; none of it becomes a header, another host or a query.
     let paths = [
         "/",
-        "/monitor?x=a%20b",
         "/a%20b/%C3%BC+&?a=b&c=%20&d=%0d%0a",
         "/x%0D%0ASet-Cookie:%20a=b?y=%0d%0aSet-Cookie:%20a=b",
         "/a%3Fb%23c?d",
-        "/session?url=https://github.com/lab/arm/blob/main/worlds/a.wbt",
         "/.well-known/other?x",
     ];
     for (server, host) in table {

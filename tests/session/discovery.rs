@@ -100,7 +100,7 @@ async fn a_name_server_that_fails_or_has_nothing_to_tell_changes_nothing_and_is_
     let name = format!("dns+fleet.test:{port}");
     let session = looking_up(std::slice::from_ref(&name), &names)
         .set("timing", json!({"placement": 0.2}))
-        .set("loadRefresh", 0.05)
+        .set("loadRefresh", 0.02)
         .start()
         .await;
     until_states(&session, &["up"; 2]).await;

@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 use socket2::{Domain, Socket, Type};
 
 use super::until_states;
-use crate::support::http;
 use crate::support::program::{Server, session_server};
+use crate::support::{http, until};
 
 const CLIENTS: usize = 25;
 /// How long they send, at most.
@@ -82,7 +82,8 @@ async fn live_pages_that_read_nothing_cost_little() {
     until_states(&session, &vec!["down"; fleet.len()]).await;
     // The page is rendered with the first.
     let request = "GET /events HTTP/1.1\r\nHost: x\r\n\r\n";
-    let mut first = [connect(&session)];
-    fill(&mut first, request.as_bytes()).await;
+    let mut first = connect(&session);
+    first.write_all(request.as_bytes()).unwrap();
+    until("the page comes", async || first.peek(&mut [0]).is_ok()).await;
     cost_little(&session, request).await;
 }

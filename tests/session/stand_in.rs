@@ -70,12 +70,7 @@ struct Shared {
 impl StandIn {
     /// Starts one on any free port.
     pub fn start(manner: Manner) -> Self {
-        Self::start_at(0, manner)
-    }
-
-    /// Starts one on this port.
-    pub fn start_at(port: u16, manner: Manner) -> Self {
-        Self::start_on(([127, 0, 0, 1], port).into(), manner)
+        Self::start_on(([127, 0, 0, 1], 0).into(), manner)
     }
 
     /// Starts one on this address of the loopback.

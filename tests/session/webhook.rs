@@ -16,7 +16,7 @@ const SECRET: &str = "T0PSECRET";
 
 fn with_webhook(servers: &[StandIn], scheme: &str, port: u16) -> Builder {
     let url = format!("{scheme}://localhost:{port}/services/{SECRET}?key={SECRET}");
-    let timing = json!({"answer": 4, "gather": 0.5, "flapping": 0.5, "mailRetry": 0.2, "mailAnswer": 5});
+    let timing = json!({"answer": 4, "gather": 0.5, "flapping": 0.5, "mailRetry": 0.05, "mailAnswer": 5});
     session_server(&addresses(servers)).set("webhook", url).set("timing", timing)
 }
 
