@@ -251,7 +251,7 @@ async fn streams_have_connections_of_their_own() {
 async fn no_trick_leads_anywhere_else() {
     let played = Played::new(|builder| builder).await;
     let server = &played.server;
-    let (_client, path) = start(&server).await;
+    let (_client, path) = start(server).await;
     let headers = "Host: localhost\r\nConnection: close\r\n";
     let other = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let elsewhere = other.local_addr().unwrap();
@@ -273,7 +273,7 @@ async fn no_trick_leads_anywhere_else() {
         "/stream".to_owned(),
     ] {
         for headers in [headers, UPGRADE] {
-            let answer = raw(&server, &format!("GET {path} HTTP/1.1\r\n{headers}\r\n")).await;
+            let answer = raw(server, &format!("GET {path} HTTP/1.1\r\n{headers}\r\n")).await;
             assert!(answer.starts_with("HTTP/1.1 404 "), "{path}: {answer}");
             assert!(!answer.contains(&token[16..]), "{answer}");
         }
@@ -291,7 +291,7 @@ async fn no_trick_leads_anywhere_else() {
         (format!("GET /client HTTP/1.1\r\n{UPGRADE}Content-Length: 1\r\n\r\nx"), 400),
         (format!("GET /client HTTP/1.1\r\n{UPGRADE}Transfer-Encoding: chunked\r\n\r\n1\r\nx\r\n0\r\n\r\n"), 400),
     ] {
-        let answer = raw(&server, &request).await;
+        let answer = raw(server, &request).await;
         let shown: String = request.chars().take(300).collect();
         assert!(answer.starts_with(&format!("HTTP/1.1 {status} ")), "{shown}: {answer}");
         assert!(!shown.contains("/client") || answer.ends_with("Error: a request for this has no body."), "{answer}");
@@ -308,7 +308,7 @@ async fn no_trick_leads_anywhere_else() {
     let second = format!("GET {path}/second.png HTTP/1.1\r\n{headers}\r\n");
     let webots = played.answer(b"HTTP/1.1 302 Found\r\nLocation: http://127.0.0.1:1/\r\nContent-Length: 2\r\n\r\nok");
     let both = format!("{absolute}{second}");
-    let (answer, head) = tokio::join!(raw(&server, &both), webots);
+    let (answer, head) = tokio::join!(raw(server, &both), webots);
     let port = server.port + 1;
     assert!(head.starts_with("GET /a.png?x=1 HTTP/1.1\r\n"), "{head}");
     assert!(head.contains(&format!("\r\nHost: 127.0.0.1:{port}\r\n")), "{head}");
