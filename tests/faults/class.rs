@@ -1,10 +1,11 @@
 //! The load under which faults are injected: a rehearsal.
 
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
-use std::time::{Duration, Instant};
+use std::process::Stdio;
+use std::time::Duration;
 
 use serde_json::Value;
+use tokio::process::{Child, Command};
 
 use crate::support::arm;
 
@@ -25,24 +26,13 @@ impl Class {
         command.args([url, "--world", &arm(), "--over", "1s", "--stay", "3s"]);
         command.args(["--patience", "20s", "--misbehave", "reload=10,drop=10,sleep=5,vanish=5,hasty=15"]);
         command.args(["--clients", &CLIENTS.to_string(), "--soak", &format!("{}s", time.as_secs())]);
-        let child = command.arg("--json").arg(&file).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
-        Self { child, file }
+        command.arg("--json").arg(&file).stdout(Stdio::null()).stderr(Stdio::null()).kill_on_drop(true);
+        Self { child: command.spawn().unwrap(), file }
     }
 
     /// Waits until all clients have gone. Returns what they have met.
     pub async fn end(mut self) -> Value {
-        let deadline = Instant::now() + Duration::from_secs(90);
-        while self.child.try_wait().unwrap().is_none() {
-            assert!(Instant::now() < deadline, "the class does not end");
-            actix_rt::time::sleep(Duration::from_millis(100)).await;
-        }
+        actix_rt::time::timeout(Duration::from_secs(90), self.child.wait()).await.expect("the class ends").unwrap();
         serde_json::from_str(&std::fs::read_to_string(&self.file).unwrap()).unwrap()
-    }
-}
-
-impl Drop for Class {
-    fn drop(&mut self) {
-        self.child.kill().ok();
-        self.child.wait().ok();
     }
 }

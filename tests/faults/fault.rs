@@ -39,14 +39,13 @@ macro_rules! faults {
 pub fn all() -> Vec<Fault> {
     faults! {
         "a session server is killed": kill_session;
-        "a session server stands still": stop_session;
+        "a session server stands still": async |fleet, random| stand_still(fleet, random, true).await;
         "a simulation server is killed": kill_server;
-        "a simulation server stands still": stop_server;
+        "a simulation server stands still": async |fleet, random| stand_still(fleet, random, false).await;
         "a Webots is killed": async |fleet, random| signal(fleet, random, "demo-simulator", Signal::SIGKILL).await;
         "a Webots stands still": async |fleet, random| signal(fleet, random, "demo-simulator", Signal::SIGSTOP).await;
         "a launcher is killed": async |fleet, random| signal(fleet, random, "/webots --batch", Signal::SIGKILL).await;
         "a launcher stands still": async |fleet, random| signal(fleet, random, "/webots --batch", Signal::SIGSTOP).await;
-        "a guardian stands still for a while": stop_guardian;
         "a git is killed": async |fleet, random| signal(fleet, random, "git --literal-pathspecs", Signal::SIGKILL).await;
         "a git stands still": async |fleet, random| signal(fleet, random, "git --literal-pathspecs", Signal::SIGSTOP).await;
         "the disk is full": fill_disk;
@@ -56,20 +55,16 @@ pub fn all() -> Vec<Fault> {
         "the log and its folder are gone": async |fleet, _| close_folder(fleet, "log", true).await;
         "the log and monitor.csv can't be written": async |fleet, _| close_folder(fleet, "log", false).await;
         "no more files can be opened": no_files;
-        "memory runs out": no_memory;
         "clocks go forward an hour": async |fleet, _| step_clock(fleet, 3600).await;
         "clocks go back an hour": async |fleet, _| step_clock(fleet, -3600).await;
         "the name server hangs": async |fleet, _| break_names(fleet, Names::Hang).await;
         "the name server does not know a name": async |fleet, _| break_names(fleet, Names::AreUnknown).await;
         "the name server is gone": async |fleet, _| break_names(fleet, Names::HaveNoServer).await;
-        "a port is taken": take_port;
-        "a server's own port is taken": take_own_port;
         "a link is cut": async |fleet, _| change_link(fleet, Mood::Cut).await;
         "a link is slow": async |fleet, _| change_link(fleet, Mood::Slow(Duration::from_millis(300))).await;
         "a link is silent": async |fleet, _| change_link(fleet, Mood::Silent).await;
         "a fifth of a server's packets are lost": async |fleet, random| lose_packets(fleet, random, 0.2).await;
         "all of a server's packets are lost": async |fleet, random| lose_packets(fleet, random, 1.0).await;
-        "a client is gone and its server does not hear it": half_open;
     }
 }
 
@@ -77,13 +72,6 @@ async fn kill_session(fleet: &mut Fleet, _: &mut SmallRng) -> bool {
     fleet.session.signal(Signal::SIGKILL);
     fleet.session.ended().await;
     fleet.restart_session().await;
-    true
-}
-
-async fn stop_session(fleet: &mut Fleet, _: &mut SmallRng) -> bool {
-    fleet.session.signal(Signal::SIGSTOP);
-    actix_rt::time::sleep(WHILE).await;
-    fleet.session.signal(Signal::SIGCONT);
     true
 }
 
@@ -96,18 +84,19 @@ async fn kill_server(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
 }
 
 /// Waits until a server that was killed has ended, and nothing that it had started is left.
-pub async fn bury(fleet: &mut Fleet, index: usize) {
+async fn bury(fleet: &mut Fleet, index: usize) {
     fleet.servers[index].ended().await;
     let stopwatch = Stopwatch::start();
     let ended = stopwatch.lap();
-    while let rest @ [_, ..] = instances_below(&fleet.folder(index)).as_slice() {
+    while let rest @ [_, ..] = instances_below(&fleet.site.folder(index)).as_slice() {
         assert!(ended.elapsed() < AT_ONCE, "{AT_ONCE:?} after the server's end there is still {rest:?}");
         actix_rt::time::sleep(Duration::from_millis(10)).await;
     }
 }
 
-async fn stop_server(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
-    let server = &fleet.servers[random.random_range(0..SERVERS)];
+async fn stand_still(fleet: &Fleet, random: &mut SmallRng, is_session: bool) -> bool {
+    let index = random.random_range(0..SERVERS);
+    let server = if is_session { &fleet.session } else { &fleet.servers[index] };
     server.signal(Signal::SIGSTOP);
     actix_rt::time::sleep(WHILE).await;
     server.signal(Signal::SIGCONT);
@@ -119,7 +108,7 @@ async fn stop_server(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
 async fn signal(fleet: &Fleet, random: &mut SmallRng, words: &str, signal: Signal) -> bool {
     let deadline = Instant::now() + WHILE;
     while Instant::now() < deadline {
-        let all = instances_below(fleet.root()).into_iter();
+        let all = instances_below(fleet.site.root()).into_iter();
         let all: Vec<i32> = all.filter(|(_, command)| command.contains(words)).map(|(pid, _)| pid).collect();
         if !all.is_empty() {
             return kill(Pid::from_raw(all[random.random_range(0..all.len())]), signal).is_ok();
@@ -128,12 +117,4 @@ async fn signal(fleet: &Fleet, random: &mut SmallRng, words: &str, signal: Signa
         actix_rt::time::sleep(Duration::from_millis(2)).await;
     }
     false
-}
-
-/// A guardian stands still, but not for good: nothing would be left to end what a server that is killed leaves.
-async fn stop_guardian(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
-    let guardian = Pid::from_raw(fleet.servers[random.random_range(0..SERVERS)].guardian());
-    kill(guardian, Signal::SIGSTOP).unwrap();
-    actix_rt::time::sleep(WHILE).await;
-    kill(guardian, Signal::SIGCONT).is_ok()
 }

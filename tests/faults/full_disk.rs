@@ -5,7 +5,7 @@ use std::path::Path;
 
 use crate::fleet::try_start;
 use crate::support::disk::{self, Full};
-use crate::support::{Builder, Client, Server, demo_server, http, session_server, skip, until};
+use crate::support::{Builder, Client, Server, arm, demo_server, http, session_server, skip, until};
 
 /// How many come.
 const CLASS: u16 = 16;
@@ -57,6 +57,9 @@ async fn a_server_with_a_full_disk_takes_nobody_and_the_whole_class_runs_elsewhe
     assert!(status == 503 && text.contains("disk is full"), "{text}");
     let page = full.monitor().await;
     assert!(page.contains("Not ready") && page.contains("disk is full"), "{page}");
+    let mut refused = Client::start(&full, &arm()).await;
+    assert!(refused.until("loading: Error:").await.contains("disk is full"));
+    assert_eq!(refused.closed().await, Some(1013), "another server may take it");
     let all = class(&session, CLASS).await;
     assert_eq!(healthy.simulations().await.len(), usize::from(CLASS));
     running.until(".").await;

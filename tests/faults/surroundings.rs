@@ -1,26 +1,22 @@
-//! Faults of what is around the servers: disks, memory, clocks, names, links and ports.
+//! Faults of what is around the servers: disks, files, clocks, names and links.
 
-use std::net::TcpListener;
-use std::time::{Duration, Instant};
+use std::fs::File;
+use std::os::unix::fs::FileExt;
+use std::process::Command;
 
 use nix::sys::signal::Signal;
-use procfs::net::TcpState;
 use procfs::process::{LimitValue, Process};
 use rand::RngExt;
 use rand::rngs::SmallRng;
 
-use crate::fault::{WHILE, bury};
-use crate::fleet::{BOUND, Fleet, PLACES, SERVERS, SMALL_DISK, try_start};
-use crate::machine::LittleMemory;
+use crate::fault::WHILE;
+use crate::fleet::{Fleet, SERVERS, SMALL_DISK};
 use crate::support::disk::{Full, ReadOnly};
-use crate::support::http;
 use crate::support::relay::Mood;
-
-/// What a server that runs out of memory may still take, with all that it starts, in bytes: less than one Webots.
-const LITTLE: u64 = 2 << 20;
+use crate::support::{Builder, shared_library};
 
 pub async fn fill_disk(fleet: &mut Fleet, _: &mut SmallRng) -> bool {
-    let folder = fleet.folder(SMALL_DISK);
+    let folder = fleet.site.folder(SMALL_DISK);
     let disk = nix::sys::statvfs::statvfs(&folder).unwrap();
     if disk.blocks() * disk.fragment_size() > 64 << 20 {
         return false;
@@ -32,7 +28,7 @@ pub async fn fill_disk(fleet: &mut Fleet, _: &mut SmallRng) -> bool {
 
 /// A folder is replaced by one that can't be written, or can't be written any more.
 pub async fn close_folder(fleet: &mut Fleet, name: &str, is_empty: bool) -> bool {
-    let folder = fleet.folder(SMALL_DISK).join(name);
+    let folder = fleet.site.folder(SMALL_DISK).join(name);
     let closed = if is_empty { ReadOnly::empty(&folder) } else { ReadOnly::at(&folder) };
     if closed.is_none() {
         return false;
@@ -48,7 +44,7 @@ pub async fn no_files(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
         return false;
     };
     let limit = |soft: u64| {
-        let mut command = std::process::Command::new("prlimit");
+        let mut command = Command::new("prlimit");
         let command = command.args(["--pid", &server.pid().to_string(), &format!("--nofile={soft}:{hard}")]);
         command.status().unwrap().success()
     };
@@ -57,37 +53,40 @@ pub async fn no_files(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
     limit(soft) && is_possible
 }
 
-/// A server has no memory for another Webots. The system ends what takes the most: a simulation, or the server itself, which
-/// is then started again.
-pub async fn no_memory(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
-    let index = random.random_range(0..SERVERS);
-    let Some(little) = LittleMemory::of(fleet.servers[index].pid(), LITTLE) else {
-        return false;
-    };
-    actix_rt::time::sleep(WHILE).await;
-    drop(little);
-    let deadline = Instant::now() + BOUND;
-    loop {
-        let state = Process::new(fleet.servers[index].pid()).and_then(|process| process.stat());
-        if state.map_or(true, |stat| stat.state == 'Z') {
-            bury(fleet, index).await;
-            fleet.restart(index).await;
-            return true;
-        }
-        if http::try_get(&fleet.servers[index].url("/health")).await.is_ok() {
-            return true;
-        }
-        assert!(Instant::now() < deadline, "server {index} has memory again, and neither answers nor ends");
-        actix_rt::time::sleep(Duration::from_millis(50)).await;
+/// The time of day, for the programs that are started with it: it can be set.
+pub struct Clock {
+    folder: tempfile::TempDir,
+    step: File,
+}
+
+impl Clock {
+    /// One that is right.
+    pub fn new() -> Self {
+        let folder = shared_library("faults/clock.c", "clock.so");
+        let step = File::create(folder.path().join("step")).unwrap();
+        let clock = Self { folder, step };
+        clock.set(0);
+        clock
+    }
+
+    /// Has a server use this clock.
+    pub fn of(&self, server: Builder) -> Builder {
+        let file = |name: &str| self.folder.path().join(name).to_str().unwrap().to_owned();
+        server.env("LD_PRELOAD", &file("clock.so")).env("CLOCK_STEP", &file("step"))
+    }
+
+    /// Sets by how many seconds it differs from the machine's.
+    pub fn set(&self, seconds: i64) {
+        self.step.write_all_at(&seconds.to_ne_bytes(), 0).unwrap();
     }
 }
 
 /// The time of day of all servers makes a step, and one back.
 pub async fn step_clock(fleet: &mut Fleet, seconds: i64) -> bool {
-    fleet.clock.set(seconds);
+    fleet.site.clock.set(seconds);
     fleet.whole("the clock's step").await;
     actix_rt::time::sleep(WHILE).await;
-    fleet.clock.set(0);
+    fleet.site.clock.set(0);
     true
 }
 
@@ -101,7 +100,7 @@ pub enum Names {
 
 /// Names fail, and the fleet is whole nevertheless.
 pub async fn break_names(fleet: &mut Fleet, how: Names) -> bool {
-    let Some(names) = &mut fleet.names else {
+    let Some(names) = &mut fleet.site.names else {
         return false;
     };
     match how {
@@ -112,44 +111,19 @@ pub async fn break_names(fleet: &mut Fleet, how: Names) -> bool {
     // A name is looked up again every two seconds.
     actix_rt::time::sleep(WHILE).await;
     fleet.whole("names failed").await;
-    match (how, &mut fleet.names) {
+    match (how, &mut fleet.site.names) {
         (Names::Hang, Some(names)) => names.signal(Signal::SIGCONT),
         (Names::HaveNoServer, Some(names)) => names.start_again(),
-        _ => fleet.set_name(),
+        _ => fleet.site.set_name(),
     }
-    true
-}
-
-pub async fn take_port(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
-    let (index, first) = (random.random_range(0..SERVERS), random.random_range(0..PLACES));
-    let mut ports = (first..first + PLACES).map(|place| fleet.port(index, place));
-    let Some(_taken) = ports.find_map(|port| TcpListener::bind(("127.0.0.1", port)).ok()) else {
-        return false;
-    };
-    actix_rt::time::sleep(WHILE).await;
-    true
-}
-
-/// A server that is started again finds its port taken, and says so; then the port is free.
-pub async fn take_own_port(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
-    let index = random.random_range(0..SERVERS);
-    fleet.servers[index].signal(Signal::SIGKILL);
-    bury(fleet, index).await;
-    {
-        let _taken = TcpListener::bind(("127.0.0.1", fleet.servers[index].port)).unwrap();
-        let mut refused = fleet.configured(index).spawn();
-        let code = refused.ended().await;
-        assert!(code.is_some_and(|code| code != 0), "{code:?}");
-    }
-    fleet.restart(index).await;
     true
 }
 
 /// The session server and one simulation server see each other through a link that changes.
 pub async fn change_link(fleet: &mut Fleet, mood: Mood) -> bool {
-    fleet.relay.set(mood);
+    fleet.site.relay.set(mood);
     actix_rt::time::sleep(WHILE).await;
-    fleet.relay.set(Mood::Open);
+    fleet.site.relay.set(Mood::Open);
     true
 }
 
@@ -158,36 +132,8 @@ pub async fn lose_packets(fleet: &mut Fleet, random: &mut SmallRng, share: f64) 
     let Some(network) = fleet.network else {
         return false;
     };
-    let lost = network.lose(share, &[fleet.ports_of(random.random_range(0..SERVERS))]);
+    let lost = network.lose(share, &[fleet.site.ports_of(random.random_range(0..SERVERS))]);
     actix_rt::time::sleep(WHILE).await;
     drop(lost);
-    true
-}
-
-/// A client with a simulation is gone, and its server does not hear of it.
-pub async fn half_open(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
-    let Some(network) = fleet.network else {
-        return false;
-    };
-    let server = &fleet.servers[random.random_range(0..SERVERS)];
-    // It may not have come back from the fault before.
-    let Ok(client) = try_start(&format!("ws://{}", server.address())).await else {
-        return false;
-    };
-    let port = client.port();
-    let _lost = network.lose(1.0, &[port.to_string()]);
-    drop(client);
-    let is_open = || {
-        let all = Process::new(server.pid()).and_then(|process| process.tcp()).unwrap();
-        let mut known =
-            all.iter().filter(|one| (one.local_address.port(), one.remote_address.port()) == (server.port, port));
-        known.any(|one| one.state == TcpState::Established)
-    };
-    assert!(is_open(), "the server has heard that its client is gone");
-    let deadline = Instant::now() + BOUND;
-    while is_open() {
-        assert!(Instant::now() < deadline, "{BOUND:?} after its end, a client is still believed in");
-        actix_rt::time::sleep(Duration::from_millis(50)).await;
-    }
     true
 }

@@ -107,33 +107,6 @@ async fn limits_that_a_machine_can_not_keep_are_told_at_the_start_and_by_a_check
 }
 
 #[actix_rt::test]
-async fn a_level_that_can_not_be_is_refused_in_one_line() {
-    let containers = || demo_server(1).set("isolation", "container");
-    let sandbox = |folders| demo_server(1).set("sandbox", folders);
-    let docker = demo_server(1).set("docker", true);
-    for (builder, words) in [
-        (docker.set("isolation", "sandbox"), "docker: true asks for containers, but isolation for another level"),
-        (containers().set("isolation", "jail"), "isolation: unknown variant `jail`"),
-        (containers().set("isolation", true), "isolation: invalid type: boolean `true`"),
-        (sandbox(json!({"readable": "/"})), "sandbox.readable: \"/\" can't be shown"),
-        (sandbox(json!({"writable": ["/srv", "/proc/self/.."]})), "sandbox.writable: \"/proc/self/..\" can't be shown"),
-        (sandbox(json!({"network": "open"})), "unknown variant `open`"),
-        (
-            sandbox(json!({"network": "closed"})).set("isolation", "none"),
-            "sandbox.network: networks of simulations' own",
-        ),
-        (containers().set("sandbox", json!({"network": "own"})), "sandbox.network: networks of simulations' own"),
-        (containers().set("maxConnections", 501), "allowed are up to 500 places"),
-        (containers().set("port", 64_990).set("maxConnections", 100), "editors up to port 65535"),
-        (containers().set("container", json!({ "network": "open" })), "unknown variant `open`"),
-        (containers().set("container", json!({ "netwrok": "closed" })), "netwrok"),
-    ] {
-        let told = builder.refused(2).await;
-        assert!(told.contains(words), "{told}");
-    }
-}
-
-#[actix_rt::test]
 async fn a_webots_that_does_not_become_ready_tells_its_level_and_the_keys() {
     for (isolation, is_told) in [("sandbox", true), ("none", false)] {
         let webots = Webots::script("echo 'no module named arm'; exit 1");

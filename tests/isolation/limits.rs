@@ -2,10 +2,9 @@
 
 use std::time::{Duration, Instant};
 
-use super::deeds::as_nobody;
 use super::lives::{long, named};
 use crate::simulation::scene::{instance_folders, nothing_left};
-use crate::support::{Client, DEMO, SOON, Server, Webots, arm, http, open_folder, server_of, skip, until};
+use crate::support::{Client, DEMO, SOON, Server, Webots, arm, http, server_of, skip, until};
 
 const LEVELS: [&str; 2] = ["none", "sandbox"];
 
@@ -177,33 +176,4 @@ async fn a_simulation_has_a_control_group_of_its_own_where_they_are_delegated() 
         until("its group is gone", async || delegated.groups() == ["server"]).await;
         assert_eq!(named(&hidden), [0; 0], "{level}: what hides ends too");
     }
-}
-
-/// What a program says that may start so many threads and processes, itself among them, as a user who has no other.
-fn said_within(processes: u32, program: &str, arguments: &[&str]) -> String {
-    let mut command = std::process::Command::new("timeout");
-    command.arg("20");
-    if nix::unistd::getuid().is_root() {
-        let user = rand::random_range(100_000..1_000_000_000).to_string();
-        command.args(["setpriv", "--reuid", &user, "--regid", &user, "--clear-groups"]);
-    }
-    let limit = format!("--nproc={processes}");
-    let output = command.args(["prlimit", &limit, program]).args(arguments).output().unwrap();
-    String::from_utf8_lossy(&output.stderr).into_owned() + &String::from_utf8_lossy(&output.stdout)
-}
-
-#[test]
-fn programs_that_may_start_no_thread_say_so_and_do_not_panic() {
-    if as_nobody().is_none() && nix::unistd::getuid().is_root() {
-        return;
-    }
-    let folder = open_folder();
-    let (world, config) = (folder.path().join("a.wbt"), folder.path().join("config.json"));
-    std::fs::write(&world, "#VRML_SIM R2025a utf8\n").unwrap();
-    std::fs::write(&config, "{\"display\": \":59\", \"isolation\": \"none\"}").unwrap();
-    let said = said_within(1, env!("CARGO_BIN_EXE_demo-simulator"), &["--stream", world.to_str().unwrap()]);
-    assert!(said.contains("no thread can be started") && !said.contains("panicked"), "{said}");
-    let check = ["--check", config.to_str().unwrap()];
-    let said = said_within(1, env!("CARGO_BIN_EXE_simulation-server"), &check);
-    assert!(said.contains("no thread can be started to ask it") && !said.contains("panicked"), "{said}");
 }

@@ -5,7 +5,9 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
-use crate::simulation::scene::{gone_within, nothing_left};
+use super::deeds::Stage;
+use super::network::levels;
+use crate::simulation::scene::{gone_within, instance_folders, nothing_left};
 use crate::support::{Client, DEMO, Webots, server_of, until};
 
 /// The processes that have this word in their command line.
@@ -20,59 +22,73 @@ pub fn long() -> String {
     format!("1000.{}", rand::random::<u64>())
 }
 
+/// One is in the group of its simulation, another has left it, and the last has no mark either.
 #[actix_rt::test]
 async fn what_hides_on_purpose_ends_with_its_sandbox() {
-    for (level, reason) in [("sandbox", "client"), ("sandbox", "kill"), ("none", "client")] {
-        let hidden = long();
-        let webots = Webots::script(&format!("(env -i setsid sleep {hidden} &)\n{DEMO} \"$@\" & wait"));
-        let builder = server_of(webots, 1).set("isolation", level);
-        let mut server = builder.set("timing.grace", 0.5).start().await;
+    for (level, reason, survivors) in [
+        ("sandbox", "client", vec![]),
+        ("sandbox", "kill", vec![]),
+        // This is what the level does not promise.
+        ("none", "client", vec!["left", "hidden"]),
+        ("none", "stop", vec!["hidden"]),
+        ("none", "kill", vec!["hidden"]),
+    ] {
+        let [stayed, left, hidden] = [long(), long(), long()];
+        let webots = Webots::script(&format!(
+            "(env -i sleep {stayed} &)\n(setsid sleep {left} &)\n(env -i setsid sleep {hidden} &)\n{DEMO} \"$@\" & wait"
+        ));
+        let mut server = server_of(webots, 1).set("isolation", level).set("timing.grace", 0.5).start().await;
         let client = Client::ready(&server).await;
-        until("it hides", async || named(&hidden).len() == 1).await;
-        if reason == "client" {
-            client.leave().await;
-            nothing_left(&server, 1).await;
-        } else {
-            server.signal(Signal::SIGKILL);
-            server.ended().await;
+        let all = [("stayed", &stayed), ("left", &left), ("hidden", &hidden)];
+        let alive = || -> Vec<&str> {
+            all.into_iter().filter(|(_, word)| !named(word).is_empty()).map(|(name, _)| name).collect()
+        };
+        until("they hide", async || alive().len() == 3).await;
+        match reason {
+            "client" => client.leave().await,
+            "stop" => server.stops().await,
+            _ => {
+                server.signal(Signal::SIGKILL);
+                server.ended().await;
+            }
         }
-        if level == "sandbox" {
-            until("it has ended", async || named(&hidden).is_empty()).await;
-        } else {
-            // This is what the level does not promise.
-            assert_eq!(named(&hidden).len(), 1);
-            kill(Pid::from_raw(named(&hidden)[0]), Signal::SIGKILL).unwrap();
+        until(&format!("{level}, {reason}: there is only {survivors:?}"), async || alive() == survivors).await;
+        until("its folder is gone", async || instance_folders(&server.folder).is_empty()).await;
+        assert_eq!(alive(), survivors, "{level}, {reason}");
+        for pid in all.into_iter().flat_map(|(_, word)| named(word)) {
+            kill(Pid::from_raw(pid), Signal::SIGKILL).unwrap();
         }
     }
 }
 
 #[actix_rt::test]
 async fn a_simulation_has_its_grace_time_at_each_level() {
-    for level in ["none", "sandbox"] {
-        let folder = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap();
-        let written = folder.path().join("written");
+    for (level, user, network) in levels("a_simulation_has_its_grace_time_at_each_level") {
+        let stage = Stage::new();
+        let (open, written) = (stage.elsewhere.path().to_str().unwrap(), stage.elsewhere.path().join("written"));
         // As Webots' launcher does: it hands SIGTERM on, and waits.
-        let work = format!("sleep 0.3; echo saved > \"{}\"", written.display());
-        let webots = Webots::script(&format!("trap '{work}; exit 0' TERM\n{DEMO} \"$@\" & wait"));
-        let builder = server_of(webots, 1).set("isolation", level);
-        let server = builder.set("sandbox.writable", folder.path().to_str().unwrap()).start().await;
+        let work = format!("sleep 0.3; echo saved > '{}'", written.display());
+        let webots = Webots::script(&format!("trap \"{work}; exit 0\" TERM\n{DEMO} \"$@\" & wait"));
+        let builder = stage.builder(&webots, level).before(user).set("sandbox.network", network);
+        let server = builder.set("sandbox.writable", open).set("timing.grace", 10).start().await;
         let client = Client::ready(&server).await;
         client.leave().await;
-        nothing_left(&server, 1).await;
-        assert_eq!(std::fs::read_to_string(&written).unwrap_or_default(), "saved\n", "{level}");
+        nothing_left(&server, 2).await;
+        assert_eq!(std::fs::read_to_string(&written).unwrap_or_default(), "saved\n", "{level}, {network}");
     }
 }
 
 #[actix_rt::test]
 async fn a_simulation_that_takes_no_notice_is_killed_after_its_grace_time() {
-    for level in ["none", "sandbox"] {
+    for (level, user, network) in levels("a_simulation_that_takes_no_notice_is_killed_after_its_grace_time") {
+        let stage = Stage::new();
         let webots = Webots::script(&format!("trap '' TERM\n{DEMO} \"$@\" &\nwhile true; do wait; sleep 0.1; done"));
-        let builder = server_of(webots, 1).set("isolation", level);
-        let server = builder.set("timing.grace", 0.5).start().await;
+        let builder = stage.builder(&webots, level).before(user).set("sandbox.network", network);
+        let server = builder.set("maxConnections", 1).start().await;
         let client = Client::ready(&server).await;
         let left = Instant::now();
         client.leave().await;
         let took = gone_within(0.5, left, &server).await;
-        assert!(took >= Duration::from_millis(500), "{level}: it was killed after {took:?}");
+        assert!(took >= Duration::from_millis(500), "{level}, {network}: it was killed after {took:?}");
     }
 }

@@ -15,7 +15,7 @@ use super::deeds::{Stage, as_nobody};
 use crate::simulation::scene::{gone_within, nothing_left};
 use crate::support::client::Heard;
 use crate::support::{
-    Builder, Client, DEMO, Server, Webots, arm, display, http, instances_below, is_told, needs, programs, skip, until,
+    Builder, Client, DEMO, Server, Webots, arm, display, instances_below, is_told, needs, programs, skip, until,
 };
 
 /// What runs a server as an ordinary user who can have networks; nothing, and a word, where there is none.
@@ -27,6 +27,13 @@ fn ordinary(test: &str) -> Option<&'static str> {
         return None;
     }
     if nix::unistd::getuid().is_root() { as_nobody() } else { Some("true") }
+}
+
+/// What a simulation is kept in: a level, who runs the server, and the network.
+pub fn levels(test: &str) -> Vec<(&'static str, &'static str, &'static str)> {
+    let mut levels = vec![("none", "true", "shared"), ("sandbox", "true", "shared")];
+    levels.extend(ordinary(test).map(|user| ("sandbox", user, "own")));
+    levels
 }
 
 /// A server of an ordinary user in whose sandboxes this network is.
@@ -135,25 +142,6 @@ async fn who_takes_all_ports_in_its_own_network_keeps_nobody_out() {
 }
 
 #[actix_rt::test]
-async fn a_simulation_in_its_own_network_does_not_reach_its_neighbour() {
-    let Some(user) = ordinary("a_simulation_in_its_own_network_does_not_reach_its_neighbour") else { return };
-    for (network, is_reached) in [("own", false), ("shared", true)] {
-        let stage = Stage::new();
-        // The second one looks for the first, at the port before its own.
-        let look = python("s.create_connection(('127.0.0.1', $port - 1), 5); print('REACHED')");
-        let webots = Webots::script(&format!("{PORT}\n{look}; echo LOOKED\n{DEMO} \"$@\" & wait"));
-        let server = server(&stage, &webots, user, network).start().await;
-        let _first = Client::ready(&server).await;
-        // Clients reach it all the same.
-        http::get(&format!("http://127.0.0.1:{}/index.html", server.port + 1)).await;
-        let second = Client::ready(&server).await;
-        let told = || std::fs::read_to_string(server.output_file(&second)).unwrap();
-        until("the second one has looked", async || told().contains("LOOKED")).await;
-        assert_eq!(told().contains("REACHED"), is_reached, "{network}: {}", told());
-    }
-}
-
-#[actix_rt::test]
 async fn a_display_is_within_reach_at_each_level_and_of_its_own_network() {
     let _alone = display::alone().await;
     needs("xhost", "x11-xserver-utils");
@@ -161,28 +149,10 @@ async fn a_display_is_within_reach_at_each_level_and_of_its_own_network() {
         ("use the display", "xhost".to_owned()),
         ("use it without its authority", "XAUTHORITY=/dev/null xhost".to_owned()),
     ];
-    let mut cases = vec![("none", "true", "shared"), ("sandbox", "true", "shared")];
-    cases.extend(ordinary("a_display_is_within_reach_of_its_own_network").map(|user| ("sandbox", user, "own")));
-    for (level, user, network) in cases {
+    for (level, user, network) in levels("a_display_is_within_reach_of_its_own_network") {
         let change = |builder: Builder| builder.before(user).set("sandbox.network", network).set("xvfb", true);
         assert_eq!(Stage::new().tried(&deeds, level, change).await, ["use the display"], "{level}, {network}");
     }
-}
-
-#[actix_rt::test]
-async fn limits_and_grace_time_hold_in_its_own_network() {
-    let Some(user) = ordinary("limits_and_grace_time_hold_in_its_own_network") else { return };
-    let stage = Stage::new();
-    let (open, written) = (stage.elsewhere.path().to_str().unwrap(), stage.elsewhere.path().join("written"));
-    let work = format!("sleep 0.3; echo saved $(ulimit -u) > '{}'", written.display());
-    let webots = Webots::script(&format!("trap \"{work}; exit 0\" TERM\n{DEMO} \"$@\" & wait"));
-    let server = server(&stage, &webots, user, "own").set("sandbox.writable", open).set("limits.processes", 70);
-    let server = server.set("timing.grace", 10).start().await;
-    let client = Client::ready(&server).await;
-    client.leave().await;
-    nothing_left(&server, 2).await;
-    // One of the processes is bubblewrap.
-    assert_eq!(std::fs::read_to_string(&written).unwrap_or_default(), "saved 71\n");
 }
 
 /// The processes of a server's simulations that are none of its own.
@@ -193,12 +163,9 @@ fn all_of(server: &Server) -> Vec<(i32, String)> {
 #[actix_rt::test]
 async fn pasta_ends_with_its_simulation_and_with_the_server() {
     let Some(user) = ordinary("pasta_ends_with_its_simulation_and_with_the_server") else { return };
-    for end in ["client", "ignores", "pasta", "server"] {
+    for end in ["client", "pasta", "server"] {
         let stage = Stage::new();
-        let trap = if end == "ignores" { "trap '' TERM" } else { "" };
-        let webots = Webots::script(&format!(
-            "{trap}\n(env -i setsid sleep 1000 &)\n{DEMO} \"$@\" &\nwhile true; do wait; sleep 0.1; done"
-        ));
+        let webots = Webots::script(&format!("(env -i setsid sleep 1000 &)\n{DEMO} \"$@\" & wait"));
         let mut server = server(&stage, &webots, user, "own").set("maxConnections", 1).start().await;
         let mut client = Client::ready(&server).await;
         let parent = server.pid();
@@ -269,12 +236,10 @@ async fn which_network_simulations_have_is_told() {
         assert!(page.contains(&format!("<dd>{words}")), "{page}");
         assert!(server.log().contains(&format!("network of simulations: {words}")), "{}", server.log());
     }
-    for network in ["own", "closed"] {
-        let (stage, webots) = (Stage::new(), Webots::script("exit 1"));
-        let setpriv = user.replace("setpriv", "/usr/bin/setpriv");
-        let told = server(&stage, &webots, &setpriv, network).env("PATH", &path(&none)).refused(1).await;
-        assert!(told.contains("but pasta is not there"), "{told}");
-    }
+    let (stage, webots) = (Stage::new(), Webots::script("exit 1"));
+    let setpriv = user.replace("setpriv", "/usr/bin/setpriv");
+    let told = server(&stage, &webots, &setpriv, "own").env("PATH", &path(&none)).refused(1).await;
+    assert!(told.contains("but pasta is not there"), "{told}");
 }
 
 #[actix_rt::test]

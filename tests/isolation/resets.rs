@@ -3,9 +3,8 @@
 use std::path::Path;
 
 use crate::simulation::scene::{instance_folders, nothing_left};
-use crate::support::{Client, DEMO, Webots, server_of, until};
+use crate::support::{Client, DEMO, Webots, demo_server, server_of, until};
 
-const LEVELS: [&str; 2] = ["none", "sandbox"];
 /// What the controller of [`Forge::with_arm`] has.
 const ORIGINAL: &str = "print('original')\n";
 
@@ -20,31 +19,34 @@ async fn a_reset_replaces_a_link_and_follows_none() {
         ("rm controllers/c/c.py; mkfifo controllers/c/c.py", true),
         ("rm controllers/c/c.py; mkdir controllers/c/c.py; touch controllers/c/c.py/mine", false),
     ];
-    for level in LEVELS {
+    for level in ["none", "sandbox"] {
+        let server = demo_server(1).set("isolation", level).start().await;
         for (deed, is_restored) in table {
             let outside = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap();
             let victim = outside.path().join("victim");
             std::fs::write(&victim, "untouched").unwrap();
             std::fs::create_dir(outside.path().join("c")).unwrap();
+            let mut client = Client::ready(&server).await;
+            let folder = instance_folders(&server.folder)[0].clone();
             let deed = deed.replace("VICTIM", &format!("'{}'", victim.display()));
             let deed = deed.replace("OUTSIDE", &format!("'{}'", outside.path().display()));
             // What a project's folder says of files and repositories is not for the server's git.
             let git = "echo '*.py working-tree-encoding=UTF-16' > .gitattributes; echo 'gitdir: /tmp' > .git";
-            let webots = Webots::script(&format!("{deed}\n{git}\n{DEMO} \"$@\" & wait"));
-            let server = server_of(webots, 1).set("isolation", level).start().await;
-            let mut client = Client::ready(&server).await;
+            let mut shell = std::process::Command::new("sh");
+            let done = shell.args(["-ec", &format!("{deed}; {git}")]).current_dir(folder.join("project")).status();
+            assert!(done.unwrap().success());
+            let what = format!("{level}, {deed}");
             let answer = client.reset("c/c.py").await;
-            let folder = instance_folders(&server.folder)[0].clone();
             let file = folder.join("project/controllers/c/c.py");
-            assert_eq!(answer.starts_with("reset"), is_restored, "{level}, {deed}: {answer}");
+            assert_eq!(answer.starts_with("reset"), is_restored, "{what}: {answer}");
             if is_restored {
-                assert!(file.symlink_metadata().unwrap().is_file(), "{level}, {deed}");
-                assert_eq!(std::fs::read_to_string(&file).unwrap(), ORIGINAL, "{level}, {deed}");
-                assert_eq!(file.canonicalize().unwrap(), file, "{level}, {deed}");
+                assert!(file.symlink_metadata().unwrap().is_file(), "{what}");
+                assert_eq!(std::fs::read_to_string(&file).unwrap(), ORIGINAL, "{what}");
+                assert_eq!(file.canonicalize().unwrap(), file, "{what}");
             }
-            assert_eq!(std::fs::read_to_string(&victim).unwrap(), "untouched", "{level}, {deed}");
+            assert_eq!(std::fs::read_to_string(&victim).unwrap(), "untouched", "{what}");
             let inside = |folder: &Path| std::fs::read_dir(folder).unwrap().count();
-            assert_eq!((inside(outside.path()), inside(&outside.path().join("c"))), (2, 0), "{level}, {deed}");
+            assert_eq!((inside(outside.path()), inside(&outside.path().join("c"))), (2, 0), "{what}");
             let left: Vec<_> = std::fs::read_dir(&folder).unwrap().flatten().map(|entry| entry.file_name()).collect();
             assert!(!left.iter().any(|name| name.to_string_lossy().starts_with("restored")), "{left:?}");
             client.leave().await;

@@ -6,12 +6,13 @@ use futures_util::future::join_all;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
-use super::git_wrapper::GitWrapper;
 use super::opened::{cached, reader, size_of, world_text};
 use super::scene::{instance_folders, nothing_left};
 use crate::support::git::git;
+use crate::support::wrapper::Wrapper;
 use crate::support::{
-    Client, Forge, Webots, arm, arm_at, instances_below, is_told, outcome, server_of, simulation_server, until, world,
+    Client, Forge, Webots, arm, arm_at, demo_server, instances_below, is_told, outcome, server_of, simulation_server,
+    until, world,
 };
 
 #[actix_rt::test]
@@ -62,6 +63,34 @@ async fn every_kind_of_url_opens_its_world() {
     }
     assert!(!server.folder.join("pwned").exists() && !Path::new("pwned").exists(), "a name was run");
     assert!(server.log().contains("is for Webots R2025a"));
+}
+
+#[actix_rt::test]
+async fn a_world_runs_only_where_its_repository_is_allowed() {
+    let (forge, webots) = (Forge::with_arm(), reader());
+    for name in ["lab-evil/arm", "lab/secret"] {
+        forge.commit(name, "main", &[("worlds/a.wbt", &world_text(name))]);
+    }
+    let builder = simulation_server(&webots.path(), forge.path(), 2);
+    let blocked = serde_json::json!(["https://github.com/lab/secret"]);
+    let server = builder.set("blockedRepositories", blocked).start().await;
+    let end = "blob/main/worlds/a.wbt";
+    let not_allowed = "Docker not enabled: cannot host simulations from repositories outside of those that this simulation server allows";
+    let is_blocked = "Cannot run simulation from blocked repository";
+    let table = [
+        (format!("https://github.com/lab/arm/{end}"), "opened [WorldInfo"),
+        (format!("https://github.com/lab-evil/arm/{end}"), not_allowed),
+        (format!("https://github.com//lab-evil//arm/{end}"), not_allowed),
+        (format!("https://github.com.evil.org/lab/arm/{end}"), not_allowed),
+        (format!("https://evil.org/github.com/lab/{end}"), not_allowed),
+        (format!("https://github.com/LAB/Secret.git/{end}"), is_blocked),
+        ("https://github.com/lab/secret/src/branch/main/worlds/a.wbt".to_owned(), is_blocked),
+        ("https://github.com/lab/secret/-/blob/main/worlds/a.wbt".to_owned(), is_blocked),
+        (format!("https://github.com/lab/%2e%2e/lab-evil/arm/{end}"), "Wrong Webots simulation URL"),
+    ];
+    for (url, words) in table {
+        is_told(&server, &url, words).await;
+    }
 }
 
 #[actix_rt::test]
@@ -151,7 +180,7 @@ async fn a_repository_can_run_nothing() {
 
 #[actix_rt::test]
 async fn equal_checkouts_are_done_once_and_a_cached_start_fetches_nothing() {
-    let wrapper = GitWrapper::new("case \"$*\" in *fetch*) sleep 0.7;; esac");
+    let wrapper = Wrapper::git("case \"$*\" in *fetch*) sleep 0.7;; esac");
     let server = server_of(reader(), 6).env("PATH", &wrapper.path()).start().await;
     let forge = server.forge();
     let all = join_all((0..5).map(|_| async { outcome(&server, &arm()).await })).await;
@@ -168,18 +197,11 @@ async fn equal_checkouts_are_done_once_and_a_cached_start_fetches_nothing() {
     is_told(&server, &arm(), "opened [changed]").await;
     let grown = size_of(&server.folder.join("cache/git")) - before;
     assert!(before > 1 << 20 && grown < 20_000, "{grown} bytes were fetched");
-    // A client that waits alone ends git when it leaves.
-    forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("once more"))]);
-    let mut impatient = Client::start(&server, &arm()).await;
-    impatient.until("loading: Step 1/9 : looking for").await;
-    until("it fetches", async || count("fetch") == 4).await;
-    impatient.leave().await;
-    nothing_left(&server, 6).await;
 }
 
 #[actix_rt::test]
 async fn progress_moves_in_percent() {
-    let wrapper = GitWrapper::new(
+    let wrapper = Wrapper::git(
         "case \"$*\" in *fetch*) for n in 10 35 60 85; do for again in 1 2 3 4; do printf 'Receiving objects: %s%% (1/2)\\r' $n >&2; sleep 0.25; done; done;; esac",
     );
     let server = server_of(reader(), 1).env("PATH", &wrapper.path()).start().await;
@@ -204,7 +226,7 @@ async fn a_kill_in_the_middle_of_a_fetch_harms_no_later_start() {
     let start = || simulation_server(&webots.path(), forge.path(), 2).folder(folder.path());
     // Half a pack, then nothing more. It is said again and again: of what comes close together clients hear the newest only,
     // and what git has started may still say something.
-    let slow = GitWrapper::new(
+    let slow = Wrapper::git(
         "case \"$*\" in *fetch*) \"$REAL\" \"$@\" & sleep 0.03; kill -STOP $!; \
          while echo 'halted: 50%' >&2; do sleep 0.2; done; exit;; esac",
     );
@@ -239,12 +261,10 @@ fn has_half_a_pack(repository: &Path) -> bool {
 }
 
 #[actix_rt::test]
-async fn a_controller_is_reset_and_nothing_else_and_one_at_a_time() {
-    let (forge, webots, folder) = (Forge::with_arm(), Webots::launcher(), tempfile::tempdir().unwrap());
-    forge.commit("lab/arm", "main", &[("protos/p.txt", "original")]);
-    let mark = folder.path().join("wait");
-    let wrapper = GitWrapper::new(&format!("while [ -e {} ]; do sleep 0.05; done", mark.display()));
-    let server = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path()).start().await;
+async fn a_controller_is_reset_and_nothing_else() {
+    let builder = demo_server(1);
+    builder.forge().commit("lab/arm", "main", &[("protos/p.txt", "original")]);
+    let server = builder.start().await;
     let mut client = Client::ready(&server).await;
     let project = instance_folders(&server.folder)[0].join("project");
     let file = project.join("controllers/c/c.py");
@@ -255,32 +275,12 @@ async fn a_controller_is_reset_and_nothing_else_and_one_at_a_time() {
     assert_eq!(client.reset("c/c.py").await, "reset controller: c/c.py");
     assert!(file.is_file());
     std::fs::write(project.join("protos/p.txt"), "changed").unwrap();
-    for name in [
-        "../protos/p.txt",
-        "c/../../protos/p.txt",
-        "/etc/passwd",
-        "c/none.py",
-        "c.py",
-        "",
-        "c/",
-        "c/c.py\0",
-        ":/protos/p.txt",
-        "*/c.py",
-    ] {
+    let names = ["../protos/p.txt", "c/../../protos/p.txt", "/etc/passwd", "c/none.py", "c.py", "", "c/"];
+    for name in names.into_iter().chain(["c/c.py\0", ":/protos/p.txt", "*/c.py"]) {
         let answer = client.reset(name).await;
         assert!(answer.ends_with("is no file below the project's controllers folder"), "{name:?}: {answer}");
     }
     assert_eq!(std::fs::read_to_string(project.join("protos/p.txt")).unwrap(), "changed");
-    // One at a time.
-    std::fs::write(&mark, "").unwrap();
-    for _ in 0..3 {
-        client.send(r#"{"reset controller": "c/c.py"}"#).await;
-    }
-    let ignored = "a controller is being reset already";
-    until("two are ignored", async || server.log().matches(ignored).count() == 2).await;
-    std::fs::remove_file(&mark).unwrap();
-    client.until("reset controller: c/c.py").await;
-    assert_eq!(client.reset("c/c.py").await, "reset controller: c/c.py");
 }
 
 #[actix_rt::test]
@@ -297,10 +297,4 @@ async fn the_files_of_the_folders_above_a_project_are_there_and_no_other_folders
     let told = outcome(&server, &world("lab/arm", "main", "a/p%20q/worlds/a.wbt")).await;
     let expected = "files [./a/mid.proto ./a/p q/protos/p.proto ./a/p q/worlds/a.wbt ./top.proto ]";
     assert!(told.contains(expected), "{told}");
-    // They count for the size.
-    std::fs::write(forge.work_tree("lab/arm", "main").join("zeros"), vec![b'0'; 3 << 20]).unwrap();
-    forge.commit_work_tree("lab/arm", "main");
-    let server = simulation_server(&webots.path(), forge.path(), 1).set("projectSize", 1).start().await;
-    let told = outcome(&server, &world("lab/arm", "main", "a/p%20q/worlds/a.wbt")).await;
-    assert_eq!(told, "loading: Error: The project is larger than 1 MiB");
 }

@@ -4,11 +4,8 @@ use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 
-use super::scene::nothing_left;
 use crate::support::http::{PASSWORD, get_as_administrator};
-use crate::support::{
-    Client, DEMO, Forge, Server, Webots, arm, http, is_told, server_of, simulation_server, until, world,
-};
+use crate::support::{Client, DEMO, Forge, Server, Webots, arm, http, server_of, simulation_server, until, world};
 
 /// A simulator that ends with an exit code, once that is in a file.
 fn ending(file: &Path) -> Webots {
@@ -149,18 +146,6 @@ async fn what_is_kept_needs_the_password_where_there_is_one() {
         let url = server.url(&format!("/output?id={id}"));
         assert_eq!(get_as_administrator(&url).await.status, 404, "{id}");
     }
-}
-
-#[actix_rt::test]
-async fn an_output_that_can_not_be_kept_fails_no_start() {
-    let server = server_of(Webots::script("echo 'last words'; exit 3"), 1).start().await;
-    let logs = server.folder.join("log/simulation");
-    std::fs::create_dir_all(&logs).unwrap();
-    // Not even root can make a folder in a file.
-    std::fs::write(logs.join("instances"), "").unwrap();
-    is_told(&server, &arm(), "Webots ended with exit code 3. Its last output: last words").await;
-    assert_eq!(server.log().matches("what Webots prints is not kept").count(), 1);
-    nothing_left(&server, 1).await;
 }
 
 #[actix_rt::test]

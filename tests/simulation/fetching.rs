@@ -4,11 +4,11 @@ use std::time::Duration;
 
 use futures_util::future::join_all;
 
-use super::git_wrapper::GitWrapper;
 use super::opened::{cached, reader, world_text};
 use super::scene::stages;
 use crate::support::git::git;
-use crate::support::{Client, Forge, arm, arm_at, is_told, outcome, simulation_server, until, world};
+use crate::support::wrapper::Wrapper;
+use crate::support::{Client, Forge, arm, arm_at, is_told, simulation_server, until, world};
 
 /// A forge with `lab/arm`: each of these branches has two worlds that name it.
 fn forge(branches: &[&str]) -> Forge {
@@ -30,7 +30,7 @@ async fn a_fetch_that_hangs_holds_up_nobody_who_needs_no_fetch_and_others_only_f
     let (forge, webots) = (forge(&["main", "slow", "one"]), reader());
     let (main, slow) = (commit(&forge, "main"), commit(&forge, "slow"));
     git(&forge.path().join("lab/arm"), &["tag", "as-slow", "slow"]);
-    let wrapper = GitWrapper::new(&format!(
+    let wrapper = Wrapper::git(&format!(
         "case \"$*\" in *fetch*+{slow}:*) while echo 'halted: 50%' >&2; do sleep 0.2; done;; esac"
     ));
     let builder = simulation_server(&webots.path(), forge.path(), 5).env("PATH", &wrapper.path());
@@ -66,28 +66,6 @@ async fn a_fetch_that_hangs_holds_up_nobody_who_needs_no_fetch_and_others_only_f
 }
 
 #[actix_rt::test]
-async fn many_commits_that_are_wanted_at_once_all_come() {
-    let branches = ["main", "one", "two", "three", "four"];
-    let (forge, webots) = (forge(&branches), reader());
-    // Of a line of commits, each is fetched alone, whichever comes first.
-    let old = commit(&forge, "main");
-    forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("newer"))]);
-    git(&forge.path().join("lab/arm"), &["tag", "old", &old]);
-    let server = simulation_server(&webots.path(), forge.path(), 8).start().await;
-    let wanted =
-        [("main", "newer"), ("old", "main"), ("one", "one"), ("two", "two"), ("three", "three"), ("four", "four")];
-    let all = wanted.map(|(name, text)| {
-        let server = &server;
-        async move { (outcome(server, &arm_at(name)).await, text) }
-    });
-    for (told, text) in join_all(all).await {
-        assert!(told.contains(&format!("opened [{text}]")), "{text}: {told}");
-    }
-    assert_eq!(cached(&server).len(), 1, "one repository for one remote");
-    git(&cached(&server)[0], &["fsck", "--full"]);
-}
-
-#[actix_rt::test]
 async fn a_git_that_is_stopped_fails_once() {
     let forge = &forge(&["main"]);
     // What each kind of command is for: to ask, to make the repository, to fetch, to list its files, to copy them.
@@ -97,7 +75,7 @@ async fn a_git_that_is_stopped_fails_once() {
             "case \" $* \" in *\" {command} \"*) mkdir {}/stopped 2>/dev/null && kill -STOP $$;; esac",
             marks.path().display()
         );
-        let wrapper = GitWrapper::new(&stop);
+        let wrapper = Wrapper::git(&stop);
         let builder = simulation_server(&webots.path(), forge.path(), 2).env("PATH", &wrapper.path());
         let server = builder.set("timing.checkout", 10).start().await;
         let ask = async || Client::start(&server, &arm()).await;

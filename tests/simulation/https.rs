@@ -2,7 +2,7 @@
 
 use std::io::Write;
 use std::net::TcpListener;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Command, Stdio};
 
 use super::opened::{cached, reader, world_text};
@@ -29,10 +29,6 @@ impl Https {
         let certificate = authority.issue(&["127.0.0.1"]).server();
         serve(listener, Some(certificate), move |request| answer(request, &root, &elsewhere));
         Self { forge, port, authority }
-    }
-
-    fn certificate(&self) -> PathBuf {
-        self.authority.file()
     }
 
     /// A simulation server that takes all repositories from here.
@@ -95,7 +91,7 @@ async fn a_forge_is_asked_over_https_and_followed_nowhere_else() {
     let plain = TcpListener::bind("127.0.0.1:0").unwrap();
     plain.set_nonblocking(true).unwrap();
     let https = Https::new(forge, format!("https://{}", plain.local_addr().unwrap()));
-    let server = https.server(&webots).env("GIT_SSL_CAINFO", https.certificate().to_str().unwrap());
+    let server = https.server(&webots).env("GIT_SSL_CAINFO", https.authority.file().to_str().unwrap());
     let server = server.set("blockedRepositories", serde_json::json!(["https://github.com/lab/secret"])).start().await;
     let missing = "does not exist or is not public";
     let table = [
@@ -146,7 +142,7 @@ async fn what_the_administrator_has_set_for_git_holds_and_what_a_world_could_hav
     let url = world("lab/private", "main", "worlds/a.wbt");
     let start = || {
         let builder = https.server(&webots).env("HOME", home.path().to_str().unwrap());
-        builder.env("GIT_SSL_CAINFO", https.certificate().to_str().unwrap())
+        builder.env("GIT_SSL_CAINFO", https.authority.file().to_str().unwrap())
     };
     is_told(&start().start().await, &url, "does not exist or is not public").await;
     is_told(&start().set("gitConfig", ours.to_str().unwrap()).start().await, &url, "opened [private]").await;

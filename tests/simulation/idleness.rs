@@ -5,9 +5,8 @@ use std::time::{Duration, Instant};
 use serde_json::json;
 
 use super::life::quick;
-use super::resuming::{ENDED, refused};
 use super::scene::nothing_left;
-use crate::support::{Client, arm, demo_server, until};
+use crate::support::{Client, arm, demo_server};
 
 /// In minutes: three seconds. Half of it before the end the client is told.
 const LIMIT: f64 = 0.05;
@@ -56,25 +55,4 @@ async fn who_runs_is_never_ended_for_it() {
     let now = viewer.time().await;
     while viewer.time().await < now + 3000.0 {}
     assert_eq!(server.simulations().await.len(), 1);
-}
-
-#[actix_rt::test]
-async fn who_is_away_and_paused_keeps_to_both_rules() {
-    let server = quick(demo_server(1)).set("idleTimeout", LIMIT).start().await;
-    // Who comes back in time is told again.
-    let (mut client, first) = Client::resumable(&server).await;
-    client.until(TOLD).await;
-    drop(client);
-    let mut client = Client::resuming(&server, &first).await;
-    let second = client.token().await;
-    let told = client.until("idle:").await;
-    assert!(["idle: 2", "idle: 1"].contains(&told.as_str()), "{told}");
-    client.send(&json!({"keep": true}).to_string()).await;
-    client.until("idle: never").await;
-    // Who does not finds out why.
-    drop(client);
-    server.until_away(1).await;
-    until("it has ended", async || server.simulations().await.is_empty()).await;
-    let told = refused(&server, &second).await;
-    assert!(told.starts_with(&format!("{ENDED}: {WHY}")), "{told}");
 }

@@ -121,10 +121,6 @@ async fn what_a_killed_server_has_left_is_removed_at_the_next_start() {
     until("git is gone", async || instances_below(scene.folder.path()).is_empty()).await;
 }
 
-pub fn is_there(pid: i32) -> bool {
-    procfs::process::Process::new(pid).is_ok_and(|process| process.stat().is_ok_and(|stat| stat.state != 'Z'))
-}
-
 #[actix_rt::test]
 async fn a_client_is_told_how_webots_ended() {
     let table = [

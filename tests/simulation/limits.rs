@@ -1,9 +1,9 @@
 //! What is too large, or takes too much.
 
-use super::git_wrapper::GitWrapper;
 use super::opened::{reader, size_of, world_text};
 use super::scene::nothing_left;
 use crate::support::git::git;
+use crate::support::wrapper::Wrapper;
 use crate::support::{Forge, WORLD, arm, arm_at, is_told, outcome, simulation_server, until, world};
 
 #[actix_rt::test]
@@ -67,7 +67,7 @@ async fn git_is_bounded_in_memory_and_in_what_it_writes() {
     let server = simulation_server(&webots.path(), forge.path(), 1).set("projectSize", 1).start().await;
     assert_eq!(outcome(&server, &arm()).await, "loading: Error: The project is larger than 1 MiB");
     // The server sets it once git has been started.
-    let wrapper = GitWrapper::new("until [ \"$(ulimit -d)\" -le 2097152 ] 2>/dev/null; do sleep 0.01; done");
+    let wrapper = Wrapper::git("until [ \"$(ulimit -d)\" -le 2097152 ] 2>/dev/null; do sleep 0.01; done");
     let server = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path()).start().await;
     is_told(&server, &arm(), "opened").await;
 }

@@ -1,20 +1,15 @@
 //! The simulation server, seen from outside: the built program, real git, real processes, a stand-in for Webots.
 
-mod admission;
 mod cache;
 mod checkout;
 mod commits;
 mod ends;
 mod fetching;
-mod git_wrapper;
 mod https;
 mod idleness;
 mod large_files;
 mod life;
 mod limits;
-#[allow(dead_code, reason = "faults use more of it")]
-#[path = "../faults/network.rs"]
-mod network;
 mod opened;
 mod own_failures;
 mod places;
@@ -28,5 +23,4 @@ pub mod scene;
 mod soak;
 mod stopping;
 mod stopping_one;
-mod trees;
 mod who;

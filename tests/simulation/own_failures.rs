@@ -58,8 +58,7 @@ async fn a_black_hole_takes_a_handful_of_clients_and_not_a_class() {
     let (mut running, mut failures) = (Vec::new(), 0);
     while running.len() < 10 {
         let given = http::get(&session.url("/session")).await.text();
-        let mut client = Client::connect(&format!("{given}/client")).await;
-        client.send(&serde_json::json!({"start": {"url": arm()}}).to_string()).await;
+        let mut client = Client::connect(&format!("{given}/client")).await.asking(&arm()).await;
         loop {
             let text = client.until("").await;
             if text.starts_with("webots:") {
@@ -116,22 +115,14 @@ async fn no_text_for_a_client_holds_a_path_of_the_machine() {
         std::fs::write(repository.join("config"), "[nonsense").unwrap();
     }
     all.extend(heard(&server, &arm()).await);
-    // Webots can't be run, and is gone.
+    // Webots can't be run.
     std::fs::set_permissions(webots.path(), std::fs::Permissions::from_mode(0o644)).unwrap();
     all.extend(heard(&server, &arm()).await);
-    std::fs::remove_file(webots.path()).unwrap();
-    all.extend(heard(&server, &arm()).await);
-    // The folder of the run is none.
-    let other = simulation_server(&Webots::launcher().path(), forge.path(), 1).start().await;
-    let run = std::fs::read_dir(other.folder.join("cache/runs")).unwrap().next().unwrap().unwrap().path();
-    std::fs::remove_dir_all(&run).unwrap();
-    std::fs::write(&run, "no folder").unwrap();
-    all.extend(heard(&other, &arm()).await);
     let temporary = std::env::temp_dir().to_str().unwrap().to_owned();
     for text in &all {
         for path in [&temporary, "cache/", "runs/", env!("CARGO_MANIFEST_DIR"), "/bin/", "/git/"] {
             assert!(!text.contains(path), "{path}: {text}");
         }
     }
-    assert!(all.iter().filter(|text| text.starts_with("loading: Error:")).count() >= 9, "{all:#?}");
+    assert!(all.iter().filter(|text| text.starts_with("loading: Error:")).count() >= 7, "{all:#?}");
 }

@@ -5,9 +5,8 @@ use std::collections::BTreeSet;
 use std::net::TcpListener;
 use std::time::Duration;
 
-use super::git_wrapper::GitWrapper;
 use super::scene::nothing_left;
-use crate::support::{Client, Forge, Webots, arm, demo_server, simulation_server, until};
+use crate::support::{Client, arm, demo_server, until};
 
 #[actix_rt::test]
 async fn the_waiting_line_is_served_in_order_and_forgets_who_leaves() {
@@ -96,13 +95,13 @@ async fn an_address_may_ask_only_so_often() {
     let ask = async |address: &str| {
         Client::start_from(&server, address, "https://github.com/none").await.until("loading: Error:").await
     };
-    let mut asked = 0;
-    until("it is told to wait", async || {
+    let mut asked = 1;
+    let too_many = "loading: Error: Too many simulations were asked for from your address";
+    while !ask("203.0.113.9").await.starts_with(too_many) {
         asked += 1;
-        ask("203.0.113.9").await.starts_with("loading: Error: Too many simulations were asked for from your address")
-    })
-    .await;
-    assert!((201..260).contains(&asked), "{asked}");
+        assert!(asked < 260, "it is never told to wait");
+    }
+    assert!(asked > 200, "{asked}");
     assert!(ask("203.0.113.10").await.contains("Wrong Webots simulation URL"));
 }
 
@@ -116,23 +115,6 @@ async fn a_port_that_somebody_else_has_is_not_lent() {
     assert_eq!(second.until("").await, "queue: 0");
     drop(first);
     assert_eq!(second.until("webots:").await, format!("webots:ws://localhost:{}", server.port + 1));
-}
-
-#[actix_rt::test]
-async fn a_port_that_is_taken_during_the_checkout_is_not_taken_for_webots() {
-    let (forge, webots, mark) = (Forge::with_arm(), Webots::launcher(), tempfile::NamedTempFile::new().unwrap());
-    let wrapper = GitWrapper::new(&format!(
-        "case \"$*\" in *checkout*) while [ -e {} ]; do sleep 0.05; done;; esac",
-        mark.path().display()
-    ));
-    let builder = simulation_server(&webots.path(), forge.path(), 1).set("isolation", "none");
-    let server = builder.env("PATH", &wrapper.path()).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.until("loading: Step 8/9 : checking main out").await;
-    let _taken = TcpListener::bind(("127.0.0.1", server.port + 1)).unwrap();
-    drop(mark);
-    client.until("loading: Error:").await;
-    assert_eq!(client.closed().await, Some(1013));
 }
 
 #[actix_rt::test]

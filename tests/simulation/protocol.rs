@@ -1,6 +1,6 @@
 //! What clients and pages may ask, and what they are told.
 
-use super::scene::{nothing_left, stages};
+use super::scene::stages;
 use crate::support::{Client, Server, arm, arm_at, demo_server, http, instances_below, until, world};
 
 #[actix_rt::test]
@@ -140,34 +140,4 @@ async fn pages_tell_what_they_should() {
     assert!(status["machine"]["memory"].is_number() && status["host"]["threads"].as_u64() > Some(0));
     let page = server.monitor().await;
     assert!(page.contains("github.com/lab/arm") && page.contains("idle"), "{page}");
-}
-
-#[actix_rt::test]
-async fn outcomes_are_counted() {
-    let server = demo_server(1).set("waitingLine", 1).start().await;
-    let count = async |name: &str| {
-        let text = server.metrics().await;
-        let name = format!("webots_simulation_{name} ");
-        text.lines().find_map(|line| line.strip_prefix(&name)).unwrap().parse::<u32>().unwrap()
-    };
-    assert_eq!(count("starts_total{outcome=\"ready\"}").await, 0);
-    let ready = Client::ready(&server).await;
-    let mut waits = Client::start(&server, &arm()).await;
-    waits.until("queue: 0").await;
-    Client::start(&server, &arm()).await.until("loading: Error: All 1 places").await;
-    Client::start(&server, &world("other/x", "main", "worlds/a.wbt")).await.until("loading: Error:").await;
-    waits.leave().await;
-    ready.leave().await;
-    nothing_left(&server, 1).await;
-    Client::start(&server, &world("lab/none", "main", "worlds/a.wbt")).await.until("loading: Error:").await;
-    for (counter, expected) in [
-        ("starts_total{outcome=\"ready\"}", 1),
-        ("starts_total{outcome=\"full\"}", 1),
-        ("starts_total{outcome=\"refused\"}", 1),
-        ("ends_total{reason=\"left\"}", 2),
-        ("ends_total{reason=\"no_checkout\"}", 1),
-        ("ends_total{reason=\"no_webots\"}", 0),
-    ] {
-        until(counter, async || count(counter).await == expected).await;
-    }
 }

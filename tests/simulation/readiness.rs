@@ -2,9 +2,8 @@
 
 use serde_json::Value;
 
-use super::scene::{instance_folders, nothing_left};
 use crate::support::{
-    Client, Forge, Server, Webots, arm, demo_server, http, is_told, session_server, simulation_server, until,
+    Forge, Server, Webots, arm, demo_server, http, is_told, session_server, simulation_server, until,
 };
 
 /// Whether the session server counts its only simulation server as one that works; a busy machine may make it full.
@@ -50,40 +49,6 @@ async fn a_display_that_is_missing_is_a_problem_for_webots_itself() {
 }
 
 #[actix_rt::test]
-async fn a_server_below_its_reserve_of_disk_refuses_clients_and_says_so() {
-    let server = demo_server(1).set("diskReserve", 100_000_000).start().await;
-    until("it is told", async || server.health().await.0 == 503).await;
-    let (_, text) = server.health().await;
-    assert!(text.contains("disk is full: less than 100000000 MiB are left (diskReserve)"), "{text}");
-    let mut client = Client::start(&server, &arm()).await;
-    let told = client.until("loading: Error:").await;
-    assert!(told.contains("disk is full"), "{told}");
-    assert_eq!(client.closed().await, Some(1013), "another server may take it");
-}
-
-#[actix_rt::test]
-async fn a_server_that_can_open_no_file_is_not_ready_until_it_can() {
-    let server = demo_server(1).start().await;
-    let session = session_server(&[server.address()]).start().await;
-    until("it works", async || works(&session).await).await;
-    let limits = |soft: &str| {
-        let mut command = std::process::Command::new("prlimit");
-        let limit = command.args(["--pid", &server.pid().to_string(), &format!("--nofile={soft}:")]);
-        assert!(limit.status().unwrap().success());
-    };
-    let process = procfs::process::Process::new(server.pid()).unwrap();
-    let procfs::process::LimitValue::Value(before) = process.limits().unwrap().max_open_files.soft_limit else {
-        panic!("no limit")
-    };
-    // What it has open stays open; the session server's connection as well.
-    limits("3");
-    until("it knows", async || server.log().contains("no simulation can be started: ")).await;
-    until("the session server knows", async || !works(&session).await).await;
-    limits(&before.to_string());
-    until("it works again", async || works(&session).await).await;
-}
-
-#[actix_rt::test]
 async fn the_limit_of_files_is_raised_as_far_as_it_is_needed_and_one_without_clients_is_refused() {
     let server = demo_server(10).set("maxClients", 300).before("ulimit -Sn 256").start().await;
     let limits = procfs::process::Process::new(server.pid()).unwrap().limits().unwrap();
@@ -93,19 +58,4 @@ async fn the_limit_of_files_is_raised_as_far_as_it_is_needed_and_one_without_cli
     assert!(few.log().contains("300 files may be open, which is enough for 46 clients"), "{}", few.log());
     let said = demo_server(1).files(128).refused(1).await;
     assert!(said.starts_with("error: 128 files may be open, which is not enough for 1 places"), "{said}");
-}
-
-#[actix_rt::test]
-async fn clients_that_leave_at_once_leave_no_folder() {
-    let server = demo_server(8).start().await;
-    let visitor = async |number: u64| {
-        for visit in 0..40 {
-            let client = Client::start(&server, &arm()).await;
-            actix_rt::time::sleep(std::time::Duration::from_millis((number + 5 * visit) % 50)).await;
-            client.leave().await;
-        }
-    };
-    futures_util::future::join_all((0..8).map(visitor)).await;
-    until("no folder is left", async || instance_folders(&server.folder).is_empty()).await;
-    nothing_left(&server, 8).await;
 }

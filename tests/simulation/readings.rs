@@ -1,19 +1,12 @@
 //! Readings of the machine and of its GPUs.
 
 use std::path::Path;
-use std::process::Command;
 
-use crate::support::{Builder, Client, Server, arm, demo_server, http, needs, until};
+use crate::support::{Builder, Client, Server, arm, demo_server, http, shared_library, until};
 
 /// A folder with the stand-in for NVIDIA's library.
 pub fn gpu_driver() -> tempfile::TempDir {
-    needs("cc", "gcc");
-    let folder = tempfile::tempdir().unwrap();
-    let source = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/simulation/nvml.c");
-    let library = folder.path().join("libnvidia-ml.so.1");
-    let made = Command::new("cc").args(["-shared", "-fPIC", "-o"]).arg(library).arg(source).status().unwrap();
-    assert!(made.success());
-    folder
+    shared_library("simulation/nvml.c", "libnvidia-ml.so.1")
 }
 
 fn with(library: &Path) -> Builder {
@@ -23,7 +16,8 @@ fn with(library: &Path) -> Builder {
 #[actix_rt::test]
 async fn gpus_are_read_and_the_least_busy_one_counts() {
     let library = gpu_driver();
-    let server = with(library.path()).env("NVML_COMPUTE_0", "100").env("NVML_COMPUTE_1", "99").start().await;
+    let builder = with(library.path()).env("NVML_COMPUTE_0", "100").env("NVML_COMPUTE_1", "99");
+    let server = builder.set("displays", serde_json::json!([":90.0", ":90.1"])).set("display", ":91").start().await;
     let status = async || server.status().await;
     until("GPUs are told", async || status().await["gpus"].as_array().is_some_and(|gpus| gpus.len() == 2)).await;
     let gpus = status().await["gpus"].clone();
@@ -39,6 +33,10 @@ async fn gpus_are_read_and_the_least_busy_one_counts() {
     until("the mean is that of the less busy GPU", counts).await;
     let metrics = metrics().await;
     assert!(metrics.contains("webots_machine_gpu_compute_percent{gpu=\"0\",name=\"Stand-in A\"} 100"), "{metrics}");
+    // Simulations are spread over them only where that is asked for.
+    let _client = Client::ready(&server).await;
+    assert_eq!(given(&server).await, [(None, String::new(), ":91".to_owned())]);
+    assert!(server.log().contains("displays has no effect"), "{}", server.log());
 }
 
 /// The state of a server's GPUs: what is wrong with them.
@@ -52,13 +50,25 @@ async fn gpus_that_are_lost_are_told_and_come_back() {
     let mark = library.path().join("mark");
     for (variable, words, left) in [
         ("NVML_LOST", "1 of 2 GPUs don't answer", 1),
-        ("NVML_GONE", "2 of 2 GPUs don't answer", 0),
         ("NVML_ONE", "1 of 2 GPUs don't answer", 1),
+        // A driver that is loaded after the start, and unloaded.
+        ("NVML_UNLOADED", "2 of 2 GPUs don't answer", 0),
     ] {
-        let server = with(library.path()).env(variable, mark.to_str().unwrap()).start().await;
+        let is_required = variable != "NVML_LOST";
+        let builder = with(library.path()).env(variable, mark.to_str().unwrap()).set("requireGpu", is_required);
+        if variable == "NVML_UNLOADED" {
+            std::fs::write(&mark, "").unwrap();
+        }
+        let server = builder.start().await;
+        if variable == "NVML_UNLOADED" {
+            until("the driver is missed", async || server.log().contains("no NVIDIA GPU is read")).await;
+            until("it is not ready", async || server.health().await.1.contains("but sees none")).await;
+            std::fs::remove_file(&mark).unwrap();
+        }
         let gpus = async || server.status().await["gpus"].as_array().unwrap().len();
         until("GPUs are told", async || gpus().await == 2).await;
         assert_eq!(gpu_problem(&server).await, None);
+        until("it is ready", async || server.health().await.1 == "ok").await;
         std::fs::write(&mark, "").unwrap();
         until("they are lost", async || gpu_problem(&server).await.is_some_and(|why| why.contains(words))).await;
         assert_eq!(gpus().await, left);
@@ -66,46 +76,14 @@ async fn gpus_that_are_lost_are_told_and_come_back() {
         assert!(server.metrics().await.contains("\nwebots_machine_gpu_lost 1\n"));
         let page = server.monitor().await.replace("&#39;", "'");
         assert!(page.contains(words), "{page}");
-        assert_eq!(http::get(&server.url("/health")).await.text(), "ok", "they are not required");
+        let required = format!("(requireGpu), but {words}");
+        let health = if is_required { required.as_str() } else { "ok" };
+        until("its readiness is told", async || server.health().await.1.contains(health)).await;
         std::fs::remove_file(&mark).unwrap();
-        until("they are back", async || gpu_problem(&server).await.is_none()).await;
+        until("they are back", async || gpu_problem(&server).await.is_none() && gpus().await == 2).await;
         assert!(server.log().contains("the GPUs answer again"), "{}", server.log());
+        until("it is ready again", async || server.health().await.1 == "ok").await;
     }
-}
-
-#[actix_rt::test]
-async fn a_driver_that_is_loaded_later_or_anew_is_found() {
-    let library = gpu_driver();
-    let mark = library.path().join("mark");
-    std::fs::write(&mark, "").unwrap();
-    let builder = with(library.path()).env("NVML_UNLOADED", mark.to_str().unwrap());
-    let server = builder.start().await;
-    let gpus = async || server.status().await["gpus"].as_array().unwrap().len();
-    until("the driver is missed", async || server.log().contains("no NVIDIA GPU is read")).await;
-    std::fs::remove_file(&mark).unwrap();
-    until("its GPUs are read", async || gpus().await == 2).await;
-    assert_eq!(gpu_problem(&server).await, None);
-    std::fs::write(&mark, "").unwrap();
-    until("it is unloaded", async || gpu_problem(&server).await.is_some()).await;
-    std::fs::remove_file(&mark).unwrap();
-    until("its GPUs are read again", async || gpus().await == 2 && gpu_problem(&server).await.is_none()).await;
-}
-
-#[actix_rt::test]
-async fn a_server_that_requires_gpus_is_ready_only_with_them() {
-    let library = gpu_driver();
-    let mark = library.path().join("mark");
-    let builder = with(library.path()).set("requireGpu", true);
-    let server = builder.env("NVML_LOST", mark.to_str().unwrap()).start().await;
-    until("it is ready", async || server.health().await.1 == "ok").await;
-    std::fs::write(&mark, "").unwrap();
-    until("it is not ready", async || server.health().await.0 == 503).await;
-    let (_, told) = server.health().await;
-    assert!(told.contains("(requireGpu), but 1 of 2 GPUs don't answer"), "{told}");
-    std::fs::remove_file(&mark).unwrap();
-    until("it is ready again", async || server.health().await.1 == "ok").await;
-    let server = demo_server(1).set("requireGpu", true).start().await;
-    until("it is not ready", async || server.health().await.1.contains("but sees none")).await;
 }
 
 #[actix_rt::test]
@@ -140,9 +118,6 @@ async fn samples_are_written_with_the_columns_of_the_original() {
         assert_eq!(values.len(), 12, "{line}");
         assert!(values[0] > 1.0e9 && (0.0..=100.0).contains(&values[3]) && values[4] > 0.0, "{line}");
     }
-    let quiet = demo_server(1).set("monitorLogEnabled", false).start().await;
-    until("it has read", async || http::get(&quiet.url("/load")).await.text() != "0").await;
-    assert!(!quiet.folder.join("log/simulation/monitor.csv").exists());
 }
 
 /// What of the GPU each simulation of a server with four is told: its number on `/status`, and its variables.
@@ -207,16 +182,4 @@ async fn simulations_are_spread_over_gpus_and_a_lost_one_gets_none() {
     assert!(given(&server).await.iter().all(|(gpu, ..)| *gpu == Some(3)), "{:?}", given(&server).await);
     let metrics = server.metrics().await;
     assert!(metrics.contains("webots_machine_gpu_compute_percent{gpu=\"2\",name=\"Stand-in C\"} 95"), "{metrics}");
-}
-
-#[actix_rt::test]
-async fn without_being_told_simulations_are_not_spread() {
-    let library = gpu_driver();
-    let builder = with(library.path()).set("displays", serde_json::json!([":90.0", ":90.1"]));
-    let server = builder.set("display", ":91").start().await;
-    until("GPUs are read", async || server.status().await["gpus"][1].is_object()).await;
-    Client::ready(&server).await;
-    let _client = Client::ready(&server).await;
-    let told = given(&server).await;
-    assert!(told.iter().all(|one| *one == (None, String::new(), ":91".to_owned())), "{told:?}");
 }

@@ -1,19 +1,16 @@
 //! When Webots is ready, where, and when it is not.
 
-use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use nix::sys::signal::{Signal, kill};
-use nix::unistd::Pid;
-
 use super::ends::line;
 use super::opened::world_text;
-use super::scene::{nothing_left, stages};
+use super::scene::nothing_left;
 use crate::support::stopwatch::Stopwatch;
+use crate::support::wrapper::Wrapper;
 use crate::support::{
-    Client, DEMO, Forge, Server, Webots, arm, demo_server, display, instance_folders_in, instances_below, is_told,
-    outcome, programs, server_of, simulation_server, until, world,
+    Client, DEMO, Forge, Server, Webots, arm, demo_server, display, instance_folders_in, is_told, outcome, programs,
+    server_of, simulation_server, until, world,
 };
 
 #[actix_rt::test]
@@ -62,48 +59,24 @@ async fn a_webots_that_hangs_is_told_and_ended() {
 }
 
 #[actix_rt::test]
-async fn signs_of_life_are_passed_on_and_the_pace_is_shown() {
-    let server = demo_server(1).set("timing.heartbeat", 0.1).start().await;
-    let mut client = Client::ready(&server).await;
-    for _ in 0..3 {
-        assert_eq!(client.until("").await, ".");
-    }
-    let mut viewer = Client::connect(&format!("ws://127.0.0.1:{}/", server.port + 1)).await.with_scene().await;
-    for (ask, shown) in [("real-time:-1", "running"), ("pause", "idle"), ("fast:-1", "running")] {
-        viewer.send(ask).await;
-        until(shown, async || stages(&server).await == [shown]).await;
-    }
-}
-
-#[actix_rt::test]
-async fn webots_is_given_the_documented_command_line() {
-    let server = server_of(Webots::script("echo \"args: $*\"; exit 1"), 1).start().await;
-    let rest = format!("--port={} --heartbeat=5000", server.port + 1);
-    for (mode, hidden, stream) in [
-        ("x3d", "--minimize --no-rendering ", "--stream"),
-        ("w3d", "--minimize --no-rendering ", "--stream"),
-        ("mjpeg", "", "--stream=mjpeg"),
+async fn webots_is_given_the_documented_command_line_and_a_display() {
+    let (forge, webots) = (Forge::with_arm(), Webots::script("echo \"on [$DISPLAY]: $*\"\nexit 1"));
+    let hidden = "--minimize --no-rendering ";
+    // The configured display, else the server's own, else the first.
+    for (configured, environment, display, mode, hidden, stream) in [
+        (Some(":57"), "export DISPLAY=:58", ":57", "x3d", hidden, "--stream"),
+        (None, "export DISPLAY=:58", ":58", "w3d", hidden, "--stream"),
+        (None, "export DISPLAY=", ":0", "mjpeg", "", "--stream=mjpeg"),
+        (None, "unset DISPLAY", ":0", "x3d", hidden, "--stream"),
     ] {
+        let builder = simulation_server(&webots.path(), forge.path(), 1).before(environment);
+        let server = builder.set("display", configured).start().await;
         let mut client = Client::connect(&server.websocket("/client")).await;
         client.send(&serde_json::json!({"start": {"url": arm(), "mode": mode}}).to_string()).await;
         let told = client.until("loading: Error:").await;
-        assert!(told.contains(&format!("args: --batch --mode=pause {hidden}{rest} {stream} worlds/a.wbt")), "{told}");
-        nothing_left(&server, 1).await;
-    }
-}
-
-#[actix_rt::test]
-async fn webots_gets_the_configured_display_else_the_servers_own_else_the_first() {
-    let (forge, webots) = (Forge::with_arm(), Webots::script("echo \"display [$DISPLAY]\"\nexit 1"));
-    for (configured, environment, display) in [
-        (Some(":57"), "export DISPLAY=:58", ":57"),
-        (None, "export DISPLAY=:58", ":58"),
-        (None, "export DISPLAY=", ":0"),
-        (None, "unset DISPLAY", ":0"),
-    ] {
-        let builder = simulation_server(&webots.path(), forge.path(), 1).before(environment);
-        let builder = if let Some(name) = configured { builder.set("display", name) } else { builder };
-        is_told(&builder.start().await, &arm(), &format!("display [{display}]")).await;
+        let port = server.port + 1;
+        let words = format!("{hidden}--port={port} --heartbeat=5000 {stream} worlds/a.wbt");
+        assert!(told.contains(&format!("on [{display}]: --batch --mode=pause {words}")), "{told}");
     }
 }
 
@@ -133,17 +106,6 @@ async fn paths_may_have_spaces_and_quotes() {
     }
 }
 
-#[actix_rt::test]
-async fn a_missing_webots_or_xvfb_is_told_with_what_to_do() {
-    let server = demo_server(1).set("webots", "/nowhere/webots").start().await;
-    let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
-    assert!(told.contains("has no Webots that it can run at \"webots\"") && told.contains("webotsHome"), "{told}");
-    let git = programs(&["git", "bash", "env", "sh", "rm"]);
-    let server = demo_server(1).set("xvfb", true).env("PATH", git.path().to_str().unwrap()).start().await;
-    is_told(&server, &arm(), "(xvfb), but has no Xvfb").await;
-    nothing_left(&server, 1).await;
-}
-
 /// The display that a simulator has printed.
 async fn display_of(server: &Server, client: &Client) -> String {
     let printed = || {
@@ -155,7 +117,7 @@ async fn display_of(server: &Server, client: &Client) -> String {
 }
 
 #[actix_rt::test]
-async fn each_webots_gets_a_virtual_display_of_its_own_and_the_number_of_one_that_was_killed_is_used_again() {
+async fn each_webots_gets_a_virtual_display_of_its_own() {
     let _alone = display::alone().await;
     // It tells which display it has, and fails without.
     let webots = Webots::script(&format!(
@@ -164,36 +126,26 @@ async fn each_webots_gets_a_virtual_display_of_its_own_and_the_number_of_one_tha
     // In a sandbox each has the same number.
     let server = server_of(webots, 2).set("xvfb", true).set("isolation", "none").start().await;
     let (one, other) = (Client::ready(&server).await, Client::ready(&server).await);
-    assert_ne!(display_of(&server, &one).await, display_of(&server, &other).await);
+    let (first, second) = (display_of(&server, &one).await, display_of(&server, &other).await);
+    assert_ne!(first, second);
     one.leave().await;
     other.leave().await;
     nothing_left(&server, 2).await;
-    let mut numbers = BTreeSet::new();
-    for _ in 0..6 {
-        let client = Client::ready(&server).await;
-        numbers.insert(display_of(&server, &client).await);
-        let xvfb = instances_below(&server.folder).into_iter().find(|one| one.1.contains("Xvfb -screen")).unwrap().0;
-        kill(Pid::from_raw(xvfb), Signal::SIGKILL).unwrap();
-        client.leave().await;
-        nothing_left(&server, 2).await;
-    }
-    // Another program of the machine may take and free numbers meanwhile.
-    assert!(numbers.len() < 6, "{numbers:?}");
-    for number in numbers {
-        assert!(!PathBuf::from(format!("/tmp/.X{}-lock", number.trim_start_matches(':'))).exists());
+    for name in [first, second] {
+        assert!(!PathBuf::from(format!("/tmp/.X{}-lock", name.trim_start_matches(':'))).exists());
     }
 }
 
 #[actix_rt::test]
 async fn a_virtual_display_that_does_not_start_is_told() {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let programs = tempfile::tempdir().unwrap();
-    let xvfb = Webots::script("echo 'first words' >&2; echo 'no screens found' >&2; exit 1");
-    std::os::unix::fs::symlink(xvfb.path(), programs.path().join("Xvfb")).unwrap();
-    let path = format!("{}:{}", programs.path().display(), std::env::var("PATH").unwrap());
+    let without = programs(&["git", "bash", "env", "sh", "rm"]);
+    let server = demo_server(1).set("xvfb", true).env("PATH", without.path().to_str().unwrap()).start().await;
+    is_told(&server, &arm(), "(xvfb), but has no Xvfb").await;
+    let xvfb = Wrapper::of("Xvfb", "echo 'first words' >&2; echo 'no screens found' >&2; exit 1");
     for level in ["none", "sandbox"] {
         let builder = simulation_server(&webots.path(), forge.path(), 1).set("xvfb", true).set("isolation", level);
-        let server = builder.env("PATH", &path).start().await;
+        let server = builder.env("PATH", &xvfb.path()).start().await;
         is_told(&server, &arm(), "The virtual display (Xvfb) can't be started: no screens found").await;
         nothing_left(&server, 1).await;
     }

@@ -3,7 +3,6 @@
 use std::time::Duration;
 
 use futures_util::{SinkExt, StreamExt};
-use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
@@ -13,71 +12,65 @@ use tokio_tungstenite::tungstenite::protocol::{CloseFrame, WebSocketConfig};
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 
 use super::life::quick;
-use super::network::Network;
 use super::scene::nothing_left;
-use crate::support::client::Heard;
 use crate::support::http::{PASSWORD, get_as_administrator, get_with_password};
+use crate::support::network::Network;
 use crate::support::{Builder, Client, SOON, Server, Webots, arm, http, server_of, skip, until};
 
 /// The headers of who asks for a WebSocket.
 const UPGRADE: &str = "Host: localhost\r\nConnection: upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n\
     Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n";
 
-/// A server.
-struct Stage {
-    server: Server,
+/// A server that relays the streams of this Webots.
+async fn relaying(webots: Webots, change: impl FnOnce(Builder) -> Builder) -> Server {
+    let files = [("worlds/textures/a.png", "a picture"), ("plugins/a.html", "<p>a page</p>")];
+    let builder = quick(server_of(webots, 2)).set("streaming", "relay");
+    builder.forge().commit("lab/arm", "main", &files);
+    change(builder).start().await
 }
 
-impl Stage {
-    async fn new(change: impl FnOnce(Builder) -> Builder) -> Self {
-        Self::with(Webots::launcher(), change).await
-    }
+/// The same of the demo simulator.
+async fn relay(change: impl FnOnce(Builder) -> Builder) -> Server {
+    relaying(Webots::launcher(), change).await
+}
 
-    async fn with(webots: Webots, change: impl FnOnce(Builder) -> Builder) -> Self {
-        let files = [("worlds/textures/a.png", "a picture"), ("plugins/a.html", "<p>a page</p>")];
-        let builder = quick(server_of(webots, 2)).set("streaming", "relay");
-        builder.forge().commit("lab/arm", "main", &files);
-        Self { server: change(builder).start().await }
-    }
+/// A simulation, and the path of its stream.
+async fn start(server: &Server) -> (Client, String) {
+    let mut client = Client::connect(&server.websocket("/client")).await;
+    client.send(&json!({"start": {"url": arm(), "resumable": true}}).to_string()).await;
+    let path = path_of(server, &mut client).await;
+    (client, path)
+}
 
-    /// A simulation, and the path of its stream.
-    async fn start(&self) -> (Client, String) {
-        let mut client = Client::connect(&self.server.websocket("/client")).await;
-        client.send(&json!({"start": {"url": arm(), "resumable": true}}).to_string()).await;
-        let path = self.path(&mut client).await;
-        (client, path)
-    }
+async fn path_of(server: &Server, client: &mut Client) -> String {
+    let told = client.until("webots:").await;
+    let beginning = format!("webots:ws://localhost:{}", server.port);
+    told.strip_prefix(&beginning).unwrap_or_else(|| panic!("{told}")).to_owned()
+}
 
-    async fn path(&self, client: &mut Client) -> String {
-        let told = client.until("webots:").await;
-        let beginning = format!("webots:ws://localhost:{}", self.server.port);
-        told.strip_prefix(&beginning).unwrap_or_else(|| panic!("{told}")).to_owned()
-    }
+async fn look_on(server: &Server, path: &str) -> Client {
+    Client::connect(&server.websocket(path)).await
+}
 
-    async fn viewer(&self, path: &str) -> Client {
-        Client::connect(&self.server.websocket(path)).await
-    }
+/// The status code that somebody gets who asks for a WebSocket.
+async fn refused(server: &Server, path: &str) -> u16 {
+    Client::with_headers(&server.websocket(path), &[]).await.err().unwrap_or(101)
+}
 
-    /// The status code that somebody gets who asks for a WebSocket.
-    async fn refused(&self, path: &str) -> u16 {
-        Client::with_headers(&self.server.websocket(path), &[]).await.err().unwrap_or(101)
-    }
-
-    /// Sends these bytes, and returns what comes until the connection ends.
-    async fn raw(&self, bytes: &str) -> String {
-        let mut socket = TcpStream::connect(("127.0.0.1", self.server.port)).await.unwrap();
-        socket.write_all(bytes.as_bytes()).await.unwrap();
-        let mut answer = Vec::new();
-        actix_rt::time::timeout(SOON, socket.read_to_end(&mut answer)).await.expect("the connection ends").ok();
-        String::from_utf8_lossy(&answer).into_owned()
-    }
+/// Sends these bytes, and returns what comes until the connection ends.
+async fn raw(server: &Server, bytes: &str) -> String {
+    let mut socket = TcpStream::connect(server.address()).await.unwrap();
+    socket.write_all(bytes.as_bytes()).await.unwrap();
+    let mut answer = Vec::new();
+    actix_rt::time::timeout(SOON, socket.read_to_end(&mut answer)).await.expect("the connection ends").ok();
+    String::from_utf8_lossy(&answer).into_owned()
 }
 
 type Socket<S> = WebSocketStream<S>;
 
 /// A Webots that this test plays, on a server that relays to it.
 struct Played {
-    stage: Stage,
+    server: Server,
     listener: TcpListener,
 }
 
@@ -88,13 +81,13 @@ impl Played {
         let port = listener.local_addr().unwrap().port();
         let webots = Webots::script(&format!("exec python3 '{script}' \"$@\" {port}"));
         let change = |builder: Builder| change(builder.set("isolation", "none"));
-        Self { stage: Stage::with(webots, change).await, listener }
+        Self { server: relaying(webots, change).await, listener }
     }
 
     /// A WebSocket, and Webots' end of it.
     async fn connect(&self, path: &str) -> (Socket<MaybeTlsStream<TcpStream>>, Socket<TcpStream>) {
         let config = WebSocketConfig::default().max_frame_size(Some(64 << 20));
-        let url = self.stage.server.websocket(path);
+        let url = self.server.websocket(path);
         let client = tokio_tungstenite::connect_async_with_config(url, Some(config), true);
         let webots = async {
             let (socket, _) = self.listener.accept().await.unwrap();
@@ -125,14 +118,14 @@ where
 #[actix_rt::test]
 async fn a_simulation_is_steered_and_its_files_are_had_through_the_server_alone() {
     for level in ["none", "sandbox"] {
-        let stage = Stage::new(|builder| builder.set("isolation", level)).await;
-        let (client, path) = stage.start().await;
-        let mut viewer = stage.viewer(&path).await.with_running_scene().await;
+        let server = relay(|builder| builder.set("isolation", level)).await;
+        let (client, path) = start(&server).await;
+        let mut viewer = look_on(&server, &path).await.with_running_scene().await;
         viewer.until("application/json:").await;
         // As Webots' page and as ours write it.
-        stage.viewer(&format!("{path}/")).await.send("x3d;broadcast").await;
+        look_on(&server, &format!("{path}/")).await.send("x3d;broadcast").await;
 
-        let picture = http::get(&stage.server.url(&format!("{path}/worlds/textures/a.png"))).await;
+        let picture = http::get(&server.url(&format!("{path}/worlds/textures/a.png"))).await;
         assert_eq!((picture.status.as_u16(), picture.text().as_str()), (200, "a picture"));
         let common = [("access-control-allow-origin", "*"), ("referrer-policy", "no-referrer")];
         let own = [("content-type", "image/png"), ("cache-control", "public, max-age=3600"), ("content-length", "9")];
@@ -140,21 +133,21 @@ async fn a_simulation_is_steered_and_its_files_are_had_through_the_server_alone(
         {
             assert_eq!(picture.header(name), Some(value), "{name}: {:?}", picture.headers);
         }
-        let url = stage.server.url(&format!("{path}/worlds/textures/a.png?now"));
+        let url = server.url(&format!("{path}/worlds/textures/a.png?now"));
         let again = awc::Client::new().get(url).insert_header(("if-none-match", picture.header("etag").unwrap()));
         assert_eq!(again.send().await.unwrap().status(), 304);
-        let page = http::get(&stage.server.url(&format!("{path}/plugins/a.html"))).await;
+        let page = http::get(&server.url(&format!("{path}/plugins/a.html"))).await;
         assert_eq!(page.header("content-security-policy"), Some("sandbox allow-scripts"));
-        assert_eq!(http::get(&stage.server.url(&format!("{path}/worlds/none.png"))).await.status, 404);
+        assert_eq!(http::get(&server.url(&format!("{path}/worlds/none.png"))).await.status, 404);
         client.close_with(1000).await;
-        nothing_left(&stage.server, 2).await;
+        nothing_left(&server, 2).await;
     }
 }
 
 #[actix_rt::test]
 async fn all_frames_and_close_codes_pass_in_both_directions() {
     let played = Played::new(|builder| builder).await;
-    let (_client, path) = played.stage.start().await;
+    let (_client, path) = start(&played.server).await;
     let (mut viewer, mut webots) = played.connect(&path).await;
     let picture = vec![7; 4 << 20];
     for message in [Message::text("a text"), Message::binary(vec![0, 255]), Message::binary(picture), Message::text("")]
@@ -181,19 +174,6 @@ async fn all_frames_and_close_codes_pass_in_both_directions() {
     drop(viewer);
     assert_eq!(next(&mut webots).await, None);
 
-    // However its answer begins.
-    let mut client = TcpStream::connect(("127.0.0.1", played.stage.server.port)).await.unwrap();
-    let request = format!("GET {path} HTTP/1.1\r\n{UPGRADE}Expect: 100-continue\r\n\r\n");
-    client.write_all(request.as_bytes()).await.unwrap();
-    let mut webots = tokio_tungstenite::accept_async(played.listener.accept().await.unwrap().0).await.unwrap();
-    webots.send(Message::text("a scene")).await.unwrap();
-    let mut answer = Vec::new();
-    let reads = async {
-        while !answer.ends_with(b"a scene") {
-            assert!(client.read_buf(&mut answer).await.unwrap() > 0, "it has ended");
-        }
-    };
-    actix_rt::time::timeout(SOON, reads).await.expect("what Webots has sent");
     let (mut viewer, webots) = played.connect(&path).await;
     drop(webots);
     assert_eq!(next(&mut viewer).await, None);
@@ -202,9 +182,9 @@ async fn all_frames_and_close_codes_pass_in_both_directions() {
 #[actix_rt::test]
 async fn a_viewer_that_does_not_read_holds_up_nobody_and_fills_no_memory() {
     let played = Played::new(|builder| builder.set("timing.silence", 3600)).await;
-    let (_client, path) = played.stage.start().await;
+    let (_client, path) = start(&played.server).await;
     let memory = || {
-        let process = procfs::process::Process::new(played.stage.server.pid()).unwrap();
+        let process = procfs::process::Process::new(played.server.pid()).unwrap();
         process.stat().unwrap().rss * procfs::page_size()
     };
     let (mut lazy, mut flood) = played.connect(&path).await;
@@ -239,7 +219,7 @@ async fn a_viewer_that_has_vanished_is_noticed_though_nothing_is_sent() {
         return skip("simulation::relay", "packets can't be filtered");
     };
     let played = Played::new(|builder| builder.set("timing.ping", 1).set("timing.silence", 2)).await;
-    let (_client, path) = played.stage.start().await;
+    let (_client, path) = start(&played.server).await;
     let (viewer, mut webots) = played.connect(&path).await;
     let MaybeTlsStream::Plain(tcp) = viewer.get_ref() else { panic!("{viewer:?}") };
     let _lost = network.lose(1.0, &[tcp.local_addr().unwrap().port().to_string()]);
@@ -249,46 +229,29 @@ async fn a_viewer_that_has_vanished_is_noticed_though_nothing_is_sent() {
 #[actix_rt::test]
 async fn streams_have_connections_of_their_own() {
     let played = Played::new(|builder| builder.set("maxClients", 2)).await;
-    let (client, path) = played.stage.start().await;
+    let (client, path) = start(&played.server).await;
     let mut streams = Vec::new();
     for _ in 0..14 {
         streams.push(played.connect(&path).await);
     }
-    assert_eq!(played.stage.refused(&path).await, 503);
-    assert_eq!(http::get(&played.stage.server.url(&format!("{path}/a.png"))).await.status, 503);
-    assert_eq!(played.stage.server.simulations().await.len(), 1);
+    assert_eq!(refused(&played.server, &path).await, 503);
+    assert_eq!(http::get(&played.server.url(&format!("{path}/a.png"))).await.status, 503);
+    assert_eq!(played.server.simulations().await.len(), 1);
     let (mut viewer, mut webots) = streams.remove(0);
     viewer.close(None).await.unwrap();
     while next(&mut webots).await.is_some() {}
     drop((viewer, webots));
     // Without a key it is refused, but not for want of room.
     let upgrade = format!("GET {path} HTTP/1.1\r\nHost: a\r\nConnection: upgrade, close\r\nUpgrade: websocket\r\n\r\n");
-    until("there is room again", async || played.stage.raw(&upgrade).await.starts_with("HTTP/1.1 400 ")).await;
+    until("there is room again", async || raw(&played.server, &upgrade).await.starts_with("HTTP/1.1 400 ")).await;
     client.leave().await;
-}
-
-#[actix_rt::test]
-async fn a_webots_that_does_not_read_holds_no_connection_of_a_client_that_has_left() {
-    let played =
-        Played::new(|builder| builder.set("maxClients", 1).set("timing", json!({"ping": 0.5, "silence": 1}))).await;
-    let (_client, path) = played.stage.start().await;
-    let mut deaf = Vec::new();
-    for _ in 0..7 {
-        let (mut viewer, webots) = played.connect(&path).await;
-        // As much as fits, and then no more.
-        let flood = async { while viewer.send(Message::binary(vec![0; 1 << 20])).await.is_ok() {} };
-        actix_rt::time::timeout(Duration::from_millis(300), flood).await.ok();
-        drop(viewer);
-        deaf.push(webots);
-    }
-    until("there is room again", async || played.stage.refused(&path).await != 503).await;
 }
 
 #[actix_rt::test]
 async fn no_trick_leads_anywhere_else() {
     let played = Played::new(|builder| builder).await;
-    let stage = &played.stage;
-    let (_client, path) = stage.start().await;
+    let server = &played.server;
+    let (_client, path) = start(server).await;
     let headers = "Host: localhost\r\nConnection: close\r\n";
     let other = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let elsewhere = other.local_addr().unwrap();
@@ -310,7 +273,7 @@ async fn no_trick_leads_anywhere_else() {
         "/stream".to_owned(),
     ] {
         for headers in [headers, UPGRADE] {
-            let answer = stage.raw(&format!("GET {path} HTTP/1.1\r\n{headers}\r\n")).await;
+            let answer = raw(server, &format!("GET {path} HTTP/1.1\r\n{headers}\r\n")).await;
             assert!(answer.starts_with("HTTP/1.1 404 "), "{path}: {answer}");
             assert!(!answer.contains(&token[16..]), "{answer}");
         }
@@ -328,7 +291,7 @@ async fn no_trick_leads_anywhere_else() {
         (format!("GET /client HTTP/1.1\r\n{UPGRADE}Content-Length: 1\r\n\r\nx"), 400),
         (format!("GET /client HTTP/1.1\r\n{UPGRADE}Transfer-Encoding: chunked\r\n\r\n1\r\nx\r\n0\r\n\r\n"), 400),
     ] {
-        let answer = stage.raw(&request).await;
+        let answer = raw(server, &request).await;
         let shown: String = request.chars().take(300).collect();
         assert!(answer.starts_with(&format!("HTTP/1.1 {status} ")), "{shown}: {answer}");
         assert!(!shown.contains("/client") || answer.ends_with("Error: a request for this has no body."), "{answer}");
@@ -345,63 +308,66 @@ async fn no_trick_leads_anywhere_else() {
     let second = format!("GET {path}/second.png HTTP/1.1\r\n{headers}\r\n");
     let webots = played.answer(b"HTTP/1.1 302 Found\r\nLocation: http://127.0.0.1:1/\r\nContent-Length: 2\r\n\r\nok");
     let both = format!("{absolute}{second}");
-    let (answer, head) = tokio::join!(stage.raw(&both), webots);
-    let port = stage.server.port + 1;
+    let (answer, head) = tokio::join!(raw(server, &both), webots);
+    let port = server.port + 1;
     assert!(head.starts_with("GET /a.png?x=1 HTTP/1.1\r\n"), "{head}");
     assert!(head.contains(&format!("\r\nHost: 127.0.0.1:{port}\r\n")), "{head}");
     let names: Vec<&str> = head.lines().skip(1).filter_map(|line| Some(line.split_once(':')?.0)).collect();
     assert_eq!(names, ["Content-Length", "Connection", "Host", "Date"], "{head}");
     assert!(answer.starts_with("HTTP/1.1 302 Found\r\n") && !answer.contains("ocation:"), "{answer}");
     assert_eq!(answer.matches("HTTP/1.1 ").count(), 1, "{answer}");
-    assert!(!stage.server.log().contains(&token[16..]));
+    assert!(!server.log().contains(&token[16..]));
 }
 
 #[actix_rt::test]
 async fn a_webots_that_does_not_answer_costs_its_client_an_error() {
     let played = Played::new(|builder| builder).await;
-    let (_client, path) = played.stage.start().await;
-    let url = played.stage.server.url(&format!("{path}/a.png"));
+    let (_client, path) = start(&played.server).await;
+    let url = played.server.url(&format!("{path}/a.png"));
     for nonsense in ["", "nonsense\r\n\r\n", "HTTP/1.1 101 Switching Protocols\r\n\r\n"] {
         let (answer, _) = tokio::join!(http::get(&url), played.answer(nonsense.as_bytes()));
         assert_eq!(answer.status, 502, "{nonsense}");
-        let (status, _) = tokio::join!(played.stage.refused(&path), played.answer(nonsense.as_bytes()));
+        let (status, _) = tokio::join!(refused(&played.server, &path), played.answer(nonsense.as_bytes()));
         assert_eq!(status, 502, "{nonsense}");
     }
     // One without a body ends with its head.
     let headers = "Host: localhost\r\nIf-None-Match: \"x\"\r\nConnection: close\r\n";
     let request = format!("GET {path}/a.png HTTP/1.1\r\n{headers}\r\n");
     let webots = played.answer(b"HTTP/1.1 304 Not Modified\r\nETag: \"x\"\r\n\r\n");
-    let (answer, head) = tokio::join!(played.stage.raw(&request), webots);
+    let (answer, head) = tokio::join!(raw(&played.server, &request), webots);
     assert!(head.contains("\r\nIf-None-Match: \"x\"\r\n"), "{head}");
     assert!(answer.starts_with("HTTP/1.1 304 ") && answer.split_once("\r\n\r\n").unwrap().1.is_empty(), "{answer}");
 }
 
 #[actix_rt::test]
 async fn the_token_stays_for_who_comes_back_and_dies_with_the_simulation() {
-    let stage = Stage::new(|builder| builder).await;
-    let (mut client, path) = stage.start().await;
+    let server = relay(|builder| builder.set("adminPassword", PASSWORD)).await;
+    let (mut client, path) = start(&server).await;
     let resume = client.token().await;
+    let _watcher = look_on(&server, &watched_by(&server, &client).await).await;
+    client.until("watched: 1").await;
     drop(client);
-    stage.server.until_away(1).await;
-    let mut client = Client::resuming(&stage.server, &resume).await;
-    assert_eq!(stage.path(&mut client).await, path);
-    let mut viewer = stage.viewer(&path).await.with_scene().await;
+    server.until_away(1).await;
+    let mut client = Client::resuming(&server, &resume).await;
+    assert_eq!(path_of(&server, &mut client).await, path);
+    client.until("watched: 1").await;
+    let mut viewer = look_on(&server, &path).await.with_scene().await;
 
-    let (other, others) = stage.start().await;
+    let (other, others) = start(&server).await;
     assert_ne!(path, others);
     client.close_with(1000).await;
     viewer.closed().await;
-    until("the token is gone", async || stage.refused(&path).await == 404).await;
-    assert_eq!(http::get(&stage.server.url(&format!("{path}/worlds/textures/a.png"))).await.status, 404);
-    assert_eq!(http::get(&stage.server.url(&format!("{others}/worlds/textures/a.png"))).await.status, 200);
+    until("the token is gone", async || refused(&server, &path).await == 404).await;
+    assert_eq!(http::get(&server.url(&format!("{path}/worlds/textures/a.png"))).await.status, 404);
+    assert_eq!(http::get(&server.url(&format!("{others}/worlds/textures/a.png"))).await.status, 200);
     // Also where the next simulation has the same port.
-    let (_next, third) = stage.start().await;
-    assert_eq!(stage.refused(&path).await, 404);
+    let (_next, third) = start(&server).await;
+    assert_eq!(refused(&server, &path).await, 404);
     assert_ne!(third, path);
     drop(other);
-    let mut told = stage.server.log();
+    let mut told = server.log();
     for page in ["/status", "/monitor", "/metrics"] {
-        told += &http::get(&stage.server.url(page)).await.text();
+        told += &http::get(&server.url(page)).await.text();
     }
     for path in [path, others, third] {
         assert!(!told.contains(&path["/stream/".len() + 16..]), "{told}");
@@ -412,28 +378,28 @@ async fn the_token_stays_for_who_comes_back_and_dies_with_the_simulation() {
 async fn a_stranger_sees_no_port_and_steers_nobody() {
     let password = |builder: Builder| builder.set("adminPassword", PASSWORD);
     for (mode, has_password) in [("direct", false), ("direct", true), ("relay", false), ("relay", true)] {
-        let stage = Stage::new(|builder| {
+        let server = relay(|builder| {
             let builder = builder.set("streaming", mode);
             if has_password { password(builder) } else { builder }
         })
         .await;
-        let client = Client::ready(&stage.server).await;
-        let port = stage.server.port + 1;
+        let client = Client::ready(&server).await;
+        let port = server.port + 1;
         let is_shown = (mode, has_password) == ("direct", false);
-        let simulation = stage.server.simulations().await.remove(0);
+        let simulation = server.simulations().await.remove(0);
         assert_eq!(simulation["port"], if is_shown { json!(port) } else { Value::Null }, "{mode} {has_password}");
-        let page = stage.server.monitor().await;
+        let page = server.monitor().await;
         assert_eq!(page.contains(&format!(">{port}<")), is_shown, "{mode} {has_password}");
         // A wrong password may be meant for another.
         for (password, shown) in [("wrong", Value::Null), (PASSWORD, json!(port))].into_iter().filter(|_| has_password)
         {
-            let answer = get_with_password(&stage.server.url("/status"), password).await;
+            let answer = get_with_password(&server.url("/status"), password).await;
             assert_eq!((answer.status.as_u16(), &answer.json()["simulations"][0]["port"]), (200, &shown), "{password}");
         }
         // An output is for administrators where there is a password.
-        let url = stage.server.url(&format!("/output?id={}", client.id()));
+        let url = server.url(&format!("/output?id={}", client.id()));
         client.leave().await;
-        nothing_left(&stage.server, 2).await;
+        nothing_left(&server, 2).await;
         let mut text = String::new();
         until("its events are kept", async || {
             text = get_as_administrator(&url).await.text();
@@ -442,20 +408,20 @@ async fn a_stranger_sees_no_port_and_steers_nobody() {
         .await;
         let port = format!("port {port}: ready");
         assert_eq!(text.contains(&port), has_password || mode == "direct", "{mode} {has_password}: {text}");
-        assert!(stage.server.log().contains(&port), "the log is the administrator's");
+        assert!(server.log().contains(&port), "the log is the administrator's");
     }
 
     // The prank, over the relay: with all that a stranger can learn, also one with a simulation of his own.
-    let stage = Stage::new(|builder| builder).await;
-    let (_victim, path) = stage.start().await;
-    let (_stranger, own) = stage.start().await;
-    let mut victim = stage.viewer(&path).await.with_running_scene().await;
+    let server = relay(|builder| builder).await;
+    let (_victim, path) = start(&server).await;
+    let (_stranger, own) = start(&server).await;
+    let mut victim = look_on(&server, &path).await.with_running_scene().await;
     let (number, secret) = (&path["/stream/".len()..][..16], &own["/stream/".len() + 16..]);
     for guess in [format!("/stream/{number}{secret}"), format!("{own}/../{number}{secret}"), "/stream/2001".to_owned()]
     {
-        assert_eq!(stage.refused(&guess).await, 404, "{guess}");
+        assert_eq!(refused(&server, &guess).await, 404, "{guess}");
     }
-    let mut stranger = stage.viewer(&own).await.with_scene().await;
+    let mut stranger = look_on(&server, &own).await.with_scene().await;
     stranger.send("pause").await;
     stranger.until("paused by client").await;
     for _ in 0..20 {
@@ -465,26 +431,26 @@ async fn a_stranger_sees_no_port_and_steers_nobody() {
 
 #[actix_rt::test]
 async fn pages_of_other_origins_start_nothing_and_get_no_stream() {
-    let stage = Stage::new(|builder| builder.set("allowedOrigins", json!(["https://lab.org"]))).await;
-    let (_client, path) = stage.start().await;
+    let server = relay(|builder| builder.set("allowedOrigins", json!(["https://lab.org"]))).await;
+    let (_client, path) = start(&server).await;
     // Webots' own viewer runs in a frame without an origin.
     for (origin, may_start, allowed) in
         [("https://lab.org", true, true), ("null", false, true), ("https://evil.org", false, false)]
     {
         let status = async |path: &str| {
-            Client::with_headers(&stage.server.websocket(path), &[("origin", origin)]).await.err().unwrap_or(101)
+            Client::with_headers(&server.websocket(path), &[("origin", origin)]).await.err().unwrap_or(101)
         };
         assert_eq!(status("/client").await, if may_start { 101 } else { 403 }, "{origin}");
         assert_eq!(status(&path).await, if allowed { 101 } else { 403 }, "{origin}");
-        let file = stage.server.url(&format!("{path}/worlds/textures/a.png"));
+        let file = server.url(&format!("{path}/worlds/textures/a.png"));
         let answer = awc::Client::new().get(file).insert_header(("origin", origin)).send().await.unwrap();
         assert_eq!(answer.status(), if allowed { 200 } else { 403 }, "{origin}");
     }
 }
 
 /// Opens the page on which an administrator watches the simulation of a client, and returns the path of its stream.
-async fn watched_by(stage: &Stage, client: &Client) -> String {
-    let url = stage.server.url(&format!("/watch?id={}", client.id()));
+async fn watched_by(server: &Server, client: &Client) -> String {
+    let url = server.url(&format!("/watch?id={}", client.id()));
     let answer = get_as_administrator(&url).await;
     assert_eq!((answer.status.as_u16(), answer.header("referrer-policy")), (200, Some("no-referrer")));
     let page = answer.text();
@@ -496,13 +462,13 @@ async fn watched_by(stage: &Stage, client: &Client) -> String {
 async fn an_administrator_watches_and_changes_nothing() {
     for mode in ["direct", "relay"] {
         let change = |builder: Builder| builder.set("adminPassword", PASSWORD).set("streaming", mode);
-        let stage = Stage::new(change).await;
-        let mut client = Client::start(&stage.server, &arm()).await;
+        let server = relay(change).await;
+        let mut client = Client::start(&server, &arm()).await;
         let address = client.until("webots:").await["webots:".len()..].to_owned();
         let mut student = Client::connect(&address).await.with_running_scene().await;
 
-        let path = watched_by(&stage, &client).await;
-        let mut watcher = stage.viewer(&path).await;
+        let path = watched_by(&server, &client).await;
+        let mut watcher = look_on(&server, &path).await;
         assert_eq!(client.until("watched").await, "watched: 1");
         // Before it has said that it only watches, nothing of it is heard either.
         for text in ["pause", "x3d", "robot:a:b;broadcast"] {
@@ -519,11 +485,11 @@ async fn an_administrator_watches_and_changes_nothing() {
             assert!(student.until("").await.starts_with("application/json:"), "{:?}", student.heard.last());
         }
         watcher.until("application/json:").await;
-        let files = stage.server.url(&format!("{path}/worlds/textures/a.png"));
+        let files = server.url(&format!("{path}/worlds/textures/a.png"));
         assert_eq!(http::get(&files).await.status, 200);
         // The token is for one connection, and leads nowhere after it.
-        assert_eq!(stage.refused(&path).await, 404);
-        let mut second = stage.viewer(&watched_by(&stage, &client).await).await;
+        assert_eq!(refused(&server, &path).await, 404);
+        let mut second = look_on(&server, &watched_by(&server, &client).await).await;
         second.send("x3d;broadcast").await;
         second.until("scene load completed").await;
         drop(second);
@@ -531,46 +497,31 @@ async fn an_administrator_watches_and_changes_nothing() {
         assert_eq!(client.until("watched").await, "watched: 0");
         assert_eq!(http::get(&files).await.status, 404);
 
-        assert!(stage.server.log().contains("watches"));
-        assert!(!stage.server.log().contains(&path["/stream/".len() + 16..]));
+        assert!(server.log().contains("watches"));
+        assert!(!server.log().contains(&path["/stream/".len() + 16..]));
         client.leave().await;
-        nothing_left(&stage.server, 2).await;
+        nothing_left(&server, 2).await;
     }
 }
 
 #[actix_rt::test]
-async fn who_comes_back_hears_that_somebody_watches() {
-    let stage = Stage::new(|builder| builder.set("adminPassword", PASSWORD)).await;
-    let (mut client, _) = stage.start().await;
-    let resume = client.token().await;
-    let mut watcher = stage.viewer(&watched_by(&stage, &client).await).await;
-    client.until("watched: 1").await;
-    drop(client);
-    stage.server.until_away(1).await;
-    let mut client = Client::resuming(&stage.server, &resume).await;
-    client.until("watched: 1").await;
-    stage.server.signal(Signal::SIGTERM);
-    while let Heard::Text(_) = watcher.next().await {}
-}
-
-#[actix_rt::test]
 async fn nobody_watches_without_the_password() {
-    let stage = Stage::new(|builder| builder).await;
-    let (client, _) = stage.start().await;
+    let server = relay(|builder| builder).await;
+    let (client, _) = start(&server).await;
     let watch = format!("/watch?id={}", client.id());
-    assert_eq!(http::get(&stage.server.url(&watch)).await.status, 403, "there is no password");
-    assert!(!stage.server.monitor().await.contains("watch?"));
+    assert_eq!(http::get(&server.url(&watch)).await.status, 403, "there is no password");
+    assert!(!server.monitor().await.contains("watch?"));
 
-    let stage = Stage::new(|builder| builder.set("adminPassword", PASSWORD)).await;
-    let (client, _) = stage.start().await;
+    let server = relay(|builder| builder.set("adminPassword", PASSWORD)).await;
+    let (client, _) = start(&server).await;
     let watch = format!("/watch?id={}", client.id());
-    assert_eq!(http::get(&stage.server.url(&watch)).await.status, 401);
+    assert_eq!(http::get(&server.url(&watch)).await.status, 401);
     let link = format!("href=\"{}\"", &watch[1..]);
-    assert!(!stage.server.monitor().await.contains(&link));
-    let page = get_as_administrator(&stage.server.url("/monitor")).await.text();
+    assert!(!server.monitor().await.contains(&link));
+    let page = get_as_administrator(&server.url("/monitor")).await.text();
     assert!(page.contains(&link), "{page:?}");
     let ask = async |id: &str, password: &str| {
-        get_with_password(&stage.server.url(&format!("/watch?id={id}")), password).await.status.as_u16()
+        get_with_password(&server.url(&format!("/watch?id={id}")), password).await.status.as_u16()
     };
     assert_eq!(ask(client.id(), "wrong").await, 401);
     for id in ["", "x", "20261122T220517042-17", "%3Cscript%3E"] {

@@ -28,11 +28,11 @@ impl Scene {
         let builder = builder.folder(folder.path());
         let server = change(builder).start().await;
         let other = if state == "queued" { Some(Client::ready(&server).await) } else { None };
-        let mut client = Client::connect(&server.websocket("/client")).await;
+        let client = Client::connect(&server.websocket("/client")).await;
         if state == "connected" {
             return Self { server, client: Some(client), other, folder, _hanging: hanging };
         }
-        client.send(&serde_json::json!({"start": {"url": arm()}}).to_string()).await;
+        let mut client = client.asking(&arm()).await;
         let told = match state {
             "queued" => "queue: 0",
             "checkingout" => "loading: Step 1/9 : looking for",
@@ -62,10 +62,11 @@ pub async fn stages(server: &Server) -> Vec<String> {
 /// Waits until nothing of any simulation is left: process, place, port and folder.
 pub async fn nothing_left(server: &Server, places: u16) {
     until("all simulations are gone", async || {
+        // What costs most comes last: to look at all processes of the machine.
         stages(server).await.is_empty()
-            && instances_below(&server.folder).is_empty()
             && instance_folders(&server.folder).is_empty()
             && (server.port + 1..=server.port + places).all(|port| TcpListener::bind(("0.0.0.0", port)).is_ok())
+            && instances_below(&server.folder).is_empty()
     })
     .await;
 }

@@ -22,7 +22,7 @@ pub struct Holdings {
 /// Clients at a time: the server has so many places.
 const AT_A_TIME: usize = 4;
 /// Starts before the first count: pools of threads and allocators fill.
-const WARM_UP: usize = 100;
+const WARM_UP: usize = 40;
 
 impl Holdings {
     fn of(server: &Server) -> Self {

@@ -8,7 +8,7 @@ use serde_json::json;
 
 use super::scene::stages;
 use crate::support::listener::{Request, listen};
-use crate::support::{Client, SOON, arm, demo_server, http, until};
+use crate::support::{Builder, Client, SOON, arm, demo_server, http, until};
 
 #[actix_rt::test]
 async fn a_server_that_drains_keeps_its_clients_takes_no_others_and_ends_with_the_last() {
@@ -79,11 +79,35 @@ async fn a_fault_of_the_configuration_is_one_line_and_exit_code_2() {
         ("timing", json!({"checkout": -1}), ["timing.checkout", "-1"]),
         ("gitMirrors", json!([["https://a.forge", "file:b"]]), [" gitMirrors: ", ""]),
         ("timing", json!({"silence": 20}), ["timing.silence", "not more than timing.ping"]),
+        ("isolation", json!("jail"), ["isolation: unknown variant `jail`", ""]),
+        ("sandbox", json!({"readable": "/"}), ["sandbox.readable: \"/\" can't be shown", ""]),
+        ("sandbox", json!({"writable": ["/srv", "/proc/self/.."]}), ["sandbox.writable: \"/proc/self/..\"", ""]),
+        ("sandbox", json!({"network": "open"}), ["unknown variant `open`", ""]),
+        ("container", json!({"network": "open"}), ["unknown variant `open`", ""]),
+        ("container", json!({"netwrok": "closed"}), ["netwrok", ""]),
     ] {
-        let said = demo_server(1).set(key, value.clone()).refused(2).await;
-        assert!(said.contains("config.json: "), "{said}");
-        assert!(words.iter().all(|word| said.contains(word)), "{key}: {value} gives {said}");
+        refused(demo_server(1).set(key, value), &words).await;
     }
+    let containers = || demo_server(1).set("isolation", "container");
+    let own_network = |isolation| demo_server(1).set("isolation", isolation).set("sandbox.network", "own");
+    for (builder, words) in [
+        (
+            containers().set("isolation", "sandbox").set("docker", true),
+            "docker: true asks for containers, but isolation",
+        ),
+        (own_network("none"), "sandbox.network: networks of simulations' own"),
+        (own_network("container"), "sandbox.network: networks of simulations' own"),
+        (containers().set("maxConnections", 501), "allowed are up to 500 places"),
+        (containers().set("port", 64_990).set("maxConnections", 100), "editors up to port 65535"),
+    ] {
+        refused(builder, &[words]).await;
+    }
+}
+
+/// Starts a server that refuses its configuration in these words.
+async fn refused(builder: Builder, words: &[&str]) {
+    let said = builder.refused(2).await;
+    assert!(said.contains("config.json: ") && words.iter().all(|word| said.contains(word)), "{words:?}: {said}");
 }
 
 #[actix_rt::test]

@@ -43,9 +43,7 @@ impl Inside {
 
     /// A client that has asked for the world.
     pub async fn client(&self) -> Client {
-        let mut client = self.connect().await;
-        ask(&mut client).await;
-        client
+        self.connect().await.asking(&arm()).await
     }
 
     /// A client that has asked for nothing.
@@ -87,9 +85,4 @@ impl Inside {
         self.running.await.unwrap().unwrap();
         assert_eq!(std::fs::read_dir(self.folder.path().join("cache/runs")).unwrap().count(), 0);
     }
-}
-
-/// Asks for the world.
-pub async fn ask(client: &mut Client) {
-    client.send(&serde_json::json!({"start": {"url": arm()}}).to_string()).await;
 }

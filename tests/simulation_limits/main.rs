@@ -47,7 +47,6 @@ fn main() {
     );
     run("time::who_is_away_at_the_time_limit_hears_it", time::who_is_away_at_the_time_limit_hears_it);
     run("panics::a_client_leaves_nothing_in_any_state", panics::a_client_leaves_nothing_in_any_state);
-    run("panics::a_webots_leaves_nothing_in_any_state", panics::a_webots_leaves_nothing_in_any_state);
     run("panics::an_actor_that_must_live_ends_the_server", panics::an_actor_that_must_live_ends_the_server);
 }
 

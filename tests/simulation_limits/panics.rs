@@ -6,23 +6,15 @@ use std::sync::Arc;
 use actix::prelude::*;
 use actix_web::{App, HttpRequest, HttpResponse, HttpServer, web};
 use actix_web_actors::ws::WsResponseBuilder;
-use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
-use webots_fleet::shared::domain::ProjectUrl;
-use webots_fleet::shared::http::{ConnectionKind, Peer};
+use tokio::sync::mpsc::{UnboundedSender, unbounded_channel};
+use webots_fleet::shared::http::ConnectionKind;
 use webots_fleet::simulation::client::WebClient;
-use webots_fleet::simulation::client_identity::ClientIdentity;
-use webots_fleet::simulation::ends::EndReason;
 use webots_fleet::simulation::machine::LoadMonitor;
-use webots_fleet::simulation::protocol::Mode;
-use webots_fleet::simulation::readiness;
-use webots_fleet::simulation::simulation_id::SimulationId;
-use webots_fleet::simulation::slots::{Slot, SlotEvent, SlotLease};
 use webots_fleet::simulation::snapshot::Stage;
 use webots_fleet::simulation::state::AppState;
-use webots_fleet::simulation::webots::{LaunchSpec, Stop, Webots, WebotsEvent, WebotsExit};
 
-use crate::inside::{Inside, ask};
-use crate::support::{Client, SOON, arm};
+use crate::inside::Inside;
+use crate::support::{Client, arm};
 
 /// Whoever gets this panics.
 #[derive(Message)]
@@ -43,7 +35,7 @@ macro_rules! panics {
     };
 }
 
-panics!(WebClient, Webots, LoadMonitor);
+panics!(WebClient, LoadMonitor);
 
 /// Opens a WebSocket as the server does, and gives away its actor's address.
 async fn gate(
@@ -84,7 +76,7 @@ pub async fn a_client_leaves_nothing_in_any_state() {
         let mut client = Client::connect(&format!("ws://127.0.0.1:{port}/client")).await;
         let address = clients.recv().await.unwrap();
         if let Some(stage) = stage {
-            ask(&mut client).await;
+            client = client.asking(&arm()).await;
             inside.until(stage).await;
         }
         address.do_send(Panic);
@@ -96,88 +88,6 @@ pub async fn a_client_leaves_nothing_in_any_state() {
         }
         inside.until_nothing_is_left().await;
         handle.stop(true).await;
-        inside.stop().await;
-    }
-}
-
-/// Hears what a web client would.
-struct Listener {
-    places: UnboundedSender<u16>,
-    exits: UnboundedSender<WebotsExit>,
-}
-
-impl Actor for Listener {
-    type Context = Context<Self>;
-}
-
-impl Handler<SlotEvent> for Listener {
-    type Result = ();
-
-    fn handle(&mut self, event: SlotEvent, _: &mut Self::Context) {
-        if let SlotEvent::Granted(port) = event {
-            self.places.send(port).unwrap();
-        }
-    }
-}
-
-impl Handler<WebotsEvent> for Listener {
-    type Result = ();
-
-    fn handle(&mut self, event: WebotsEvent, _: &mut Self::Context) {
-        if let WebotsEvent::Exited(exit) = event {
-            self.exits.send(exit).unwrap();
-        }
-    }
-}
-
-/// Asks for a place as a session does.
-fn lease(server: &AppState, listener: &Addr<Listener>, world: &ProjectUrl) -> SlotLease {
-    let client = (Peer::Proxy(std::net::Ipv4Addr::LOCALHOST.into()), ClientIdentity::default());
-    SlotLease::acquire(&server.slots, SimulationId::next(), listener.clone().recipient(), world, client).unwrap()
-}
-
-/// Starts a Webots as a web client does.
-async fn launch(server: &AppState) -> (Addr<Webots>, UnboundedReceiver<WebotsExit>) {
-    let (places, mut granted) = unbounded_channel();
-    let (exits, ended) = unbounded_channel();
-    let listener = Listener { places, exits }.start();
-    let world = ProjectUrl::parse(&arm()).unwrap();
-    let lease = lease(server, &listener, &world);
-    let port = granted.recv().await.unwrap();
-    let project =
-        server.checkouts.start(world, server.run.instance().unwrap(), Arc::new(|_| ())).await.unwrap().unwrap();
-    let spec = LaunchSpec {
-        config: Arc::clone(&server.config),
-        containers: None,
-        launcher: Arc::clone(&server.launcher),
-        watcher: server.watcher.clone(),
-        program: readiness::webots_program(&server.config).unwrap(),
-        checkouts: Arc::clone(&server.checkouts),
-        project: Arc::new(project),
-        mode: Mode::X3d,
-        slot: Slot { lease, port },
-        gpu: None,
-        events: listener.recipient(),
-    };
-    (Webots::new(spec).start(), ended)
-}
-
-pub async fn a_webots_leaves_nothing_in_any_state() {
-    for stage in [Stage::Launching, Stage::Idle, Stage::Running, Stage::Stopping] {
-        let inside = Inside::new(stage, |_| ()).await;
-        let (webots, mut ended) = launch(&inside.server).await;
-        if stage == Stage::Stopping {
-            inside.until(Stage::Idle).await;
-            webots.do_send(Stop(EndReason::Left));
-        }
-        inside.until(stage).await;
-        let begin = std::time::Instant::now();
-        webots.do_send(Panic);
-        let exit = actix_rt::time::timeout(SOON, ended.recv()).await.unwrap().unwrap();
-        assert!(!exit.clean && !exit.why.is_empty(), "{stage:?}: {exit:?}");
-        inside.until_nothing_is_left().await;
-        assert!(begin.elapsed().as_secs() < 4, "{stage:?}: the grace time was waited for, in which all may go wrong");
-        assert_eq!(inside.server.ends.latest()[0].how.reason, EndReason::Fault, "{stage:?}");
         inside.stop().await;
     }
 }

@@ -5,10 +5,8 @@ use std::time::{Duration, Instant};
 use webots_fleet::simulation::ends::EndReason;
 use webots_fleet::simulation::snapshot::Stage;
 
-use serde_json::json;
-
 use crate::inside::Inside;
-use crate::support::{arm, until};
+use crate::support::until;
 
 pub async fn a_simulation_ends_at_its_time_limit_in_any_state() {
     for stage in [Stage::Launching, Stage::Idle, Stage::Running, Stage::Stopping] {
@@ -37,15 +35,12 @@ pub async fn a_simulation_ends_at_its_time_limit_in_any_state() {
 /// Nobody can hold a place for ever by coming back: the limit counts from the first start.
 pub async fn who_is_away_at_the_time_limit_hears_it() {
     let inside = Inside::new(Stage::Idle, |config| config.timeout = 5).await;
-    let mut client = inside.connect().await;
-    client.send(&json!({"start": {"url": arm(), "resumable": true}}).to_string()).await;
     let begin = Instant::now();
-    let token = client.until("resume: ").await.trim_start_matches("resume: ").to_owned();
+    let (client, token) = inside.connect().await.start_resumable().await;
     drop(client);
     until("it has ended", async || inside.stages().is_empty()).await;
     assert!(begin.elapsed() >= Duration::from_secs(5), "{:?}", begin.elapsed());
-    let mut client = inside.connect().await;
-    client.send(&json!({ "resume": token }).to_string()).await;
+    let mut client = inside.connect().await.resume(&token).await;
     let told = client.until("loading: Error:").await;
     let words = "loading: Error: this simulation has ended: The time limit of 5 seconds was reached";
     assert!(told.starts_with(words), "{told}");

@@ -48,9 +48,13 @@ impl Client {
 
     /// Connects to a simulation server and asks for a world.
     pub async fn start(server: &super::program::Server, world: &str) -> Self {
-        let mut client = Self::connect(&server.websocket("/client")).await;
-        client.send(&serde_json::json!({"start": {"url": world}}).to_string()).await;
-        client
+        Self::connect(&server.websocket("/client")).await.asking(world).await
+    }
+
+    /// Asks for a world.
+    pub async fn asking(mut self, world: &str) -> Self {
+        self.send(&serde_json::json!({"start": {"url": world}}).to_string()).await;
+        self
     }
 
     /// A client whose simulation of the world of [`arm`](super::git::arm) is ready.
@@ -91,9 +95,7 @@ impl Client {
 
     /// The same as through a web server, which says that the client has this address.
     pub async fn start_from(server: &super::program::Server, address: &str, world: &str) -> Self {
-        let mut client = Self::from_address(server, address).await.unwrap();
-        client.send(&serde_json::json!({"start": {"url": world}}).to_string()).await;
-        client
+        Self::from_address(server, address).await.unwrap().asking(world).await
     }
 
     /// Connects to a simulation server as through a web server.
@@ -140,14 +142,6 @@ impl Client {
     pub fn id(&self) -> &str {
         let told = self.heard.iter().find_map(|text| text.strip_prefix("session: "));
         told.unwrap_or_else(|| panic!("no id in {:#?}", self.heard))
-    }
-
-    /// The port of this end of the connection.
-    pub fn port(&self) -> u16 {
-        match self.socket.get_ref() {
-            MaybeTlsStream::Plain(socket) => socket.local_addr().unwrap().port(),
-            other => panic!("{other:?}"),
-        }
     }
 
     /// Sends a text.
@@ -258,7 +252,7 @@ impl Client {
 
     /// Whether nothing comes for so long.
     pub async fn is_silent(&mut self, time: Duration) -> bool {
-        actix_rt::time::timeout(time, self.read()).await.is_err()
+        self.next_within(time).await.is_none()
     }
 
     /// Closes with this code, and waits for the answer as browsers do: a connection that is dropped before with something

@@ -12,6 +12,7 @@ pub mod git;
 pub mod http;
 pub mod listener;
 pub mod name_server;
+pub mod network;
 pub mod page;
 pub mod ports;
 pub mod program;
@@ -21,6 +22,7 @@ pub mod smtp;
 pub mod stand_in;
 pub mod stopwatch;
 pub mod webots;
+pub mod wrapper;
 
 pub use client::{Client, is_told, outcome};
 pub use git::{Forge, WORLD, arm, arm_at, world};
@@ -29,6 +31,8 @@ pub use webots::{DEMO, Webots, instance_folders_in, instances_below};
 
 use std::io::Write;
 use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+use std::process::Command;
 use std::time::{Duration, Instant};
 
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
@@ -51,9 +55,20 @@ pub fn open_folder() -> tempfile::TempDir {
 }
 
 /// Makes a program of a script for bash.
-pub fn make_program(path: &std::path::Path, script: &str) {
+pub fn make_program(path: &Path, script: &str) {
     std::fs::write(path, format!("#!/usr/bin/env bash\n{script}\n")).unwrap();
     std::fs::set_permissions(path, PermissionsExt::from_mode(0o755)).unwrap();
+}
+
+/// A folder with a shared library of this name, made of a file below `tests`.
+pub fn shared_library(source: &str, name: &str) -> tempfile::TempDir {
+    needs("cc", "gcc");
+    let folder = tempfile::tempdir().unwrap();
+    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests").join(source);
+    let mut compiler = Command::new("cc");
+    let made = compiler.args(["-shared", "-fPIC", "-O1", "-o"]).arg(folder.path().join(name)).arg(source).status();
+    assert!(made.unwrap().success());
+    folder
 }
 
 /// A folder with links to these programs alone, for PATH.
@@ -81,7 +96,7 @@ pub async fn holds_soon(mut condition: impl AsyncFnMut() -> bool) -> bool {
             return false;
         }
         // What is waited for long is asked for less often: each question costs a busy machine time.
-        let pause = (begin.elapsed() / 10).clamp(Duration::from_millis(10), Duration::from_millis(50));
+        let pause = (begin.elapsed() / 10).clamp(Duration::from_millis(10), Duration::from_millis(100));
         actix_rt::time::sleep(pause).await;
     }
     true

@@ -21,8 +21,6 @@ pub struct Script {
     pub client: Vec<&'static str>,
     /// The texts on `/webots`; then time passes.
     pub webots: Vec<&'static str>,
-    /// Whether `/webots` closes once its texts are said and it was asked to run.
-    pub ends: bool,
 }
 
 impl Default for Script {
@@ -32,7 +30,6 @@ impl Default for Script {
             session: vec!["ws://{}"],
             client: vec!["shutdownTimeout: 60", "webots:ws://{}/webots"],
             webots: vec!["model:<Scene/>", "paused by client"],
-            ends: false,
         }
     }
 }
@@ -129,7 +126,6 @@ impl Part {
 
     async fn talk(self, socket: TcpStream, path: &str) -> Option<()> {
         let mut socket = accept_async(socket).await.ok()?;
-        let is_webots = path.starts_with("/webots");
         let texts = match path {
             "/" => &vec!["1"],
             "/client" => &self.script.client,
@@ -137,11 +133,6 @@ impl Part {
         };
         for text in texts {
             socket.send(Message::text(self.fill(text))).await.ok()?;
-        }
-        if is_webots && self.script.ends {
-            // Who still speaks would find the connection broken.
-            while socket.next().await?.ok()? != Message::text("real-time:-1") {}
-            return socket.close(None).await.ok();
         }
         let mut time = 0;
         loop {

@@ -1,0 +1,43 @@
+//! A program that stands before the real one in the path: it notes each call, and can misbehave.
+
+use super::make_program;
+
+/// A folder with the wrapper.
+pub struct Wrapper {
+    folder: tempfile::TempDir,
+}
+
+impl Wrapper {
+    /// One of git, which runs this script before each call; `$REAL` is the real git.
+    pub fn git(script: &str) -> Self {
+        Self::of("git", script)
+    }
+
+    /// One of another program.
+    pub fn of(program: &str, script: &str) -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let paths = std::env::var_os("PATH").unwrap();
+        let real =
+            std::env::split_paths(&paths).map(|folder| folder.join(program)).find(|path| path.is_file()).unwrap();
+        let (real, log) = (real.display(), folder.path().join("calls"));
+        let note = format!("REAL={real}\necho \"$*\" >> {}", log.display());
+        make_program(&folder.path().join(program), &format!("{note}\n{script}\nexec \"$REAL\" \"$@\""));
+        Self { folder }
+    }
+
+    /// The variable PATH with the wrapper first.
+    pub fn path(&self) -> String {
+        format!("{}:{}", self.folder.path().display(), std::env::var("PATH").unwrap())
+    }
+
+    /// The arguments of each call until now.
+    pub fn calls(&self) -> Vec<String> {
+        let text = std::fs::read_to_string(self.folder.path().join("calls")).unwrap_or_default();
+        text.lines().map(str::to_owned).collect()
+    }
+
+    /// How many calls have this in their arguments.
+    pub fn count(&self, words: &str) -> usize {
+        self.calls().iter().filter(|call| call.contains(words)).count()
+    }
+}
