@@ -111,7 +111,6 @@ async fn a_fault_of_the_configuration_is_one_line_and_exit_code_2() {
         ("loadThreshold", json!(-1), ["loadThreshold", "-1"]),
         ("loadRefresh", json!(0), ["loadRefresh", "0"]),
         ("timing", json!({"answer": "fast"}), ["timing.answer", "a number of seconds"]),
-        ("timing", json!([1]), [" timing", ""]),
         ("timing", json!({"anser": 1}), ["timing", "anser"]),
         ("timing", json!({"ping": 10, "silence": 10}), ["timing.silence", "timing.ping"]),
         ("examples", json!({"titel": "a", "url": "b"}), ["examples", "title"]),

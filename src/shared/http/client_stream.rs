@@ -22,15 +22,14 @@ use tokio::sync::oneshot;
 use tokio_util::io::poll_read_buf;
 
 use super::limits::ConnectionPermit;
+use super::routing::MAX_BODY;
 
 /// Size of one read from the socket, in bytes.
 const READ_AT_ONCE: usize = 4 * 1024;
 /// Begin of the answer that upgrades a connection to a WebSocket.
 const SWITCHING_PROTOCOLS: &[u8] = b"HTTP/1.1 101 ";
-/// Size limit of the head of a request, in bytes. A connection with a larger one is closed.
-const MAX_HEAD: usize = 32 * 1024;
-/// Size limit of a body, in bytes. A request with a larger one, or one in chunks, is answered without it.
-pub const MAX_BODY: usize = 8 * 1024;
+/// Size limit of the head of a request, in bytes: actix refuses one that is as large.
+const MAX_HEAD: usize = 128 * 1024;
 /// Limit of headers in a request, the same as that of actix.
 const MAX_HEADERS: usize = 96;
 
@@ -119,9 +118,6 @@ impl ClientStream {
             if let Some(length) = request_length(&self.unread) {
                 return Poll::Ready(Ok(length));
             }
-            if self.unread.len() > MAX_HEAD {
-                return Poll::Ready(Err(io::ErrorKind::InvalidData.into()));
-            }
             if ready!(self.poll_fill(context))? == 0 {
                 return Poll::Ready(Ok(0));
             }
@@ -129,14 +125,14 @@ impl ClientStream {
     }
 }
 
-/// The length of the request that these bytes begin with; `None` while its head is incomplete. Of an invalid one, which
-/// actix answers, it is all bytes.
+/// The length of the request that these bytes begin with; `None` while its head is incomplete. Of an invalid one, or
+/// one that is too large, which actix answers, it is all bytes.
 fn request_length(bytes: &[u8]) -> Option<usize> {
     let mut headers = [httparse::EMPTY_HEADER; MAX_HEADERS];
     let mut request = httparse::Request::new(&mut headers);
     match request.parse(bytes) {
         Ok(httparse::Status::Complete(head)) => Some(head + body_length(request.headers).unwrap_or(0)),
-        Ok(httparse::Status::Partial) => None,
+        Ok(httparse::Status::Partial) => (bytes.len() >= MAX_HEAD).then_some(bytes.len()),
         Err(_) => Some(bytes.len()),
     }
 }

@@ -12,11 +12,11 @@ use actix_web::{FromRequest, Handler, HttpRequest, HttpResponse, Resource, Respo
 use rand::RngExt;
 use serde::de::DeserializeOwned;
 
-use super::client_stream::MAX_BODY;
-
 /// Range of `Retry-After`, in seconds.
 const RETRY_AFTER: std::ops::RangeInclusive<u16> = 2..=6;
 
+/// Size limit of a body, in bytes. A request with a larger one, or one in chunks, is answered without it.
+pub const MAX_BODY: usize = 8 * 1024;
 /// Timeout of a body.
 const BODY_TIMEOUT: Duration = Duration::from_secs(5);
 
