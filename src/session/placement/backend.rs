@@ -198,7 +198,9 @@ impl Backend {
         // Clients in the queue cost nothing yet.
         let present = f64::from(instances.present().min(instances.places));
         let shown = (present - self.unseen).max(0.0);
-        self.fit.learn(shown, report.load, report.at.saturating_duration_since(before.at));
+        // While many start, it is uncertain how much of them the load shows.
+        let trust = if shown < present { shown / present } else { 1.0 };
+        self.fit.learn(shown, report.load, report.at.saturating_duration_since(before.at), trust * trust);
     }
 
     /// Compares the report with the one before: which clients arrived, which left.

@@ -93,8 +93,8 @@ impl CostFit {
     }
 
     /// Learns that the server had this `load`, in percent, with this number of `clients`. `elapsed` is the time since
-    /// the report before.
-    pub(super) fn learn(&mut self, clients: f64, load: f64, elapsed: Duration) {
+    /// the report before, and `trust` (0 to 1) how well the number of clients is known.
+    pub(super) fn learn(&mut self, clients: f64, load: f64, elapsed: Duration, trust: f64) {
         let seconds = elapsed.min(MAX_STEP).as_secs_f64();
         let load = load.min(100.0);
         // A full machine can show that its clients cost more than assumed, but not that they cost less.
@@ -112,10 +112,10 @@ impl CostFit {
         } else {
             let fade = (-seconds / MEMORY.as_secs_f64()).exp();
             let weight = if is_foreign(load, expected) {
-                seconds * FOREIGN_TRUST
+                trust * seconds * FOREIGN_TRUST
             } else {
                 self.seen += std::mem::take(&mut self.arrived);
-                seconds
+                trust * seconds
             };
             self.weight = self.weight * fade + weight;
             self.clients = self.clients * fade + weight * clients;

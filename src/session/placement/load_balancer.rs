@@ -79,8 +79,8 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
     /// Records what a server answered at `now`, and whether it takes new clients. If its last starts have failed for a
     /// reason of its own, other servers are preferred for a while. A server that is not in the fleet is ignored.
     pub fn report(&mut self, id: &Id, now: Instant, report: &ServerReport, accepting: bool) {
-        self.expire(now);
         let Some(server) = self.servers.get_mut(id) else { return };
+        self.replicas.count(0.0, count(server.expire(now, &self.policy)));
         server.report(now, report, accepting, &self.policy, &mut self.cost, &mut self.replicas);
         sort_in(server, id, &self.policy, &mut self.ranking);
     }
