@@ -188,8 +188,7 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
     let (load_monitor, readings) = LoadMonitor::new(slots.clone(), run.path(), csv, spread.clone());
     let load_monitor = load_monitor.start();
     announcer::start(&config);
-    let usage = UsageMonitor::default();
-    let watcher = Watcher::start(run.path().to_owned(), config.disk_reserve, usage.clone());
+    let watcher = Watcher::start(run.path().to_owned(), config.disk_reserve);
     let watcher = watcher.map_err(|error| format!("simulations can't be watched: {error}"))?;
     let starts = metrics.counter("webots_simulation_starts_total", "Simulations that were asked for", "outcome")?;
     for outcome in ["ready", "refused", "full"] {
@@ -221,7 +220,7 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
         start_quota: quota::starts(config.max_connections),
         live: LiveUpdates::default(),
         administrators: LiveUpdates::default(),
-        usage,
+        usage: UsageMonitor::default(),
         watcher,
         started: Instant::now(),
         config,

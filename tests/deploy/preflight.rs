@@ -59,7 +59,7 @@ fn nothing_is_warned_about_where_all_is_there() {
 
 #[test]
 fn what_is_missing_is_warned_about() {
-    let empty = tempfile::tempdir().unwrap();
+    let empty = crate::support::programs(&["prlimit"]);
     for (keys, warnings) in [
         (
             json!({"webotsHome": "/nowhere", "xvfb": true}),

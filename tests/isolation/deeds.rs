@@ -175,50 +175,6 @@ async fn a_sandbox_holds_for_an_ordinary_user_too() {
     assert_eq!(done, ["be bounded by the kernel"]);
 }
 
-/// What a running simulation reads of a file that was replaced after its start.
-#[actix_rt::test]
-async fn secrets_that_are_written_anew_stay_hidden() {
-    let Some(stage) = Stage::apart("secrets_that_are_written_anew_stay_hidden") else { return };
-    let folder = || tempfile::tempdir_in(apart().unwrap()).unwrap();
-    let (password, links) = (folder(), folder());
-    open(password.path());
-    open(links.path());
-    let replace = |file: PathBuf| {
-        let new = file.with_extension("new");
-        std::fs::write(&new, "a secret").unwrap();
-        std::fs::rename(new, file).unwrap();
-    };
-    replace(password.path().join("password"));
-    std::os::unix::fs::symlink(password.path().join("password"), links.path().join("password")).unwrap();
-    let ready = stage.elsewhere.path().join("ready");
-    let read = |name, path: PathBuf| format!("grep -q secret {} && echo 'READ {name}'", path.display());
-    let webots = Webots::script(&format!(
-        "ls {} >/dev/null && echo waits\nuntil [ -e {} ]; do sleep 0.01; done\n{}\n{}\necho THE END; exit 1",
-        stage.elsewhere.path().display(),
-        ready.display(),
-        read("password", password.path().join("password")),
-        read("link", links.path().join("password")),
-    ));
-    for (level, count) in [("sandbox", 0), ("none", 2)] {
-        let builder = stage.builder(&webots, level);
-        let link = links.path().join("password");
-        let server = builder.set("adminPassword", serde_json::json!({ "file": link })).start().await;
-        let mut client = Client::start(&server, &arm()).await;
-        client.until("shutdownTimeout").await;
-        let log = server.output_file(&client);
-        until("it runs", async || std::fs::read_to_string(&log).is_ok_and(|text| text.contains("waits"))).await;
-        replace(password.path().join("password"));
-        std::fs::remove_file(&link).unwrap();
-        std::fs::write(&link, "another secret").unwrap();
-        std::fs::write(&ready, "").unwrap();
-        let told = client.until("loading: Error:").await;
-        assert!(told.contains("THE END"), "{told}");
-        assert_eq!(told.matches("READ").count(), count, "{level}: {told}");
-        nothing_left(&server, 2).await;
-        std::fs::remove_file(&ready).unwrap();
-    }
-}
-
 #[actix_rt::test]
 async fn temporary_folders_are_the_simulations_own_wherever_they_are() {
     let stage = Stage::new();

@@ -117,26 +117,6 @@ async fn each_kind_of_end_is_told_as_such() {
 }
 
 #[actix_rt::test]
-async fn what_a_simulation_has_taken_is_told() {
-    let webots = Webots::script(&format!(
-        "{DEMO} \"$@\" &\n{{ for ((n = 0; n < 500000; n++)); do :; done; sleep 1000; }} & wait"
-    ));
-    let server =
-        server_of(webots, 1).set("isolation", "none").set("timing.heartbeat", 1).set("timing.grace", 0.2).start().await;
-    let mut client = Client::ready(&server).await;
-    // The pauses between two readings are ten seconds at most.
-    for _ in 0..13 {
-        client.heard.clear();
-        client.until(".").await;
-    }
-    let simulations = server.status().await["simulations"].clone();
-    client.leave().await;
-    let line = line(&server, simulations[0]["id"].as_str().unwrap()).await;
-    let (memory, time): (u64, f64) = (line[8].parse().unwrap(), line[9].parse().unwrap());
-    assert!((1 << 20..1 << 32).contains(&memory) && (0.2..100.0).contains(&time), "{line:?}");
-}
-
-#[actix_rt::test]
 async fn what_is_kept_needs_the_password_where_there_is_one() {
     let server = server_of(Webots::script("exit 7"), 1).set("adminPassword", PASSWORD).start().await;
     let mut client = Client::start(&server, &arm()).await;

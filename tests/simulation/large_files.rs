@@ -23,7 +23,7 @@ async fn files_that_are_missing_from_git_lfs_are_told() {
     assert!(told.starts_with("loading: Warning: 1 files of this project are kept in Git LFS and c"), "{told}");
     client.until("loading: Error: Webots ended with exit code 1").await;
     // Without git-lfs it is told that this is what is missing.
-    let bin = programs(&["git", "bash", "sed", "env", "sh", "rm"]);
+    let bin = programs(&["git", "bash", "sed", "env", "sh", "rm", "prlimit"]);
     let builder = simulation_server(&webots.path(), forge.path(), 1);
     let server = builder.env("PATH", bin.path().to_str().unwrap()).start().await;
     let told = Client::start(&server, &arm()).await.until("loading: Warning:").await;

@@ -4,7 +4,7 @@ mod admission;
 mod cache;
 mod checkout;
 mod commits;
-mod ends;
+pub mod ends;
 mod fetching;
 mod git_wrapper;
 mod https;

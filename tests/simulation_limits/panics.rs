@@ -151,7 +151,6 @@ async fn launch(server: &AppState) -> (Addr<Webots>, UnboundedReceiver<WebotsExi
         launcher: Arc::clone(&server.launcher),
         watcher: server.watcher.clone(),
         program: readiness::webots_program(&server.config).unwrap(),
-        checkouts: Arc::clone(&server.checkouts),
         project: Arc::new(project),
         mode: Mode::X3d,
         slot: Slot { lease, port },

@@ -4,7 +4,7 @@
 //! the queue, a checkout in progress, a running Webots. It ends with its client, or some time after the connection of a
 //! client that may return.
 
-use std::sync::Arc;
+use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
 use actix::prelude::*;
@@ -14,6 +14,7 @@ use futures_util::stream::AbortHandle;
 use super::state::{State, WebotsHandle};
 use crate::shared::http::Peer;
 use crate::shared::run::closing;
+use crate::simulation::checkout::Project;
 use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::ends::EndReason;
 use crate::simulation::protocol::{self, Mode};
@@ -21,7 +22,7 @@ use crate::simulation::sessions::{ClientAction, Connection, ToClient, Token};
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::slots::{Slot, SlotEvent};
 use crate::simulation::state::AppState;
-use crate::simulation::webots::{Keep, ResetController, WebotsEvent, WebotsExit};
+use crate::simulation::webots::{Keep, WebotsEvent, WebotsExit};
 
 /// The actor.
 pub struct Session {
@@ -34,6 +35,8 @@ pub struct Session {
     /// Ends the attachment of that connection.
     pub(super) attachment: Option<AbortHandle>,
     pub(super) state: State,
+    /// The project that was checked out, as long as its Webots holds it.
+    pub(super) project: Weak<Project>,
     /// How it is shown.
     pub(super) mode: Mode,
     /// Whether its client may resume it.
@@ -77,6 +80,7 @@ impl Session {
                 client: None,
                 attachment: None,
                 state: State::Over,
+                project: Weak::new(),
                 mode: request.mode.unwrap_or_default(),
                 token: None,
                 launched: None,
@@ -118,6 +122,7 @@ impl Session {
     /// Releases everything, and sends its client the last text. A client that has not received it can return for `why`.
     pub(super) fn finish(&mut self, last_words: String, why: &str, code: CloseCode, ctx: &mut Context<Self>) {
         self.state = State::Over;
+        self.resetting.take().map(|resetting| ctx.cancel_future(resetting));
         if let Some(client) = self.client.take() {
             client.do_send(ToClient::End(last_words, code));
         }
@@ -126,20 +131,20 @@ impl Session {
     }
 
     fn reset_controller(&mut self, file: String, ctx: &mut Context<Self>) {
-        let State::Launched(WebotsHandle(webots)) = &self.state else {
+        let Some(project) = self.project.upgrade() else {
             return self.text(protocol::nothing_to_reset());
         };
         if self.resetting.is_some() {
             return log::info!("{}: a controller is being reset already", self.name());
         }
-        let restored = webots.send(ResetController(file.clone())).into_actor(self);
-        self.resetting = Some(ctx.spawn(restored.map(move |answer, this, _| {
+        let checkouts = Arc::clone(&self.server.checkouts);
+        let restored = async move { checkouts.restore_controller(&project, &file).await.map(|()| file) };
+        self.resetting = Some(ctx.spawn(restored.into_actor(self).map(|restored, this, _| {
             this.resetting = None;
-            match answer {
-                Ok(Ok(())) => this.text(protocol::reset_controller(&file)),
+            match restored {
+                Ok(file) => this.text(protocol::reset_controller(&file)),
                 // This error does not end the simulation.
-                Ok(Err(error)) => this.text(protocol::error(&error.to_string())),
-                Err(error) => log::warn!("{}: no controller was reset: {error}", this.name()),
+                Err(error) => this.text(protocol::error(&error.to_string())),
             }
         })));
     }

@@ -46,7 +46,7 @@ pub enum Cause {
 
 /// The exit codes of a program that was ended by SIGTERM or SIGKILL, which Docker sends to all containers when it is
 /// stopped.
-const ENDED_BY_SIGNAL: [u8; 2] = [128 + 15, 128 + 9];
+const ENDED_BY_SIGNAL: [i32; 2] = [128 + 15, 128 + 9];
 /// The range of Docker's events that is queried for the end of a container, before and after now: Docker answers at the
 /// end of the range.
 const EVENTS: (Duration, Duration) = (Duration::from_mins(1), Duration::from_millis(100));
@@ -98,16 +98,6 @@ impl SimulationContainers {
     /// Restarts the participant's controller on notification, as the original does when Webots was reset.
     pub fn restart(&self) -> Option<Arc<Notify>> {
         self.restart.as_ref().map(|(request, _)| Arc::clone(request))
-    }
-
-    /// The ids of its containers, which the kernel knows them by; none where Docker fails.
-    pub fn ids(&self) -> impl Future<Output = Vec<String>> + use<> {
-        let (docker, all) = (self.docker.clone(), self.all());
-        let words = [["inspect", "--format", "{{.Id}}"].map(str::to_owned).to_vec(), all].concat();
-        async move {
-            let ids = docker.run(&words, SHORT_TIMEOUT).await.unwrap_or_default();
-            ids.lines().map(|id| id.trim().to_owned()).collect()
-        }
     }
 
     /// Why Webots' container has ended, given the end of the program `docker`; nothing if Docker knows no more.

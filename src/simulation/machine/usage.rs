@@ -52,13 +52,6 @@ struct Readings {
 /// Time for which a reading is cached.
 const AGE: Duration = Duration::from_millis(1800);
 
-impl Tree {
-    /// A tree without a control group.
-    pub fn of(root: i32) -> Self {
-        Self { root, cgroup: None }
-    }
-}
-
 impl UsageMonitor {
     /// The usage of each of these trees, never much older than two seconds. Blocks for some milliseconds.
     pub fn read(&self, trees: &[Tree]) -> Usages {
