@@ -145,7 +145,7 @@ impl Sandbox {
         let (home, run, tmp) = (inside("home")?, inside("run")?, inside("tmp")?);
         display.prepare(&tmp)?;
         let mut own: Vec<Mount> = temporary_folders().map(|at| Mount::writable(at, &tmp)).collect();
-        own.push(Mount::writable(self.runtime_folder(), &run));
+        own.push(Mount::writable(runtime_folder(), &run));
         own.extend(self.homes.iter().map(|at| Mount::writable(at.clone(), &home)));
         let project = spec.mark.join(InstanceDir::PROJECT);
         own.push(Mount::writable(project.clone(), &project));
@@ -153,7 +153,7 @@ impl Sandbox {
         let files = spec.command.first().map(PathBuf::from).into_iter().chain(self.display_files(display));
         own.extend(files.filter_map(|file| file.canonicalize().ok()).map(Mount::read_only));
         own.extend(self.network.as_ref().and_then(|network| network.mounts(&spec.mark)));
-        own.retain(|mount| mount.at.exists() || mount.at == self.runtime_folder());
+        own.retain(|mount| mount.at.exists() || mount.at == runtime_folder());
         Ok(own)
     }
 
@@ -174,13 +174,9 @@ impl Sandbox {
         vec![
             ("HOME".into(), home.into()),
             ("TMPDIR".into(), "/tmp".into()),
-            ("XDG_RUNTIME_DIR".into(), self.runtime_folder().into()),
+            ("XDG_RUNTIME_DIR".into(), runtime_folder().into()),
             ("QT_X11_NO_MITSHM".into(), "1".into()),
         ]
-    }
-
-    fn runtime_folder(&self) -> PathBuf {
-        PathBuf::from(format!("/run/user/{}", nix::unistd::getuid()))
     }
 
     /// Gives each sandbox a network of its own, if that works here. Blocks for ten seconds at most.
@@ -216,6 +212,11 @@ impl Sandbox {
             _ => Err(io::Error::other(complaint)),
         }
     }
+}
+
+/// The user's runtime directory.
+fn runtime_folder() -> PathBuf {
+    PathBuf::from(format!("/run/user/{}", nix::unistd::getuid()))
 }
 
 /// The home directories of the server's user: `HOME`, and the one in the user database.
