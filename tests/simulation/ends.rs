@@ -70,7 +70,7 @@ async fn a_simulation_has_one_id_from_its_first_message_to_its_last_trace() {
     until("the output is kept with the events", async || kept().await.contains("ended (crashed)")).await;
     let kept = kept().await;
     let printed = format!("\n\n{begun}last words\nwithout end");
-    for words in ["asks for https://github.com/lab/arm", ": ready\n", "Webots ended with exit code 3", &printed] {
+    for words in ["asks for https://github.com/lab/arm", "Z ready\n", "Webots ended with exit code 3", &printed] {
         assert!(kept.contains(words), "{words:?}: {kept}");
     }
     let page = server.monitor().await;

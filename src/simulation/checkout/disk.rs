@@ -43,7 +43,7 @@ pub async fn outgrown(folders: Vec<(PathBuf, u64)>) {
 
 fn is_beyond(folder: &Path, most: u64) -> bool {
     let mut size = DiskUsage::new(measure, most);
-    !size.add_folder(folder) || size.total() > most
+    !size.add_folder(folder) || size.total > most
 }
 
 /// What everything below a folder takes, each file and folder at least what a name takes of a disk.
@@ -59,5 +59,5 @@ fn measure(about: &fs::Metadata) -> u64 {
 pub fn sum(folder: &Path, measure: fn(&fs::Metadata) -> u64) -> u64 {
     let mut size = DiskUsage::new(measure, u64::MAX);
     size.add_folder(folder);
-    size.total()
+    size.total
 }

@@ -123,7 +123,7 @@ impl DiskUse {
         size.until = Some(Instant::now() + time);
         let is_shown = size.add_folder(&self.folder);
         self.add_nameless(&mut size, Instant::now() + time);
-        (self.taken, self.lost, self.counted) = (size.total(), lost, Instant::now());
+        (self.taken, self.lost, self.counted) = (size.total, lost, Instant::now());
         let limit = (self.allowed - self.first) >> 20;
         if !is_shown {
             self.end("The simulation has folders that nobody can look into, too deep or closed".to_owned());

@@ -91,8 +91,7 @@ impl Launcher {
     /// # Errors
     /// As for [`Self::new`].
     pub fn start(config: &SimulationConfig) -> Result<Self, String> {
-        let is_ours = config.isolation != IsolationSetting::Container;
-        let cgroups = is_ours.then(Cgroups::delegated).flatten();
+        let cgroups = (config.isolation != IsolationSetting::Container).then(Cgroups::delegated).flatten();
         let mut launcher = Self::new(config)?;
         match &launcher.shortcoming {
             Some(why) => log::warn!("worlds' programs may do whatever this user may (isolation: none): {why}"),

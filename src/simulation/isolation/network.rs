@@ -38,6 +38,8 @@ const INTERNET: (Ipv4Addr, u16) = (Ipv4Addr::new(203, 0, 113, 7), 9);
 /// The file that names it, and that of a simulation in the folder of its instance.
 const RESOLV_CONF: &str = "/etc/resolv.conf";
 const OWN_RESOLV_CONF: &str = "resolv.conf";
+/// The socket of the system's log.
+const SYSTEM_LOG: &str = "/dev/log";
 /// Path of nft, which is not in the `PATH` of ordinary users.
 const NFT: &str = "/usr/sbin/nft";
 /// Loads the packet filter of the file `$1`, if there is one, and becomes the program that follows. Versions of pasta until
@@ -89,11 +91,15 @@ impl OwnNetwork {
         let mut command: Vec<OsString> = ["setpriv", "--pdeathsig", "KILL", "--"].map(Into::into).into();
         command.push(self.pasta.clone().into());
         // By default it maps its gateway to the machine's loopback, and opens ports to and from the machine.
-        let fixed = ["--quiet", "--config-net", "--no-map-gw", "-u", "none", "-T", "none", "-U", "none", "-t"];
+        let fixed = ["--config-net", "--no-map-gw", "-u", "none", "-T", "none", "-U", "none", "-t"];
         command.extend(fixed.map(Into::into));
         // A port alone is one of all addresses, of either version of IP.
         let is_any = self.forwarded == Ipv6Addr::UNSPECIFIED;
         command.push(if is_any { port.to_string() } else { format!("{}/{port}", self.forwarded) }.into());
+        // Without the system's log it prints errors. With it, AppArmor may allow no other file.
+        if !Path::new(SYSTEM_LOG).exists() {
+            command.extend(["--log-file".into(), instance.join("pasta.log").into()]);
+        }
         if !self.closed {
             let resolver = if self.loopback.is_ipv4() { RESOLVER } else { RESOLVER_6 };
             command.extend(["--dns-forward", resolver].map(Into::into));

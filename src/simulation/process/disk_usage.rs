@@ -27,7 +27,8 @@ pub struct DiskUsage {
     enough: u64,
     /// When to stop counting.
     pub until: Option<Instant>,
-    total: u64,
+    /// What was added up until now.
+    pub total: u64,
     /// Device and inode of the files without a name.
     nameless: HashSet<(u64, u64)>,
 }
@@ -71,11 +72,6 @@ impl DiskUsage {
     /// Adds up by this measure, to no more than `enough`.
     pub fn new(measure: fn(&Metadata) -> u64, enough: u64) -> Self {
         Self { measure, enough, until: None, total: 0, nameless: HashSet::new() }
-    }
-
-    /// What was added up until now.
-    pub fn total(&self) -> u64 {
-        self.total
     }
 
     /// Adds everything below a directory that there is time for. Symlinks are not followed. Returns whether no folder there was
@@ -128,7 +124,7 @@ mod tests {
     fn size(folder: &Path, measure: fn(&Metadata) -> u64) -> u64 {
         let mut size = DiskUsage::new(measure, u64::MAX);
         assert!(size.add_folder(folder));
-        size.total()
+        size.total
     }
 
     #[test]
@@ -152,6 +148,6 @@ mod tests {
         }
         let mut size = DiskUsage::new(room, 10 * SMALLEST);
         assert!(size.add_folder(folder.path()));
-        assert_eq!(size.total(), 11 * SMALLEST);
+        assert_eq!(size.total, 11 * SMALLEST);
     }
 }

@@ -201,7 +201,7 @@ impl Webots {
     fn over(&mut self, kind: EndReason, why: &str, taken: Taken, ctx: &mut Context<Self>) {
         self.spec.slot.lease.end(kind, why, taken);
         let clean = kind == EndReason::Finished;
-        let own = kind == EndReason::Fault || (kind == EndReason::NoWebots && self.spec.containers.is_none());
+        let own = kind == EndReason::Fault || !(clean || self.listening || self.spec.containers.is_some());
         let mut why = why.to_owned();
         if !clean {
             why += &self.tail.last_words(&self.spec.project.instance.project());
