@@ -20,7 +20,7 @@
 //! | `simulation::isolation` | how a simulation is launched: its level of isolation (`launcher`), the variables that it inherits, limits; the control group that ends with it (`cgroup`) |
 //! | [`simulation::container`] | simulations in containers: what a project requests, its image, its compose project (its GPU and user, too) |
 //! | [`simulation::ends`] | how simulations have ended: counter, table, their logs (`kept_output`) |
-//! | [`simulation::webots`] | one running Webots: its command line and GPU (`launch_spec`), its log (opened by `launched`, written by `output`), end |
+//! | [`simulation::webots`] | one running Webots: its command line and GPU (`launch_spec`), its log (opened by `launched`, written by `output`), its end (`launched`) |
 //! | [`simulation::client`] | a client's WebSocket (`web_client`), the session of its simulation, which sends it nearly all messages (`session`; `start`: before Webots runs, with the choice of the GPU) |
 //! | [`simulation::sessions`] | how a connection is attached to its session, and how a client resumes it |
 //! | [`simulation::slots`] | the slots that clients wait for: leases, the queue and the shares of addresses and users (`slot_pool`), the streams of simulations and the tokens that lead to them (`stream`) |
@@ -68,8 +68,8 @@
 //! [`simulation::webots::Webots`] holds its process group, its instance directory and the lease of its slot in
 //! guards. Dropping it frees all three, whatever its state, even after a panic. When the simulation server exits, for
 //! whatever reason, its [`simulation::process::guardian`] process ends everything that the server has started.
-//! One `simulation::isolation::Watcher` enforces the limits that the kernel does not, and notes what simulations use. One
-//! thread copies all streams that are relayed, but those of watchers; the server exits if it panics.
+//! One `simulation::isolation::Watcher` enforces what the kernel does not: how much simulations write. One thread copies
+//! all streams that are relayed, but those of watchers; the server exits if it panics.
 //!
 //! # What ends, and what restarts
 //!

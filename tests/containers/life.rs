@@ -41,10 +41,6 @@ async fn a_world_runs_in_a_container_and_nothing_is_left_when_its_client_goes() 
     until("its folder is gone", async || instance_folders_in(&server.cache()).is_empty()).await;
     let read = || std::fs::read_to_string(server.folder.join("log/simulation/simulations.csv")).unwrap_or_default();
     until("its end is in simulations.csv", async || read().lines().count() == 2).await;
-    let table = read();
-    let line: Vec<_> = table.lines().nth(1).unwrap().split(',').collect();
-    let (memory, time): (u64, f64) = (line[8].parse().unwrap(), line[9].parse().unwrap());
-    assert!((1 << 20..1 << 32).contains(&memory) && (0.05..100.0).contains(&time), "{table}");
     // The port is free, and the next one gets it.
     let mut next = Client::start(&server, &arm()).await;
     assert_eq!(next.patiently("webots:").await, format!("webots:ws://localhost:{}", server.port + 1));

@@ -47,7 +47,7 @@ fn nothing_is_warned_about_where_all_is_there() {
 
 #[test]
 fn what_is_missing_or_does_not_fit_is_warned_about() {
-    let empty = tempfile::tempdir().unwrap();
+    let empty = crate::support::programs(&["prlimit"]);
     let users = |trusted: &str| json!({"isolation": "none", "userHeader": "X-User", "trustedProxies": [trusted]});
     let pose = "worlds' programs can pose as any user";
     for (keys, told_of, untold) in [

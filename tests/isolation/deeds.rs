@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use crate::simulation::scene::nothing_left;
-use crate::support::{Builder, Client, Forge, Webots, arm, simulation_server, skip, until};
+use crate::support::{Builder, Client, Forge, Webots, arm, simulation_server, skip};
 
 /// Everything of a test: a server with things that are none of a world's business.
 pub struct Stage {
@@ -177,50 +177,6 @@ async fn a_sandbox_holds_for_an_ordinary_user_too() {
     let processes = [("be bounded by the kernel", "test $(ulimit -u) = 71".to_owned())];
     let done = stage.tried(&processes, "sandbox", |builder| builder.before(nobody).set("limits.processes", 70)).await;
     assert_eq!(done, ["be bounded by the kernel"]);
-}
-
-/// What a running simulation reads of a file that was replaced after its start.
-#[actix_rt::test]
-async fn secrets_that_are_written_anew_stay_hidden() {
-    let Some(stage) = Stage::apart("secrets_that_are_written_anew_stay_hidden") else { return };
-    let folder = || {
-        let folder = tempfile::tempdir_in(apart().unwrap()).unwrap();
-        open(folder.path());
-        folder
-    };
-    let (passwords, links) = (folder(), folder());
-    let (password, link) = (passwords.path().join("password"), links.path().join("password"));
-    let replace = |file: &Path| {
-        let new = file.with_extension("new");
-        std::fs::write(&new, "a secret").unwrap();
-        std::fs::rename(new, file).unwrap();
-    };
-    replace(&password);
-    std::os::unix::fs::symlink(&password, &link).unwrap();
-    let ready = stage.elsewhere.path().join("ready");
-    let webots = Webots::script(&format!(
-        "ls {} >/dev/null && echo waits\nuntil [ -e {} ]; do sleep 0.01; done\ngrep -h secret {} {}\necho THE END; exit 1",
-        shown(&stage.elsewhere),
-        shown(&ready),
-        shown(&password),
-        shown(&link),
-    ));
-    for (level, count) in [("sandbox", 0), ("none", 2)] {
-        let builder = stage.builder(&webots, level).set("adminPassword", serde_json::json!({ "file": link }));
-        let server = builder.start().await;
-        let mut client = Client::start(&server, &arm()).await;
-        client.until("shutdownTimeout").await;
-        let log = server.output_file(&client);
-        until("it runs", async || std::fs::read_to_string(&log).is_ok_and(|text| text.contains("waits"))).await;
-        replace(&password);
-        replace(&link);
-        std::fs::write(&ready, "").unwrap();
-        let told = client.until("loading: Error:").await;
-        assert!(told.contains("THE END"), "{told}");
-        assert_eq!(told.matches("a secret").count(), count, "{level}: {told}");
-        nothing_left(&server, 2).await;
-        std::fs::remove_file(&ready).unwrap();
-    }
 }
 
 #[actix_rt::test]

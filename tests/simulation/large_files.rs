@@ -16,7 +16,7 @@ async fn a_world_whose_large_files_are_missing_opens_without_them() {
     forge.commit("lab/arm", "main", &[("meshes/a.dae", POINTER), (".gitattributes", ATTRIBUTES)]);
     is_told(&simulation_server(&webots.path(), forge.path(), 1).start().await, &arm(), "opened").await;
     // The same without git-lfs.
-    let bin = programs(&["git", "bash", "sed", "env", "sh", "rm"]);
+    let bin = programs(&["git", "bash", "sed", "env", "sh", "rm", "prlimit"]);
     let builder = simulation_server(&webots.path(), forge.path(), 1);
     is_told(&builder.env("PATH", bin.path().to_str().unwrap()).start().await, &arm(), "opened").await;
 }

@@ -3,7 +3,7 @@
 mod cache;
 mod checkout;
 mod commits;
-mod ends;
+pub mod ends;
 mod fetching;
 mod https;
 mod idleness;

@@ -36,7 +36,7 @@ pub async fn outgrown(folders: Vec<(PathBuf, u64)>) {
         let looked_at = folders.clone();
         let is_beyond = |(folder, most): &(PathBuf, u64)| {
             let mut size = DiskUsage::new(measure, *most);
-            !size.add_folder(folder) || size.total() > *most
+            !size.add_folder(folder) || size.total > *most
         };
         if blocking(move || Ok(looked_at.iter().any(is_beyond))).await.is_ok_and(|is_one| is_one) {
             return;
@@ -57,5 +57,5 @@ fn measure(about: &fs::Metadata) -> u64 {
 pub fn sum(folder: &Path, measure: fn(&fs::Metadata) -> u64) -> u64 {
     let mut size = DiskUsage::new(measure, u64::MAX);
     size.add_folder(folder);
-    size.total()
+    size.total
 }

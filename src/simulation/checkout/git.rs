@@ -40,8 +40,6 @@ const HEAVY: [&str; 2] = ["fetch", "gc"];
 const NICENESS: i32 = 10;
 /// Size limit of a command's answer, in bytes.
 const MAX_ANSWER: u64 = 64 * 1024 * 1024;
-/// Longest line of standard error that is kept, in bytes.
-const MAX_LINE: usize = 500;
 
 impl Git {
     /// Prepares git for the server whose run has this folder.
@@ -90,7 +88,7 @@ impl Git {
             ("GIT_NO_REPLACE_OBJECTS".into(), "1".into()),
             ("LC_ALL".into(), "C".into()),
         ];
-        (run.answer, run.line) = (MAX_ANSWER, MAX_LINE);
+        run.answer = MAX_ANSWER;
         run.limits.push((Resource::Data, MAX_MEMORY));
         run
     }

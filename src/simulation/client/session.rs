@@ -4,7 +4,7 @@
 //! the queue, a checkout in progress, a running Webots. It ends with its client, or some time after the connection of a
 //! client that may return. `start` is its way to a running Webots, `resume` the wait for its client.
 
-use std::sync::Arc;
+use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
 use actix::prelude::*;
@@ -14,6 +14,7 @@ use futures_util::stream::AbortHandle;
 use crate::shared::domain::ProjectUrl;
 use crate::shared::http::Peer;
 use crate::shared::run::closing;
+use crate::simulation::checkout::Project;
 use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::ends::{EndReason, Taken};
 use crate::simulation::protocol::{self, Mode};
@@ -21,7 +22,7 @@ use crate::simulation::sessions::{ClientAction, Connection, ToClient, Token};
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::slots::{Slot, SlotEvent, SlotLease};
 use crate::simulation::state::AppState;
-use crate::simulation::webots::{Keep, ResetController, Stop, Webots, WebotsEvent, WebotsExit};
+use crate::simulation::webots::{Keep, Stop, Webots, WebotsEvent, WebotsExit};
 
 /// The actor.
 pub struct Session {
@@ -34,6 +35,8 @@ pub struct Session {
     /// Ends the attachment of that connection, at once.
     pub(super) attachment: Option<AbortHandle>,
     pub(super) state: State,
+    /// The project that was checked out, as long as its Webots holds it.
+    pub(super) project: Weak<Project>,
     /// How it is shown.
     pub(super) mode: Mode,
     /// Whether its client may resume it.
@@ -98,6 +101,7 @@ impl Session {
                 client: None,
                 attachment: None,
                 state: State::Over,
+                project: Weak::new(),
                 mode: request.mode.unwrap_or_default(),
                 token: None,
                 launched: None,
@@ -145,26 +149,24 @@ impl Session {
     }
 
     fn reset_controller(&mut self, file: String, ctx: &mut Context<Self>) {
-        let State::Launched(WebotsHandle(webots)) = &self.state else {
+        let Some(project) = self.project.upgrade() else {
             return self.text(protocol::nothing_to_reset());
         };
         if self.is_resetting {
             return log::info!("{}: a controller is being reset already", self.name());
         }
         self.is_resetting = true;
-        let restored = webots.send(ResetController(file.clone())).into_actor(self);
-        restored
-            .map(move |answer, this, _| {
-                this.is_resetting = false;
-                match answer {
-                    Ok(Ok(())) => this.text(protocol::reset_controller(&file)),
-                    // This error does not end the simulation.
-                    Ok(Err(error)) => this.text(protocol::error(&error.to_string())),
-                    // Webots has ended, which its client hears.
-                    Err(_) => {}
-                }
-            })
-            .spawn(ctx);
+        let checkouts = Arc::clone(&self.server.checkouts);
+        let restored = async move { checkouts.restore_controller(&project, &file).await.map(|()| file) };
+        let restored = restored.into_actor(self).map(|restored, this, _| {
+            this.is_resetting = false;
+            match restored {
+                Ok(file) => this.text(protocol::reset_controller(&file)),
+                // This error does not end the simulation.
+                Err(error) => this.text(protocol::error(&error.to_string())),
+            }
+        });
+        restored.spawn(ctx);
     }
 
     /// Reports how the simulation ends, before the state is dropped. Webots' own report takes precedence.

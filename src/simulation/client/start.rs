@@ -105,14 +105,15 @@ impl Session {
         slot.lease.update(|one| one.version = Some(version));
         self.text(protocol::loading("webots is starting"));
         let gpu = self.take_gpu(&slot.lease);
+        let project = Arc::new(project);
+        self.project = Arc::downgrade(&project);
         let spec = LaunchSpec {
             config: Arc::clone(&self.server.config),
             containers: self.server.containers.clone(),
             launcher: Arc::clone(&self.server.launcher),
             watcher: self.server.watcher.clone(),
             program,
-            checkouts: Arc::clone(&self.server.checkouts),
-            project: Arc::new(project),
+            project,
             mode: self.mode,
             gpu,
             slot,

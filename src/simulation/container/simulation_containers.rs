@@ -96,16 +96,6 @@ impl SimulationContainers {
         self.restart.as_ref().map(|(request, _)| Arc::clone(request))
     }
 
-    /// The ids of its containers, which the kernel knows them by; none where Docker fails.
-    pub fn ids(&self) -> impl Future<Output = Vec<String>> + use<> {
-        let (docker, all) = (self.docker.clone(), self.services.iter().map(|service| self.container(service)));
-        let words: Vec<String> = ["inspect", "--format", "{{.Id}}"].map(str::to_owned).into_iter().chain(all).collect();
-        async move {
-            let ids = docker.run(&words, SHORT_TIMEOUT).await.unwrap_or_default();
-            ids.lines().map(|id| id.trim().to_owned()).collect()
-        }
-    }
-
     /// Why Webots' container has ended, given the end of the program `docker`; nothing if Docker knows no more.
     pub async fn cause(&self, ended: ExitReason) -> Option<Cause> {
         let ExitReason::Code(code) = ended else { return None };

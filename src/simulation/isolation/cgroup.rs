@@ -16,11 +16,8 @@ use crate::simulation::ends::Taken;
 /// The control groups below this server's own.
 pub struct Cgroups(PathBuf);
 
-/// The control group of one simulation. Dropping it kills all processes inside, and removes it.
-pub struct Cgroup {
-    /// Its directory.
-    pub folder: PathBuf,
-}
+/// The control group of one simulation: its directory. Dropping it kills all processes inside, and removes it.
+pub struct Cgroup(pub PathBuf);
 
 /// The group of the server itself: in a group with subgroups, the kernel's limits do not apply to processes beside
 /// these.
@@ -29,6 +26,9 @@ const OWN: &str = "server";
 const CONTROLLERS: [&str; 3] = ["cpu", "memory", "pids"];
 /// The kernel's period of CPU limits, in microseconds.
 const PERIOD: u64 = 100_000;
+/// How many processes run a simulation, and do not count for its limit, at most: bubblewrap has one outside of the sandbox
+/// and one inside, and pasta is one.
+const RUNNERS: u64 = 3;
 /// Timeout of killed processes until they have exited.
 const VANISH: Duration = Duration::from_secs(2);
 /// Interval between two checks whether they have.
@@ -39,16 +39,12 @@ impl Cgroups {
     /// just exiting would be taken for another owner of the server's group.
     pub fn delegated() -> Option<Self> {
         let folder = own_folder()?;
-        match Self::divide(&folder) {
-            Ok(()) => {
-                log::info!("each simulation gets a control group below {}", folder.display());
-                Some(Self(folder))
-            }
-            Err(error) => {
-                log::info!("simulations get no control groups: {} can't be divided: {error}", folder.display());
-                None
-            }
-        }
+        let divided = Self::divide(&folder).inspect_err(|error| {
+            log::info!("simulations get no control groups: {} can't be divided: {error}", folder.display());
+        });
+        divided.ok()?;
+        log::info!("each simulation gets a control group below {}", folder.display());
+        Some(Self(folder))
     }
 
     /// Moves this server into a subgroup, so that there can be others beside it.
@@ -67,19 +63,18 @@ impl Cgroups {
         own_folder().and_then(|folder| offered(&folder).ok()).unwrap_or_default()
     }
 
-    /// Creates a group with these limits for a simulation, which so many processes of ours run; `None` if that fails, and it
-    /// runs without one.
-    pub fn make(&self, limits: &ResourceLimits, runners: u64) -> Option<Cgroup> {
+    /// Creates a group with these limits for a simulation; `None` if that fails, and it runs without one.
+    pub fn make(&self, limits: &ResourceLimits) -> Option<Cgroup> {
         let made = tempfile::Builder::new().prefix("simulation-").tempdir_in(&self.0);
         let made = made.inspect_err(|error| log::warn!("no control group can be made: {error}"));
-        let cgroup = Cgroup { folder: made.ok()?.keep() };
+        let cgroup = Cgroup(made.ok()?.keep());
         // A simulation that runs out of memory is killed as a whole.
         let mut settings =
-            vec![("pids.max", (limits.processes + runners).to_string()), ("memory.oom.group", "1".to_owned())];
+            vec![("pids.max", (limits.processes + RUNNERS).to_string()), ("memory.oom.group", "1".to_owned())];
         settings.extend(limits.memory.map(|memory| ("memory.max", (memory << 20).to_string())));
         settings.extend(limits.cores.map(|cores| ("cpu.max", format!("{} {PERIOD}", cores * PERIOD))));
         for (file, value) in settings {
-            let file = cgroup.folder.join(file);
+            let file = cgroup.0.join(file);
             // A controller that this server does not have can't limit anything.
             if file.exists()
                 && let Err(error) = std::fs::write(&file, &value)
@@ -95,39 +90,22 @@ impl Cgroup {
     /// The prefix of a command that runs it in this group.
     pub fn joining(&self) -> Vec<OsString> {
         let words = ["/bin/sh", "-c", "echo 0 >\"$0\" && exec \"$@\""].map(OsString::from);
-        words.into_iter().chain(std::iter::once(self.folder.join("cgroup.procs").into())).collect()
+        words.into_iter().chain(std::iter::once(self.0.join("cgroup.procs").into())).collect()
     }
 
     /// Kills all processes inside, and returns whether the kernel had killed one because of the memory limit, and what has
     /// been taken. Blocks until they have exited, for two seconds at most.
     pub fn end(&self) -> (bool, Taken) {
-        kill(&self.folder);
-        let events = std::fs::read_to_string(self.folder.join("memory.events")).unwrap_or_default();
+        kill(&self.0);
+        let events = std::fs::read_to_string(self.0.join("memory.events")).unwrap_or_default();
         let kills = events.lines().find_map(|line| line.strip_prefix("oom_kill "));
-        (kills.is_some_and(|count| count.trim() != "0"), taken_in(&self.folder))
+        // The kernel knows the peak of memory since Linux 5.19.
+        let taken = Taken { memory: number_in(&self.0.join("memory.peak")), time: cgroup_time(&self.0) };
+        (kills.is_some_and(|count| count.trim() != "0"), taken)
     }
 }
 
-/// What has been taken in the control group with this folder, as far as the kernel counts it. It knows the peak of memory
-/// since Linux 5.19.
-fn taken_in(folder: &Path) -> Taken {
-    Taken { memory: number_in(&folder.join("memory.peak")), time: cgroup_time(folder) }
-}
-
-/// What a container has taken until now, as far as the kernel counts it, in control groups of either version, which Docker
-/// makes with systemd and without. They vanish with the container.
-pub(super) fn taken_by_container(container: &str) -> Taken {
-    let root = Path::new("/sys/fs/cgroup");
-    let names = [format!("system.slice/docker-{container}.scope"), format!("docker/{container}")];
-    let of_version_1 = |name: &String| Taken {
-        memory: number_in(&root.join("memory").join(name).join("memory.max_usage_in_bytes")),
-        time: number_in(&root.join("cpuacct").join(name).join("cpuacct.usage")).map(Duration::from_nanos),
-    };
-    let all = names.iter().flat_map(|name| [taken_in(&root.join(name)), of_version_1(name)]);
-    all.fold(Taken::default(), |all, one| Taken { memory: all.memory.or(one.memory), time: all.time.or(one.time) })
-}
-
-/// The CPU time of all that has run in a cgroup v2.
+/// The CPU time of all that has run in a group.
 fn cgroup_time(folder: &Path) -> Option<Duration> {
     let times = std::fs::read_to_string(folder.join("cpu.stat")).ok()?;
     let time = times.lines().find_map(|line| line.strip_prefix("usage_usec "))?;
@@ -151,7 +129,7 @@ fn kill(folder: &Path) {
 
 impl Drop for Cgroup {
     fn drop(&mut self) {
-        let folder = std::mem::take(&mut self.folder);
+        let folder = std::mem::take(&mut self.0);
         let remove = move || {
             kill(&folder);
             if let Err(error) = std::fs::remove_dir(&folder) {

@@ -56,7 +56,7 @@ impl Display {
     /// # Errors
     /// When there is no Xvfb, or the file can't be written.
     pub fn new_virtual(instance: &Path) -> io::Result<Self> {
-        let xvfb = which("Xvfb").map_err(io::Error::other)?.canonicalize()?;
+        let xvfb = which("Xvfb").map_err(|error| io::Error::other(format!("no Xvfb: {error}")))?.canonicalize()?;
         let authority = instance.join("Xauthority");
         let cookie: [u8; 16] = rand::random();
         let mut entry = EVERY_HOST.to_be_bytes().to_vec();

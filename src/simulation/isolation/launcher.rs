@@ -5,21 +5,25 @@
 use std::ffi::OsString;
 use std::io;
 use std::net::IpAddr;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use nix::sys::resource::{Resource, getrlimit};
 use which::which;
 
 use super::cgroup::{Cgroup, Cgroups};
-use super::inherited_environment;
+use super::display::Display;
 use super::network::OwnNetwork;
-use super::program::Program;
 use super::sandbox::Sandbox;
 use crate::simulation::config::{IsolationSetting, ResourceLimits, SandboxNetwork, SimulationConfig, VariableName};
 use crate::simulation::process::SpawnSpec;
 
 /// Soft limit of open files that programs expect; programs that use `select` can't handle more.
 const USUAL_FILES: u64 = 1024;
+/// Variables of the server's environment that Webots, Qt, graphics drivers and interpreters read; with `*`, all with this
+/// prefix. None of them is a secret of the server.
+const NEEDED: &str = "PATH HOME USER LOGNAME SHELL TERM TZ LANG LANGUAGE LC_* TMPDIR XAUTHORITY XDG_RUNTIME_DIR \
+                      XDG_DATA_DIRS XDG_CONFIG_DIRS WEBOTS_* LD_LIBRARY_PATH PYTHONPATH OMP_* QT_* QTWEBENGINE_* LIBGL_* \
+                      MESA_* GALLIUM_* DRI_PRIME __GL* __NV* __EGL* VK_* VGL_* NVIDIA_* CUDA_*";
 
 /// Launches simulations at one level.
 pub struct Launcher {
@@ -33,7 +37,6 @@ pub struct Launcher {
     why_shared: Option<String>,
     cgroups: Option<Cgroups>,
     controllers: Vec<&'static str>,
-    prlimit: Option<PathBuf>,
     variables: Vec<VariableName>,
     limits: ResourceLimits,
 }
@@ -44,21 +47,21 @@ impl Launcher {
     /// # Errors
     /// When the configuration requires what this machine does not have, as text for an administrator.
     pub fn new(config: &SimulationConfig) -> Result<Self, String> {
+        if config.isolation != IsolationSetting::Container && which("prlimit").is_err() {
+            return Err("prlimit is not there; on Debian, Ubuntu and Fedora the package util-linux has it".to_owned());
+        }
         // Before a sandbox is tried: what that has started may still be in this server's group.
         let controllers = Cgroups::controllers();
         let wants_sandbox = matches!(config.isolation, IsolationSetting::Sandbox | IsolationSetting::Auto);
-        let (mut sandbox, shortcoming) = match wants_sandbox.then(|| Sandbox::new(config)).transpose() {
-            Ok(sandbox) => (sandbox, None),
-            Err(why) if config.isolation == IsolationSetting::Sandbox => {
-                return Err(format!("isolation is \"sandbox\", but {why}; \"none\" runs worlds without it"));
-            }
-            Err(why) => (None, Some(why)),
-        };
-        let level = match config.isolation {
-            IsolationSetting::Auto if sandbox.is_some() => IsolationSetting::Sandbox,
-            IsolationSetting::Auto => IsolationSetting::None,
-            level => level,
-        };
+        let (level, mut sandbox, shortcoming) =
+            match (config.isolation, wants_sandbox.then(|| Sandbox::new(config)).transpose()) {
+                (IsolationSetting::Sandbox, Err(why)) => {
+                    return Err(format!("isolation is \"sandbox\", but {why}; \"none\" runs worlds without it"));
+                }
+                (_, Err(why)) => (IsolationSetting::None, None, Some(why)),
+                (_, Ok(Some(sandbox))) => (IsolationSetting::Sandbox, Some(sandbox), None),
+                (level, Ok(None)) => (level, None, None),
+            };
         let wanted = config.sandbox.network;
         let why_shared = match &mut sandbox {
             Some(_) if wanted == SandboxNetwork::Shared => None,
@@ -77,7 +80,6 @@ impl Launcher {
             shortcoming,
             cgroups: None,
             controllers,
-            prlimit: which("prlimit").ok(),
             variables: config.environment.clone(),
             limits: config.limits.clone(),
         })
@@ -89,10 +91,7 @@ impl Launcher {
     /// # Errors
     /// As for [`Self::new`].
     pub fn start(config: &SimulationConfig) -> Result<Self, String> {
-        let cgroups = match config.isolation {
-            IsolationSetting::Container => None,
-            _ => Cgroups::delegated(),
-        };
+        let cgroups = (config.isolation != IsolationSetting::Container).then(Cgroups::delegated).flatten();
         let mut launcher = Self::new(config)?;
         match &launcher.shortcoming {
             Some(why) => log::warn!("worlds' programs may do whatever this user may (isolation: none): {why}"),
@@ -111,18 +110,7 @@ impl Launcher {
 
     /// The limits that this machine can't enforce, one line each.
     pub fn unenforced_limits(&self) -> Vec<String> {
-        if self.level == IsolationSetting::Container {
-            // Docker enforces them.
-            return Vec::new();
-        }
         let mut lines = Vec::new();
-        if self.prlimit.is_none() {
-            lines.push(
-                "limits.openFiles does not hold, and files, core dumps and processes have no limit of the kernel's: prlimit \
-                 is not there; on Debian, Ubuntu and Fedora the package util-linux has it"
-                    .to_owned(),
-            );
-        }
         if self.sandbox.as_ref().is_some_and(|sandbox| !sandbox.ends_namespaces) {
             lines.push(
                 "worlds' programs can make user namespaces, which brings more of the kernel within their reach: only \
@@ -134,7 +122,8 @@ impl Launcher {
         for (key, controller, is_set) in
             [("limits.memory", "memory", limits.memory.is_some()), ("limits.cores", "cpu", limits.cores.is_some())]
         {
-            if is_set && !controllers.contains(&controller) {
+            // Docker enforces them for containers.
+            if is_set && self.level != IsolationSetting::Container && !controllers.contains(&controller) {
                 lines.push(format!(
                     "{key} does not hold: systemd has not delegated control groups with the controller {controller} to \
                      this program (Delegate={controller} in its unit)"
@@ -142,12 +131,6 @@ impl Launcher {
             }
         }
         lines
-    }
-
-    /// How many processes of each simulation are what runs it: bubblewrap has one outside of the sandbox and one inside, and
-    /// pasta is one.
-    pub fn runners(&self) -> u64 {
-        self.sandbox.as_ref().map_or(0, |sandbox| 2 + u64::from(sandbox.network.is_some()))
     }
 
     /// The network of each simulation's own, if it has one.
@@ -197,69 +180,59 @@ impl Launcher {
         }
     }
 
-    /// The specification of the process that runs a program, and its control group.
+    /// The same process at the level of this server, with this display and port of its stream; and its control group.
     ///
     /// # Errors
     /// When a directory can't be created.
-    pub fn prepare(&self, mut program: Program<'_>) -> io::Result<(SpawnSpec, Option<Cgroup>)> {
-        let cgroup = self.cgroups.as_ref().and_then(|cgroups| cgroups.make(&self.limits, self.runners()));
+    pub fn prepare(
+        &self,
+        mut spec: SpawnSpec,
+        port: u16,
+        display: &Display,
+    ) -> io::Result<(SpawnSpec, Option<Cgroup>)> {
+        let cgroup = self.cgroups.as_ref().and_then(|cgroups| cgroups.make(&self.limits));
         let mut command = cgroup.as_ref().map(Cgroup::joining).unwrap_or_default();
-        let mut environment = inherited_environment::allowed(&self.variables);
-        environment.push(program.display.variable());
-        environment.append(&mut program.variables);
+        let mut environment = self.inherited();
+        environment.push(display.variable());
+        environment.append(&mut spec.environment);
         if let Some(sandbox) = &self.sandbox {
             // Symlinks are not followed out of a sandbox.
-            if let Some(file) = program.command.first_mut()
+            if let Some(file) = spec.command.first_mut()
                 && let Ok(real) = Path::new(&*file).canonicalize()
             {
                 *file = real.into();
             }
-            command.extend(sandbox.command(&program)?);
+            command.extend(sandbox.command(&spec, port, display)?);
             environment.extend(sandbox.environment());
+            spec.wrappers = 1 + usize::from(sandbox.network.is_some());
         }
         command.extend(self.limited());
-        command.extend(program.display.launcher(self.sandbox.is_some()));
-        let spec = SpawnSpec {
-            command: command.into_iter().chain(program.command).collect(),
-            inherits: false,
-            environment,
-            wrappers: self.sandbox.as_ref().map_or(0, |sandbox| 1 + usize::from(sandbox.network.is_some())),
-            folder: Some(program.folder.to_owned()),
-            mark: program.instance.to_owned(),
-            grace: program.grace,
-        };
-        Ok((spec, cgroup))
+        command.extend(display.launcher(self.sandbox.is_some()));
+        command.append(&mut spec.command);
+        Ok((SpawnSpec { command, environment, inherits: false, ..spec }, cgroup))
     }
 
-    /// Whether the kernel counts the processes of each sandbox separately.
-    fn limits_by_namespace(&self) -> bool {
-        let is_ordinary = !nix::unistd::getuid().is_root();
-        self.sandbox.is_some() && is_ordinary && self.prlimit.is_some() && counts_by_namespace()
-    }
-
-    /// Limit of a simulation's processes; `None` if the kernel or Docker enforces it.
-    pub fn most_processes(&self) -> Option<u64> {
-        let is_kept = self.level == IsolationSetting::Container
-            || self.limits_by_namespace()
-            || self.cgroups.is_some() && self.controllers.contains(&"pids");
-        (!is_kept).then_some(self.limits.processes)
+    /// The variables of the server's own environment that a simulation gets.
+    fn inherited(&self) -> Vec<(OsString, OsString)> {
+        let needed = NEEDED.split_whitespace().filter_map(|name| VariableName::try_from(name.to_owned()).ok());
+        let names: Vec<VariableName> = needed.chain(self.variables.iter().cloned()).collect();
+        let is_named = |name: &OsString| name.to_str().is_some_and(|name| names.iter().any(|one| one.covers(name)));
+        std::env::vars_os().filter(|(name, _)| is_named(name)).collect()
     }
 
     /// The prefix of a command that runs it with the kernel's limits for processes.
     fn limited(&self) -> Vec<OsString> {
-        let Some(prlimit) = &self.prlimit else {
-            return Vec::new();
-        };
         let files = at_most(Resource::RLIMIT_NOFILE, self.limits.open_files);
-        let size = format!("--fsize={}", at_most(Resource::RLIMIT_FSIZE, self.limits.disk << 20));
-        let mut words = vec![format!("--nofile={}:{files}", files.min(USUAL_FILES)), size, "--core=0".to_owned()];
+        let size = at_most(Resource::RLIMIT_FSIZE, self.limits.disk << 20);
+        let mut words = vec!["prlimit".to_owned(), format!("--nofile={}:{files}", files.min(USUAL_FILES))];
+        words.extend([format!("--fsize={size}"), "--core=0".to_owned()]);
         // The kernel counts all processes of a user, but in a user namespace only those inside, one of which is
         // bubblewrap.
-        if self.limits_by_namespace() {
+        if self.sandbox.is_some() && !nix::unistd::getuid().is_root() && counts_by_namespace() {
             words.push(format!("--nproc={}", at_most(Resource::RLIMIT_NPROC, self.limits.processes + 1)));
         }
         words.push("--".to_owned());
-        std::iter::once(prlimit.into()).chain(words.into_iter().map(OsString::from)).collect()
+        words.into_iter().map(OsString::from).collect()
     }
 }
 

@@ -2,22 +2,16 @@
 
 mod cgroup;
 mod disk;
-mod disk_use;
 mod display;
-mod inherited_environment;
 mod keyrings;
 mod launcher;
 mod mount;
 mod network;
-mod peak;
-mod program;
 mod sandbox;
 mod watcher;
 
 pub use cgroup::Cgroup;
-pub use disk_use::DiskUse;
+pub use disk::DiskUse;
 pub use display::Display;
 pub use launcher::Launcher;
-pub use peak::Peak;
-pub use program::Program;
-pub use watcher::{Watch, Watcher};
+pub use watcher::Watcher;

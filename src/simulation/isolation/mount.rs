@@ -1,8 +1,6 @@
 //! The mounts of a sandbox, and what they hide of the server.
 
-use std::collections::BTreeSet;
 use std::ffi::OsString;
-use std::fs::DirEntry;
 use std::path::{Path, PathBuf};
 
 use crate::simulation::config::SimulationConfig;
@@ -52,10 +50,9 @@ impl Mount {
 
 /// The mounts that hide what only the server may read: its log, its cache with all simulations, its configuration and
 /// other secrets.
-pub fn hidden(config: &SimulationConfig, homes: &[PathBuf]) -> Vec<Mount> {
+pub fn hidden(config: &SimulationConfig) -> Vec<Mount> {
     let folders = [&config.log_dir.0, &config.cache_dir.0].into_iter().filter_map(|folder| folder.canonicalize().ok());
-    let folders = folders.chain(std::iter::once(ETC.into())).chain(folders_of_secrets(config, homes));
-    let mut hidden: Vec<Mount> = folders.map(Mount::empty).collect();
+    let mut hidden: Vec<Mount> = folders.chain([ETC.into()]).map(Mount::empty).collect();
     for file in config.secret_files() {
         let Some(real) = file.canonicalize().ok().filter(|file| file.is_file()) else { continue };
         // The other configurations are nearby: those of the session server are in a directory beside this one.
@@ -66,22 +63,4 @@ pub fn hidden(config: &SimulationConfig, homes: &[PathBuf]) -> Vec<Mount> {
         hidden.push(Mount::file(real, "/dev/null".into()));
     }
     hidden
-}
-
-/// The directories that contain only secrets of the server: a file that replaces another one would be visible unless
-/// its directory is hidden. Programs may need anything else in a directory.
-fn folders_of_secrets(config: &SimulationConfig, homes: &[PathBuf]) -> Vec<PathBuf> {
-    let named = config.secret_files().filter_map(|file| {
-        let folder = file.parent()?.canonicalize().ok()?;
-        Some(folder.join(file.file_name()?))
-    });
-    let secrets: BTreeSet<PathBuf> = named.flat_map(|file| file.canonicalize().into_iter().chain([file])).collect();
-    let shown = config.sandbox.readable.iter().chain(&config.sandbox.writable).chain(&config.webots_home);
-    let shown = shown.map(|path| path.0.clone()).chain(homes.iter().cloned()).chain([std::env::temp_dir()]);
-    let shown: Vec<PathBuf> = shown.filter_map(|path| path.canonicalize().ok()).collect();
-    let is_secret = |entry: std::io::Result<DirEntry>| entry.is_ok_and(|entry| secrets.contains(&entry.path()));
-    let holds_only_secrets = |folder: &Path| folder.read_dir().is_ok_and(|mut entries| entries.all(is_secret));
-    let folders: BTreeSet<&Path> = secrets.iter().filter_map(|file| file.parent()).collect();
-    let hidden = folders.into_iter().filter(|at| !shown.iter().any(|one| one == at) && holds_only_secrets(at));
-    hidden.map(Path::to_owned).collect()
 }

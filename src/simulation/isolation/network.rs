@@ -14,15 +14,11 @@ use std::path::{Path, PathBuf};
 use which::which;
 
 use super::mount::Mount;
-use super::program::Program;
 use crate::simulation::config::{SandboxNetwork, SimulationConfig};
-use crate::simulation::machine::display;
 
 /// The programs and settings that give each sandbox a network of its own.
 pub struct OwnNetwork {
     pasta: PathBuf,
-    setpriv: PathBuf,
-    unshare: PathBuf,
     /// The program that loads the packet filter; `None` if it is missing or fails.
     pub nft: Option<PathBuf>,
     /// Whether programs reach nothing at all.
@@ -39,18 +35,19 @@ const RESOLVER: &str = "169.254.1.1";
 const RESOLVER_6: &str = "fd53::1:1";
 /// An address of the internet (for documentation), to which nothing is sent.
 const INTERNET: (Ipv4Addr, u16) = (Ipv4Addr::new(203, 0, 113, 7), 9);
-/// The file that names it.
+/// The file that names it, and that of a simulation in the folder of its instance.
 const RESOLV_CONF: &str = "/etc/resolv.conf";
+const OWN_RESOLV_CONF: &str = "resolv.conf";
 /// The socket of the system's log.
 const SYSTEM_LOG: &str = "/dev/log";
 /// Path of nft, which is not in the `PATH` of ordinary users.
 const NFT: &str = "/usr/sbin/nft";
-/// Versions of pasta until 2023 leave the socket on which they listen, which is one of the machine's network, to what they
-/// start.
-const CLOSE: &str = "exec 3>&- 4>&- 5>&- 6>&- 7>&- 8>&- 9>&-";
-/// Fails if a program in the sandbox has inherited a socket.
-pub const CHECK: &str = "for one in /proc/self/fd/*; do case $(readlink \"$one\") in socket:*) \
-                         echo 'pasta leaves sockets open' >&2; exit 1 ;; esac; done";
+/// Loads the packet filter of the file `$1`, if there is one, and becomes the program that follows. Versions of pasta until
+/// 2023 leave the socket on which they listen, which is one of the machine's network, to what they start.
+const BEGIN: &str = r#"exec 3>&- 4>&- 5>&- 6>&- 7>&- 8>&- 9>&-
+[ -z "$1" ] || "$0" -f "$1" || exit
+shift
+exec "$@""#;
 
 impl OwnNetwork {
     /// Prepares networks for a server with this configuration.
@@ -61,15 +58,10 @@ impl OwnNetwork {
         if nix::unistd::getuid().is_root() {
             return Err("pasta gives none to root, run the server as a user of its own".to_owned());
         }
-        if let Some(display) = remote_display(config) {
-            return Err(format!("the display {display} is reached by TCP, which such a network closes"));
-        }
         let missing = |program, package| {
             format!("{program} is not there; on Debian, Ubuntu and Fedora the package {package} has it")
         };
         let pasta = which("pasta").map_err(|_| missing("pasta", "passt"))?;
-        let util = |program| which(program).map_err(|_| missing(program, "util-linux"));
-        let (setpriv, unshare) = (util("setpriv")?, util("unshare")?);
         let closed = config.sandbox.network == SandboxNetwork::Closed;
         let nft = which("nft").ok().or_else(|| Some(PathBuf::from(NFT)).filter(|nft| nft.is_file()));
         if closed && nft.is_none() {
@@ -77,7 +69,7 @@ impl OwnNetwork {
         }
         let loopback = loopback();
         let forwarded = if config.ports_are_public() { config.bind } else { loopback };
-        Ok(Self { pasta, setpriv, unshare, nft, closed, loopback, forwarded })
+        Ok(Self { pasta, nft, closed, loopback, forwarded })
     }
 
     /// Drops the packet filter, if the configuration allows that. Returns whether there was one.
@@ -90,60 +82,46 @@ impl OwnNetwork {
         if self.forwarded.is_unspecified() { self.loopback } else { self.forwarded }
     }
 
-    /// The words that run a program in a network of its own. Writes the files that it needs into the instance's folder.
+    /// The words that run a program in a network of its own, into which this port is forwarded. Writes the files that it needs
+    /// into the instance's folder.
     ///
     /// # Errors
     /// When these can't be written.
-    pub fn command(&self, program: &Program<'_>) -> io::Result<Vec<OsString>> {
-        let mut command: Vec<OsString> = vec![self.setpriv.clone().into()];
-        command.extend(["--pdeathsig", "KILL", "--"].map(Into::into));
+    pub fn command(&self, instance: &Path, port: u16) -> io::Result<Vec<OsString>> {
+        let mut command: Vec<OsString> = ["setpriv", "--pdeathsig", "KILL", "--"].map(Into::into).into();
         command.push(self.pasta.clone().into());
         // By default it maps its gateway to the machine's loopback, and opens ports to and from the machine.
         let fixed = ["--config-net", "--no-map-gw", "-u", "none", "-T", "none", "-U", "none", "-t"];
         command.extend(fixed.map(Into::into));
         // A port alone is one of all addresses, of either version of IP.
         let is_any = self.forwarded == Ipv6Addr::UNSPECIFIED;
-        let port = program.port;
         command.push(if is_any { port.to_string() } else { format!("{}/{port}", self.forwarded) }.into());
         // Without the system's log it prints errors. With it, AppArmor may allow no other file.
         if !Path::new(SYSTEM_LOG).exists() {
-            command.extend(["--log-file".into(), program.instance.join("pasta.log").into()]);
+            command.extend(["--log-file".into(), instance.join("pasta.log").into()]);
         }
         if !self.closed {
             let resolver = if self.loopback.is_ipv4() { RESOLVER } else { RESOLVER_6 };
             command.extend(["--dns-forward", resolver].map(Into::into));
-            std::fs::write(resolv_conf(program.instance), format!("nameserver {resolver}\n"))?;
+            std::fs::write(instance.join(OWN_RESOLV_CONF), format!("nameserver {resolver}\n"))?;
         }
         command.extend(["--", "/bin/sh", "-c"].map(Into::into));
+        let (mut loader, mut rules) = (Path::new("sh"), PathBuf::new());
         if let Some(nft) = &self.nft {
-            let rules = program.instance.join("network.nft");
+            (loader, rules) = (nft, instance.join("network.nft"));
             std::fs::write(&rules, if self.closed { include_str!("closed.nft") } else { include_str!("own.nft") })?;
-            command.push(format!("{CLOSE}; \"$0\" -f \"$1\" && shift && exec \"$@\"").into());
-            command.extend([nft.clone().into(), rules.into()]);
-        } else {
-            command.push(format!("{CLOSE}; exec \"$@\"").into());
-            command.push("sh".into());
         }
+        command.extend([BEGIN.into(), loader.into(), rules.into()]);
         // bubblewrap finds its own processes in `/proc`, and pasta has begun to count them anew.
-        command.extend([self.unshare.clone().into(), "--mount-proc".into(), "--".into()]);
+        command.extend(["unshare", "--mount-proc", "--"].map(Into::into));
         Ok(command)
     }
 
     /// The mount by which programs in a sandbox resolve names.
     pub fn mounts(&self, instance: &Path) -> Option<Mount> {
         let at = Path::new(RESOLV_CONF).canonicalize().ok().filter(|_| !self.closed)?;
-        Some(Mount::file(at, resolv_conf(instance)))
+        Some(Mount::file(at, instance.join(OWN_RESOLV_CONF)))
     }
-}
-
-/// A display of the configuration that is reached by TCP.
-fn remote_display(config: &SimulationConfig) -> Option<String> {
-    let mut displays = config.all_displays().into_iter().filter(|_| !config.xvfb);
-    displays.find(|display| display::socket(display).is_none())
-}
-
-fn resolv_conf(instance: &Path) -> PathBuf {
-    instance.join("resolv.conf")
 }
 
 /// The machine's loopback address. pasta makes networks without IPv4 where the machine has no route for it, and then

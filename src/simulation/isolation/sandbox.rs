@@ -4,7 +4,7 @@
 //! The mounts are one list, outer directories before inner ones. The most specific path wins: a mount covers a
 //! directory and its contents unless a longer path overrides it.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::io;
 use std::net::{Ipv4Addr, TcpListener};
@@ -16,17 +16,15 @@ use which::which;
 use super::display::Display;
 use super::keyrings;
 use super::mount::{Mount, hidden};
-use super::network::{CHECK, OwnNetwork};
-use super::program::Program;
+use super::network::OwnNetwork;
 use crate::shared::text::one_line;
 use crate::simulation::config::{SandboxNetwork, SimulationConfig};
 use crate::simulation::machine::display;
-use crate::simulation::process::{ExitReason, Ran, Run, RunError};
+use crate::simulation::process::{ExitReason, InstanceDir, Run, SpawnSpec};
 
 /// The common part of all sandboxes of this server.
 pub struct Sandbox {
     bubblewrap: PathBuf,
-    user: u32,
     homes: Vec<PathBuf>,
     mounts: Vec<Mount>,
     /// Whether programs inside are kept from creating user namespaces, which bubblewrap supports since 0.8.
@@ -75,13 +73,12 @@ impl Sandbox {
         mounts.extend(writable.map(|at| Mount::writable(at.clone(), &at)));
         // Last, so that nothing overrides these.
         let homes = homes();
-        mounts.extend(hidden(config, &homes));
+        mounts.extend(hidden(config));
         mounts.retain(|mount| mount.at.exists());
-        let (user, shared_memory) = (nix::unistd::getuid().as_raw(), config.limits.disk << 20);
-        let mut sandbox = Self { bubblewrap, user, homes, mounts, ends_namespaces: true, network: None, shared_memory };
+        let shared_memory = config.limits.disk << 20;
+        let mut sandbox = Self { bubblewrap, homes, mounts, ends_namespaces: true, network: None, shared_memory };
         let mut tried = sandbox.trial();
-        // A trial that hangs would also hang without these options.
-        if tried.as_ref().is_err_and(|error| error.kind() != io::ErrorKind::TimedOut) {
+        if tried.is_err() {
             sandbox.ends_namespaces = false;
             tried = sandbox.trial();
         }
@@ -94,28 +91,26 @@ impl Sandbox {
     ///
     /// # Errors
     /// When a directory can't be created.
-    pub fn command(&self, program: &Program<'_>) -> io::Result<Vec<OsString>> {
-        let mut command = self.network.as_ref().map_or_else(|| Ok(Vec::new()), |network| network.command(program))?;
-        let filter = program.instance.join("system-calls");
+    pub fn command(&self, spec: &SpawnSpec, port: u16, display: &Display) -> io::Result<Vec<OsString>> {
+        let instance = &spec.mark;
+        let mut command =
+            self.network.as_ref().map_or_else(|| Ok(Vec::new()), |network| network.command(instance, port))?;
+        let filter = instance.join("system-calls");
         std::fs::write(&filter, keyrings::filter())?;
         command.extend(["/bin/sh", "-c", "exec \"$@\" 3<\"$0\""].map(Into::into));
         command.extend([filter.into(), self.bubblewrap.clone().into(), "--seccomp".into(), "3".into()]);
-        command.extend(
-            ["--die-with-parent", "--new-session", "--unshare-pid", "--unshare-ipc", "--cap-drop", "ALL"]
-                .map(Into::into),
-        );
-        if self.ends_namespaces || self.network.is_some() {
-            command.push("--unshare-user".into());
-        }
+        let fixed = ["--die-with-parent", "--new-session", "--unshare-user", "--unshare-pid", "--unshare-ipc"];
+        command.extend(fixed.map(Into::into));
         if self.ends_namespaces {
             command.push("--disable-userns".into());
         }
         if self.network.is_some() {
             // In pasta's namespace it is root.
-            let (user, group) = (self.user.to_string(), nix::unistd::getgid().to_string());
+            let (user, group) = (nix::unistd::getuid().to_string(), nix::unistd::getgid().to_string());
             command.extend(["--uid".into(), user.into(), "--gid".into(), group.into()]);
         }
-        command.extend(["--ro-bind", "/", "/", "--dev", "/dev", "--proc", "/proc"].map(Into::into));
+        command
+            .extend(["--cap-drop", "ALL", "--ro-bind", "/", "/", "--dev", "/dev", "--proc", "/proc"].map(Into::into));
         // The kernel lets root write there without capabilities.
         command.extend(["--ro-bind-try", "/proc/sys", "/proc/sys"].map(Into::into));
         for device in devices() {
@@ -123,7 +118,7 @@ impl Sandbox {
         }
         // Of two mounts at the same path the last one counts.
         let mut mounts = BTreeMap::new();
-        for mount in self.own(program)?.into_iter().chain(self.mounts.iter().cloned()) {
+        for mount in self.own(spec, display)?.into_iter().chain(self.mounts.iter().cloned()) {
             mounts.insert((mount.at.components().count(), mount.at.clone()), mount);
         }
         // Empty directories are memory: they are made read-only, as is the rest of `/dev`.
@@ -136,33 +131,35 @@ impl Sandbox {
         }
         command.extend(["--tmpfs", "/dev/shm"].map(Into::into));
         command.extend(closed.into_iter().flat_map(|at| ["--remount-ro".into(), at.into()]));
-        command.extend(["--chdir".into(), program.folder.into(), "--".into()]);
+        command.extend(spec.folder.iter().flat_map(|folder| ["--chdir".into(), folder.into()]));
+        command.push("--".into());
         Ok(command)
     }
 
     /// What is different from one simulation to another.
-    fn own(&self, program: &Program<'_>) -> io::Result<Vec<Mount>> {
+    fn own(&self, spec: &SpawnSpec, display: &Display) -> io::Result<Vec<Mount>> {
         let inside = |name: &str| {
-            let folder = program.instance.join(name);
+            let folder = spec.mark.join(name);
             std::fs::create_dir_all(&folder).map(|()| folder)
         };
         let (home, run, tmp) = (inside("home")?, inside("run")?, inside("tmp")?);
-        program.display.prepare(&tmp)?;
+        display.prepare(&tmp)?;
         let mut own: Vec<Mount> = temporary_folders().map(|at| Mount::writable(at, &tmp)).collect();
-        own.push(Mount::writable(self.runtime_folder(), &run));
+        own.push(Mount::writable(runtime_folder(), &run));
         own.extend(self.homes.iter().map(|at| Mount::writable(at.clone(), &home)));
-        own.push(Mount::writable(program.project.clone(), &program.project));
+        let project = spec.mark.join(InstanceDir::PROJECT);
+        own.push(Mount::writable(project.clone(), &project));
         // The sandbox resolves symlinks inside, where their targets may not exist.
-        let files = program.command.first().map(PathBuf::from).into_iter().chain(self.display_files(program));
+        let files = spec.command.first().map(PathBuf::from).into_iter().chain(self.display_files(display));
         own.extend(files.filter_map(|file| file.canonicalize().ok()).map(Mount::read_only));
-        own.extend(self.network.as_ref().and_then(|network| network.mounts(program.instance)));
-        own.retain(|mount| mount.at.exists() || mount.at == self.runtime_folder());
+        own.extend(self.network.as_ref().and_then(|network| network.mounts(&spec.mark)));
+        own.retain(|mount| mount.at.exists() || mount.at == runtime_folder());
         Ok(own)
     }
 
     /// The socket of the display, and the file that authorizes its users; or the program of one that is started inside.
-    fn display_files(&self, program: &Program<'_>) -> Vec<PathBuf> {
-        let name = match program.display {
+    fn display_files(&self, display: &Display) -> Vec<PathBuf> {
+        let name = match display {
             Display::Outside(name) => name,
             Display::Virtual { xvfb, authority } => return vec![xvfb.clone(), authority.clone()],
         };
@@ -177,13 +174,9 @@ impl Sandbox {
         vec![
             ("HOME".into(), home.into()),
             ("TMPDIR".into(), "/tmp".into()),
-            ("XDG_RUNTIME_DIR".into(), self.runtime_folder().into()),
+            ("XDG_RUNTIME_DIR".into(), runtime_folder().into()),
             ("QT_X11_NO_MITSHM".into(), "1".into()),
         ]
-    }
-
-    fn runtime_folder(&self) -> PathBuf {
-        PathBuf::from(format!("/run/user/{}", self.user))
     }
 
     /// Gives each sandbox a network of its own, if that works here. Blocks for ten seconds at most.
@@ -205,41 +198,33 @@ impl Sandbox {
     /// Runs `true` in a sandbox with all mounts.
     fn trial(&self) -> io::Result<()> {
         let instance = tempfile::tempdir()?;
-        let project = instance.path().join("project");
+        let project = instance.path().join(InstanceDir::PROJECT);
         std::fs::create_dir(&project)?;
-        let words = self.command(&Program {
-            command: Vec::new(),
-            instance: instance.path(),
-            folder: &project,
-            project: project.clone(),
-            // One that was free a moment ago.
-            port: TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?.local_addr()?.port(),
-            variables: Vec::new(),
-            display: &Display::Outside(String::new()),
-            grace: TRIAL,
-        })?;
-        let check = if self.network.is_some() { CHECK } else { "true" };
-        let command = words.into_iter().chain(["/bin/sh", "-c", check].map(Into::into));
+        let spec = SpawnSpec { folder: Some(project), ..SpawnSpec::new(Vec::new(), instance.path()) };
+        // One that was free a moment ago.
+        let port = TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?.local_addr()?.port();
+        let mut command = self.command(&spec, port, &Display::Outside(String::new()))?;
+        command.extend(["/bin/sh", "-c", "true"].map(Into::into));
         let mut complaint = String::new();
-        match Run::new(command, instance.path(), TRIAL).blocking(|line| complaint = line) {
-            Ok(Ran { ending: ExitReason::Code(0), .. }) => Ok(()),
-            Ok(_) => Err(io::Error::other(complaint)),
-            Err(RunError::Slow(_)) => Err(io::Error::new(io::ErrorKind::TimedOut, "it does not end")),
-            Err(error) => Err(io::Error::other(error)),
+        let ran = Run::new(command, instance.path(), TRIAL).blocking(|line| complaint = line);
+        match ran.map_err(io::Error::other)?.ending {
+            ExitReason::Code(0) => Ok(()),
+            _ => Err(io::Error::other(complaint)),
         }
     }
 }
 
+/// The user's runtime directory.
+fn runtime_folder() -> PathBuf {
+    PathBuf::from(format!("/run/user/{}", nix::unistd::getuid()))
+}
+
 /// The home directories of the server's user: `HOME`, and the one in the user database.
 fn homes() -> Vec<PathBuf> {
-    let named = std::env::var_os("HOME").map(PathBuf::from);
     let known = nix::unistd::User::from_uid(nix::unistd::getuid()).ok().flatten().map(|user| user.dir);
-    let mut homes: Vec<PathBuf> = named
-        .into_iter()
-        .chain(known)
-        .filter_map(|home| home.canonicalize().ok())
-        .filter(|home| home.parent().is_some())
-        .collect();
+    let all = std::env::var_os("HOME").map(PathBuf::from).into_iter().chain(known);
+    let real = all.filter_map(|home| home.canonicalize().ok());
+    let mut homes: Vec<PathBuf> = real.filter(|home| home.parent().is_some()).collect();
     homes.dedup();
     homes
 }
@@ -249,7 +234,7 @@ fn temporary_folders() -> impl Iterator<Item = PathBuf> {
     let all = ["/tmp".into(), "/var/tmp".into(), std::env::temp_dir()];
     let real = all.into_iter().filter_map(|folder: PathBuf| folder.canonicalize().ok());
     // Each sandbox has its own shared memory.
-    real.filter(|folder| folder.parent().is_some() && !folder.starts_with("/dev")).collect::<BTreeSet<_>>().into_iter()
+    real.filter(|folder| folder.parent().is_some() && !folder.starts_with("/dev"))
 }
 
 /// The graphics cards of this machine.

@@ -1,49 +1,25 @@
-//! Watches over what simulations take that the kernel does not limit: room on the disk, and on some machines processes.
-//! One thread looks for all of them.
+//! Watches over what simulations write on the disk, which the kernel does not limit. One thread looks for all of them.
 //!
 //! The free room of the disk is looked at each second, and more often as it comes close to the reserve (`diskReserve`). At the
 //! reserve the simulation ends that has grown most, then the next.
 //!
-//! All else is done in ticks that take 1 % of one core at most: as they take longer, the pause between them grows. One pass
-//! over `/proc` serves all simulations. Folders, which have to be counted one by one, are counted only when the disk has lost
-//! as much room as the simulation may still write, and every ten seconds at most.
+//! Folders, which have to be counted one by one for `limits.disk`, are counted only when the disk has lost as much room as the
+//! simulation may still write, and every ten seconds at most: in ticks that take 1 % of one core at most. As they take
+//! longer, the pause between them grows.
 
 use std::io;
 use std::path::PathBuf;
-use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::time::{Duration, Instant};
 
 use nix::time::{ClockId, clock_gettime};
 use tokio::sync::oneshot;
 
-use super::disk::Disk;
-use super::disk_use::{DiskUse, words};
-use super::peak::Peak;
-use crate::simulation::machine::usages;
+use super::disk::{Disk, DiskUse};
 
 /// Monitors simulations. Its thread ends when the last clone is dropped.
 #[derive(Debug, Clone)]
-pub struct Watcher(Sender<(Watch, oneshot::Sender<String>)>);
-
-/// What is monitored of one simulation.
-pub struct Watch {
-    /// What it has taken of the disk.
-    pub disk: DiskUse,
-    /// Limit of its own processes and threads; `None` if the kernel enforces it.
-    pub processes: Option<u64>,
-    /// Number of the tree's processes that run the simulation, and do not count.
-    pub runners: u64,
-    /// Receives its usage; `None` if its control group counts it.
-    pub peak: Option<Arc<Peak>>,
-}
-
-/// A monitored simulation.
-struct Watched {
-    watch: Watch,
-    /// Receives the message when it exceeds a limit, and is gone then.
-    excess: Option<oneshot::Sender<String>>,
-}
+pub struct Watcher(Sender<DiskUse>);
 
 /// The shortest time between two ticks.
 const SHORTEST: Duration = Duration::from_secs(1);
@@ -73,10 +49,11 @@ impl Watcher {
 
     /// Waits until a simulation exceeds a limit. Returns the message for its client. Dropping the future ends the
     /// monitoring.
-    pub async fn until_too_much(&self, watch: Watch) -> String {
-        let (excess, told) = oneshot::channel();
+    pub async fn until_too_much(self, mut simulation: DiskUse) -> String {
+        let (end, told) = oneshot::channel();
+        simulation.end = Some(end);
         // The thread lives as long as this.
-        self.0.send((watch, excess)).ok();
+        self.0.send(simulation).ok();
         match told.await {
             Ok(why) => why,
             Err(_) => std::future::pending().await,
@@ -84,38 +61,29 @@ impl Watcher {
     }
 }
 
-impl Watched {
-    /// Sends this message, and ends the monitoring.
-    fn end(&mut self, why: String) {
-        // The receiver may be gone.
-        self.excess.take().map(|excess| excess.send(why));
-    }
-}
-
 /// All monitored simulations.
 struct Table {
     disk: Disk,
-    all: Vec<Watched>,
+    all: Vec<DiskUse>,
 }
 
 impl Table {
-    fn run(&mut self, watches: &Receiver<(Watch, oneshot::Sender<String>)>) {
+    fn run(&mut self, watches: &Receiver<DiskUse>) {
         let mut tick = Instant::now() + SHORTEST;
         loop {
             let next = tick.min(Instant::now() + self.disk.pause());
-            loop {
-                let left = next.saturating_duration_since(Instant::now());
-                match if self.all.is_empty() { watches.recv().map_err(Into::into) } else { watches.recv_timeout(left) }
-                {
-                    Ok((mut watch, excess)) => {
-                        watch.disk.lost = self.disk.lost;
-                        self.all.push(Watched { watch, excess: Some(excess) });
-                    }
-                    Err(RecvTimeoutError::Timeout) => break,
-                    Err(RecvTimeoutError::Disconnected) => return,
+            let left = next.saturating_duration_since(Instant::now());
+            let come =
+                if self.all.is_empty() { watches.recv().map_err(Into::into) } else { watches.recv_timeout(left) };
+            match come {
+                Ok(mut one) => {
+                    one.lost = self.disk.lost;
+                    self.all.push(one);
                 }
+                Err(RecvTimeoutError::Timeout) => {}
+                Err(RecvTimeoutError::Disconnected) => return,
             }
-            self.all.retain(|one| one.excess.as_ref().is_some_and(|excess| !excess.is_closed()));
+            self.all.retain(|one| one.end.as_ref().is_some_and(|end| !end.is_closed()));
             if let Some(least) = self.disk.look()
                 && (self.end_grown_most(least) || least == 0)
             {
@@ -124,8 +92,8 @@ impl Table {
             if Instant::now() >= tick {
                 let begin = processor_time();
                 self.count_folders(begin);
-                self.count_processes();
-                tick = Instant::now() + pause_after(processor_time().saturating_sub(begin));
+                let pause = processor_time().saturating_sub(begin) * PAUSE;
+                tick = Instant::now() + pause.clamp(SHORTEST, LONGEST);
             }
         }
     }
@@ -134,23 +102,20 @@ impl Table {
     /// fills the disk.
     fn end_grown_most(&mut self, least: u64) -> bool {
         let (until, lost) = (Instant::now() + COUNTS_AT_RESERVE, self.disk.lost);
-        // The one that had grown most is counted first, then those whose count is oldest.
-        self.all.sort_by_key(|one| one.watch.disk.counted);
-        let most = self.all.iter().enumerate().max_by_key(|(_, one)| one.watch.disk.growth()).map(|(index, _)| index);
-        most.inspect(|index| self.all.swap(0, *index));
+        // Those whose count is oldest are counted first.
+        self.all.sort_by_key(|one| one.counted);
         for one in &mut self.all {
             if Instant::now() >= until {
                 break;
             }
-            if let Some(why) = one.watch.disk.count(lost, COUNT_AT_RESERVE) {
-                one.end(why);
+            if one.count(lost, COUNT_AT_RESERVE) {
                 return true;
             }
         }
-        let grown = self.all.iter_mut().filter_map(|one| Some((one.watch.disk.growth()?, one)));
+        let grown = self.all.iter_mut().filter_map(|one| Some((one.growth()?, one)));
         match grown.max_by_key(|(growth, _)| *growth) {
             Some((growth, one)) if growth >= least => {
-                one.end(words(growth));
+                one.end_for_reserve(growth);
                 true
             }
             _ => false,
@@ -160,33 +125,13 @@ impl Table {
     /// Counts what simulations have written, in a tick that began at this processor time.
     fn count_folders(&mut self, begin: Duration) {
         let (lost, time) = (self.disk.lost, self.disk.pause().min(COUNT));
-        let mut due: Vec<&mut Watched> = self.all.iter_mut().filter(|one| one.watch.disk.is_due(lost)).collect();
-        due.sort_by_key(|one| one.watch.disk.counted);
+        let mut due: Vec<&mut DiskUse> = self.all.iter_mut().filter(|one| one.is_due(lost)).collect();
+        due.sort_by_key(|one| one.counted);
         for one in due {
             if processor_time().saturating_sub(begin) >= FOLDERS {
                 break;
             }
-            if let Some(why) = one.watch.disk.count(lost, time) {
-                one.end(why);
-            }
-        }
-    }
-
-    fn count_processes(&mut self) {
-        let is_counted =
-            |watch: &Watch| watch.processes.is_some() || watch.peak.as_ref().is_some_and(|peak| peak.is_of_tree());
-        let trees = self.all.iter().map(|one| &one.watch).filter(|watch| is_counted(watch));
-        let usages = usages(&trees.map(|watch| watch.disk.root).collect::<Vec<_>>());
-        for one in &mut self.all {
-            let usage = usages.get(&one.watch.disk.root);
-            one.watch.peak.iter().for_each(|peak| peak.look(usage));
-            if let (Some(limit), Some(usage)) = (one.watch.processes, usage)
-                && usage.threads > limit.saturating_add(one.watch.runners)
-            {
-                one.end(format!(
-                    "The simulation has more than {limit} processes and threads, the limit of this server (limits.processes)"
-                ));
-            }
+            one.count(lost, time);
         }
     }
 }
@@ -194,9 +139,4 @@ impl Table {
 /// CPU time of this thread. Time that a tick waits for a busy machine or its disk does not count.
 fn processor_time() -> Duration {
     clock_gettime(ClockId::CLOCK_THREAD_CPUTIME_ID).map(Duration::from).unwrap_or_default()
-}
-
-/// The pause after a tick with this CPU time.
-fn pause_after(tick: Duration) -> Duration {
-    (tick * PAUSE).clamp(SHORTEST, LONGEST)
 }

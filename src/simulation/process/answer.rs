@@ -15,20 +15,20 @@ const REQUEST: &[u8] = b"GET /robots.txt HTTP/1.0\r\nHost: localhost\r\n\r\n";
 const PAUSE: (Duration, Duration) = (Duration::from_millis(5), Duration::from_millis(500));
 /// The pause is such a part of the time since the start, so that many that start on a busy machine don't ask it all the time.
 const PART: u32 = 20;
-/// Timeout of the first request: the proxy may accept it before anything inside listens.
-const FIRST_TIMEOUT: Duration = Duration::from_millis(100);
-/// Longest timeout of later ones: Webots answers none while it reads a world.
-const TIMEOUT: Duration = Duration::from_secs(2);
+/// Bounds of the timeout of a request, which is the time since the start: the proxy may accept the first one before anything
+/// inside listens, and Webots answers none while it reads a world.
+const TIMEOUT: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(2));
 
 /// Waits until Webots is ready at this address. A container has to run: a request before it has its address holds all
 /// others up for a second, until the kernel asks for that address again.
 pub async fn until_answering(address: SocketAddr, is_forwarded: bool) {
-    let (begin, mut timeout) = (Instant::now(), FIRST_TIMEOUT);
+    let begin = Instant::now();
     loop {
+        let timeout = begin.elapsed().clamp(TIMEOUT.0, TIMEOUT.1);
         match actix_rt::time::timeout(timeout, answers(address, is_forwarded)).await {
             Ok(Ok(true)) => return,
             Ok(_) => actix_rt::time::sleep((begin.elapsed() / PART).clamp(PAUSE.0, PAUSE.1)).await,
-            Err(_) => timeout = TIMEOUT.min(timeout * 2),
+            Err(_) => {}
         }
     }
 }

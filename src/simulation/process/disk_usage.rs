@@ -1,32 +1,42 @@
-//! The size of the files below a directory, also while programs change it.
+//! The room that a disk has left, and what the files below a directory take of it, also while programs change them.
 
 use std::collections::HashSet;
 use std::fs::Metadata;
 use std::io::ErrorKind;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
-/// Adds up files. A large file with several names, or that is found again because it was moved, counts once.
+use nix::sys::statvfs::statvfs;
+
+/// The room that a disk has left for ordinary users.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct DiskRoom {
+    /// In bytes.
+    pub bytes: u64,
+    /// Free inodes. Some file systems make inodes as they need them, and report none.
+    pub inodes: u64,
+    /// All inodes.
+    all_inodes: u64,
+}
+
+/// Adds up files.
 pub struct DiskUsage {
     measure: fn(&Metadata) -> u64,
     /// Counting stops above this many bytes.
     enough: u64,
     /// When to stop counting.
-    until: Option<Instant>,
-    total: u64,
-    /// Device and inode of large files.
-    met: HashSet<(u64, u64)>,
+    pub until: Option<Instant>,
+    /// What was added up until now.
+    pub total: u64,
+    /// Device and inode of the files without a name.
+    nameless: HashSet<(u64, u64)>,
 }
 
 /// Least disk usage of a file or directory, in bytes.
 pub const SMALLEST: u64 = 4096;
-/// Files from this size on, in bytes, are tracked by inode.
-const LARGE: u64 = 64 * 1024;
-/// Limit of nested directories: the kernel resolves the whole path for each.
-const DEEPEST: usize = 200;
-/// How many entries of a folder are counted between two looks at the clock.
-const BETWEEN_CLOCKS: usize = 64;
+/// The least share of the disk's inodes that must be free: one in so many.
+const FREE_INODES: u64 = 50;
 
 /// What a file or folder takes of the disk. Holes take nothing.
 pub fn room(about: &Metadata) -> u64 {
@@ -38,29 +48,38 @@ pub fn length(about: &Metadata) -> u64 {
     if about.is_dir() { 0 } else { about.len() }
 }
 
+impl DiskRoom {
+    /// The room of the disk that a folder is on.
+    ///
+    /// # Errors
+    /// When the file system does not say.
+    pub fn of(folder: &Path) -> std::io::Result<Self> {
+        let disk = statvfs(folder)?;
+        let bytes = disk.blocks_available().saturating_mul(disk.fragment_size());
+        Ok(Self { bytes, inodes: disk.files_available(), all_inodes: disk.files() })
+    }
+
+    /// What is less than the reserve (in MiB), in words. Without the numbers that change with each call.
+    pub fn shortage(&self, reserve: u64) -> Option<String> {
+        if self.bytes >> 20 < reserve {
+            return Some(format!("{reserve} MiB are left (diskReserve)"));
+        }
+        (self.inodes < self.all_inodes / FREE_INODES).then(|| "2 % of its inodes are left".to_owned())
+    }
+}
+
 impl DiskUsage {
     /// Adds up by this measure, to no more than `enough`.
     pub fn new(measure: fn(&Metadata) -> u64, enough: u64) -> Self {
-        Self { measure, enough, until: None, total: 0, met: HashSet::new() }
-    }
-
-    /// Stops counting after this time.
-    pub fn within(mut self, time: Duration) -> Self {
-        self.until = Some(Instant::now() + time);
-        self
-    }
-
-    /// What was added up until now.
-    pub fn total(&self) -> u64 {
-        self.total
+        Self { measure, enough, until: None, total: 0, nameless: HashSet::new() }
     }
 
     /// Adds everything below a directory that there is time for. Symlinks are not followed. Returns whether no folder there was
-    /// closed to this server, or nested so deep that nobody would do that but on purpose.
+    /// closed to this server, or nested so deep that the system finds no path to it.
     pub fn add_folder(&mut self, folder: &Path) -> bool {
-        let mut open: Vec<(PathBuf, usize)> = vec![(folder.to_owned(), 0)];
+        let mut open: Vec<PathBuf> = vec![folder.to_owned()];
         let mut is_shown = true;
-        while let Some((folder, depth)) = open.pop().filter(|_| !self.is_late()) {
+        while let Some(folder) = open.pop() {
             let entries = match std::fs::read_dir(&folder) {
                 Ok(entries) => entries,
                 Err(error) => {
@@ -69,39 +88,32 @@ impl DiskUsage {
                     continue;
                 }
             };
-            for (number, entry) in entries.flatten().enumerate() {
-                if number % BETWEEN_CLOCKS == BETWEEN_CLOCKS - 1 && self.is_late() {
-                    return is_shown;
-                }
+            for entry in entries.flatten() {
                 let Ok(about) = entry.metadata() else { continue };
                 self.add(&about);
                 if self.total > self.enough {
                     return true;
                 }
+                if self.until.is_some_and(|until| Instant::now() >= until) {
+                    return is_shown;
+                }
                 if about.is_dir() {
-                    is_shown &= depth < DEEPEST;
-                    open.push((entry.path(), depth + 1));
+                    open.push(entry.path());
                 }
             }
         }
         is_shown
     }
 
-    /// Adds a file that has lost its names while a process has it open.
+    /// Adds a file that has lost its names while processes have it open: once, however many these are.
     pub fn add_nameless(&mut self, about: &Metadata) {
-        if self.met.insert((about.dev(), about.ino())) {
-            self.total = self.total.saturating_add((self.measure)(about));
+        if self.nameless.insert((about.dev(), about.ino())) {
+            self.add(about);
         }
     }
 
-    fn is_late(&self) -> bool {
-        self.until.is_some_and(|until| Instant::now() >= until)
-    }
-
     fn add(&mut self, about: &Metadata) {
-        let size = (self.measure)(about);
-        let is_new = size < LARGE || self.met.insert((about.dev(), about.ino()));
-        self.total = self.total.saturating_add(if is_new { size } else { SMALLEST });
+        self.total = self.total.saturating_add((self.measure)(about));
     }
 }
 
@@ -112,7 +124,7 @@ mod tests {
     fn size(folder: &Path, measure: fn(&Metadata) -> u64) -> u64 {
         let mut size = DiskUsage::new(measure, u64::MAX);
         assert!(size.add_folder(folder));
-        size.total()
+        size.total
     }
 
     #[test]
@@ -129,17 +141,6 @@ mod tests {
     }
 
     #[test]
-    fn a_large_file_with_several_names_counts_once() {
-        let folder = tempfile::tempdir().unwrap();
-        std::fs::write(folder.path().join("0"), vec![1; 1_000_000]).unwrap();
-        for name in 1..10 {
-            std::fs::hard_link(folder.path().join("0"), folder.path().join(name.to_string())).unwrap();
-        }
-        let bytes = size(folder.path(), room);
-        assert!((1_000_000 + 9 * SMALLEST..1_200_000).contains(&bytes), "{bytes}");
-    }
-
-    #[test]
     fn no_more_is_added_than_anybody_wants_to_know() {
         let folder = tempfile::tempdir().unwrap();
         for name in 0..100 {
@@ -147,6 +148,6 @@ mod tests {
         }
         let mut size = DiskUsage::new(room, 10 * SMALLEST);
         assert!(size.add_folder(folder.path()));
-        assert_eq!(size.total(), 11 * SMALLEST);
+        assert_eq!(size.total, 11 * SMALLEST);
     }
 }

@@ -1,26 +1,27 @@
-//! The directories of running simulations: guards that remove them on drop.
+//! The directories of running simulations: guards that remove them on drop, by the system's `rm`. It handles any depth,
+//! which a recursion in the server would not, and does not follow symlinks.
 
+use std::ffi::OsString;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use super::process_group::ExitReason;
 use super::process_tree;
-use super::remove_tree::remove_tree;
+use super::runner::Run;
 
 /// The directory of one run of the server: `runs/run-*` in `cacheDir`. It contains a directory for each simulation.
-pub struct RunDir {
-    folder: PathBuf,
-}
+pub struct RunDir(PathBuf);
 
 /// The directory of one simulation. Dropping it removes it with its contents.
 #[derive(Debug)]
-pub struct InstanceDir {
-    folder: PathBuf,
-}
+pub struct InstanceDir(PathBuf);
 
 /// Attempts to remove a directory before that is left to the next start, and the pause between two attempts.
 const TRIES: u32 = 60;
 const PAUSE: Duration = Duration::from_secs(1);
+/// Timeout of an attempt: a program that still runs may keep adding files.
+const LIMIT: Duration = Duration::from_mins(10);
 
 impl RunDir {
     /// Creates the directory of this run below `cache`, and removes what earlier runs have left there. Only for the
@@ -33,17 +34,16 @@ impl RunDir {
         std::fs::create_dir_all(&runs)?;
         // Marks of processes are compared with this path, so it must be canonical.
         let runs = runs.canonicalize()?;
-        let (mut dead, mut processes) = (0, 0);
+        let mut dead = 0;
         for run in std::fs::read_dir(&runs)?.flatten() {
             dead += 1;
-            processes += process_tree::kill_marked(&run.path());
+            process_tree::kill_marked(&run.path());
             remove(&run.path());
         }
         if dead > 0 {
-            log::warn!("removed what {dead} earlier runs had left, {processes} processes among it");
+            log::warn!("removed what {dead} earlier runs had left");
         }
-        let folder = tempfile::Builder::new().prefix("run-").tempdir_in(&runs)?.keep();
-        Ok(Self { folder })
+        Ok(Self(tempfile::Builder::new().prefix("run-").tempdir_in(&runs)?.keep()))
     }
 
     /// Creates a directory for a simulation, with the directory of its project inside.
@@ -52,69 +52,120 @@ impl RunDir {
     /// When a directory can't be created.
     pub fn instance(&self) -> io::Result<InstanceDir> {
         // The directory of the run may have been removed.
-        std::fs::create_dir_all(&self.folder)?;
-        let folder = tempfile::Builder::new().prefix("instance-").tempdir_in(&self.folder)?.keep();
-        let instance = InstanceDir { folder };
+        std::fs::create_dir_all(&self.0)?;
+        let instance = InstanceDir(tempfile::Builder::new().prefix("instance-").tempdir_in(&self.0)?.keep());
         std::fs::create_dir(instance.project())?;
         Ok(instance)
     }
 
     /// The folder itself.
     pub fn path(&self) -> &Path {
-        &self.folder
+        &self.0
     }
 
     /// Removes the directory with its contents.
     pub fn remove(&self) {
-        remove(&self.folder);
-    }
-}
-
-impl Drop for RunDir {
-    fn drop(&mut self) {
-        self.remove();
+        remove(&self.0);
     }
 }
 
 impl InstanceDir {
+    /// The name of the project's directory in that of an instance.
+    pub const PROJECT: &str = "project";
+
     /// The folder itself.
     pub fn path(&self) -> &Path {
-        &self.folder
+        &self.0
     }
 
     /// The directory of the project. It is created with the instance: if it were created later, that could happen after
     /// the instance was removed.
     pub fn project(&self) -> PathBuf {
-        self.folder.join("project")
+        self.0.join(Self::PROJECT)
     }
 }
 
 impl Drop for InstanceDir {
     fn drop(&mut self) {
         // A project may contain many files, and this may run on an actor's thread.
-        let folder = std::mem::take(&mut self.folder);
+        let folder = std::mem::take(&mut self.0);
         let shown = folder.display().to_string();
-        if let Err(error) = std::thread::Builder::new().spawn(move || remove_patiently(&folder)) {
+        let remove = move || {
+            // A machine without free files or processes for `rm` may recover.
+            for _ in 1..TRIES {
+                if remove_tree(&folder).is_ok() {
+                    return;
+                }
+                std::thread::sleep(PAUSE);
+            }
+            remove(&folder);
+        };
+        if let Err(error) = std::thread::Builder::new().spawn(remove) {
             log::error!("{shown} is left to the next start: no thread for its removal: {error}");
         }
     }
-}
-
-/// Removes a directory, and retries each second for a minute: a machine without free files or processes for `rm` may
-/// recover. Blocks: only for threads of their own.
-fn remove_patiently(folder: &Path) {
-    for _ in 0..TRIES {
-        if remove_tree(folder).is_ok() {
-            return;
-        }
-        std::thread::sleep(PAUSE);
-    }
-    remove(folder);
 }
 
 /// Removes a directory. What can't be removed is logged, and left to the next start. Blocks.
 pub fn remove(folder: &Path) {
     if let Err(error) = remove_tree(folder) {
         log::error!("{} can't be removed: {error}", folder.display());
+    }
+}
+
+/// Removes a directory, if it is there. Blocks.
+///
+/// # Errors
+/// When something in it can't be removed, or after ten minutes.
+pub fn remove_tree(folder: &Path) -> io::Result<()> {
+    run(&["rm", "-rf", "--"], folder).or_else(|_| {
+        // A world's program may have removed the write permission of its directories.
+        run(&["chmod", "-R", "u+rwX", "--"], folder).ok();
+        run(&["rm", "-rf", "--"], folder)
+    })
+}
+
+fn run(words: &[&str], folder: &Path) -> io::Result<()> {
+    let command = words.iter().map(OsString::from).chain([folder.into()]);
+    let mut complaint = String::new();
+    // Its mark is not that of a run: ending a run does not kill it.
+    let ran = Run::new(command, Path::new("/"), LIMIT).blocking(|line| complaint = line);
+    let ran = ran.map_err(|error| io::Error::other(format!("{} {error}", words.join(" "))))?;
+    if ran.ending == ExitReason::Code(0) { Ok(()) } else { Err(io::Error::other(complaint)) }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::PermissionsExt;
+
+    use nix::sys::stat::Mode;
+
+    use super::*;
+
+    #[test]
+    fn links_are_removed_and_not_followed() {
+        let place = tempfile::tempdir().unwrap();
+        let (folder, other) = (place.path().join("folder"), place.path().join("other"));
+        std::fs::create_dir_all(folder.join("inside")).unwrap();
+        std::fs::create_dir(&other).unwrap();
+        std::fs::write(other.join("kept"), "").unwrap();
+        std::os::unix::fs::symlink(&other, folder.join("link")).unwrap();
+        std::os::unix::fs::symlink(&other, folder.join("inside/link")).unwrap();
+        nix::unistd::mkfifo(&folder.join("inside/pipe"), Mode::S_IRWXU).unwrap();
+        remove_tree(&folder).unwrap();
+        assert!(!folder.exists() && other.join("kept").exists());
+    }
+
+    #[test]
+    fn locked_folders_are_removed() {
+        let place = tempfile::tempdir().unwrap();
+        let folder = place.path().join("folder");
+        std::fs::create_dir_all(folder.join("a/b/c")).unwrap();
+        for (locked, mode) in [("a/b/c", 0o000), ("a/b", 0o300), ("a", 0o500)] {
+            std::fs::write(folder.join(locked).join("file"), "").unwrap();
+            std::fs::set_permissions(folder.join(locked), std::fs::Permissions::from_mode(mode)).unwrap();
+        }
+        remove_tree(&folder).unwrap();
+        assert!(!folder.exists());
     }
 }

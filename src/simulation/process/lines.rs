@@ -3,24 +3,20 @@
 use crate::shared::text::one_line;
 
 /// The incomplete last line of an output.
-pub struct Lines {
-    line: Vec<u8>,
-    longest: usize,
-}
+#[derive(Default)]
+pub struct Lines(Vec<u8>);
+
+/// So many bytes are kept of a line.
+const LONGEST: usize = 1000;
 
 impl Lines {
-    /// For an output of whose lines so many bytes are kept; the rest of a longer one is left out.
-    pub fn new(longest: usize) -> Self {
-        Self { line: Vec::new(), longest }
-    }
-
     /// Passes on each line that ends in these bytes, made printable; also lines that the program overwrites (`\r`).
     /// Empty lines are dropped.
     pub fn feed(&mut self, bytes: &[u8], mut told: impl FnMut(String)) {
         for byte in bytes {
             match byte {
                 b'\r' | b'\n' => self.end(&mut told),
-                _ if self.line.len() < self.longest => self.line.push(*byte),
+                _ if self.0.len() < LONGEST => self.0.push(*byte),
                 _ => {}
             }
         }
@@ -28,8 +24,8 @@ impl Lines {
 
     /// Passes on the line in which the output ended, if there is one.
     pub fn end(&mut self, mut told: impl FnMut(String)) {
-        let text = one_line(String::from_utf8_lossy(&self.line).trim_end());
-        self.line.clear();
+        let text = one_line(String::from_utf8_lossy(&self.0).trim_end());
+        self.0.clear();
         if !text.is_empty() {
             told(text);
         }
@@ -48,11 +44,11 @@ mod tests {
             bytes in prop::collection::vec(prop_oneof![3 => any::<u8>(), 1 => Just(b'\n'), 1 => Just(0x1b)], 0..4000),
             size in 1_usize..64,
         ) {
-            let (mut lines, mut told) = (Lines::new(50), Vec::new());
+            let (mut lines, mut told) = (Lines::default(), Vec::new());
             bytes.chunks(size).for_each(|chunk| lines.feed(chunk, |line| told.push(line)));
             lines.end(|line| told.push(line));
             for line in &told {
-                prop_assert!(!line.chars().any(char::is_control) && line.chars().count() <= 50, "{line:?}");
+                prop_assert!(!line.chars().any(char::is_control) && line.chars().count() <= LONGEST, "{line:?}");
             }
             let breaks = bytes.split(|byte| b"\r\n".contains(byte)).count();
             prop_assert!(told.len() <= breaks, "{} lines of {breaks}", told.len());
@@ -61,12 +57,13 @@ mod tests {
 
     #[test]
     fn lines_come_whole_whatever_the_parts_they_are_read_in() {
-        let text: &[u8] = b"Step 1/2 : FROM a\r\n\x1b[31mred\n\n10%\r20%\nlonger than it may be\nlast";
+        let long = "x".repeat(LONGEST);
+        let text = format!("Step 1/2 : FROM a\r\n\x1b[31mred\n\n10%\r20%\n{long} and more\nlast");
         for size in 1..text.len() {
-            let (mut lines, mut told) = (Lines::new(17), Vec::new());
-            text.chunks(size).for_each(|chunk| lines.feed(chunk, |line| told.push(line)));
+            let (mut lines, mut told) = (Lines::default(), Vec::new());
+            text.as_bytes().chunks(size).for_each(|chunk| lines.feed(chunk, |line| told.push(line)));
             lines.end(|line| told.push(line));
-            assert_eq!(told, ["Step 1/2 : FROM a", " [31mred", "10%", "20%", "longer than it ma", "last"]);
+            assert_eq!(told, ["Step 1/2 : FROM a", " [31mred", "10%", "20%", &long, "last"]);
         }
     }
 }

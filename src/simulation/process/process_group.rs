@@ -63,19 +63,17 @@ pub struct ProcessGroup {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ExitReason {
     /// With this exit code.
-    Code(u8),
+    Code(i32),
     /// By this signal.
-    Signal(u8),
+    Signal(i32),
     /// It could not be started: a launcher did not find it.
     NotStarted,
-    /// The system does not report it.
-    Unknown,
 }
 
 /// Exit code of a launcher (a shell, `env`, `nice`) that does not find its program.
-const NOT_FOUND: u8 = 127;
+const NOT_FOUND: i32 = 127;
 /// Offset that bubblewrap adds to the number of the signal that has ended its program.
-const SIGNALLED: u8 = 128;
+const SIGNALLED: i32 = 128;
 /// Timeout of killed processes until they have exited.
 const VANISH: Duration = Duration::from_secs(1);
 /// Interval between two checks whether the group is empty.
@@ -105,7 +103,7 @@ impl ProcessGroup {
         let child = command.stdin(Stdio::null()).stdout(output).stderr(errors).spawn()?;
         let leader = child.id().and_then(|id| i32::try_from(id).ok()).ok_or(std::io::ErrorKind::Other)?;
         let (terminate, asked) = oneshot::channel();
-        let group = KillOnDrop { leader: Some(Pid::from_raw(leader)), wrappers: spec.wrappers };
+        let group = KillOnDrop { leader: Pid::from_raw(leader), wrappers: spec.wrappers };
         let ended = wait(group, child, asked, spec.grace);
         Ok((Self { leader, terminate: Some(terminate) }, ended))
     }
@@ -126,7 +124,7 @@ impl ProcessGroup {
 
 /// Waits for the end of a program. `asked` receives the request for an orderly end; if its sender is dropped without
 /// one, the group is killed at once.
-async fn wait(mut group: KillOnDrop, mut child: Child, asked: oneshot::Receiver<()>, grace: Duration) -> ExitReason {
+async fn wait(group: KillOnDrop, mut child: Child, asked: oneshot::Receiver<()>, grace: Duration) -> ExitReason {
     let status = tokio::select! {
         status = child.wait() => status,
         asked = asked => {
@@ -145,45 +143,41 @@ async fn wait(mut group: KillOnDrop, mut child: Child, asked: oneshot::Receiver<
     };
     group.signal(Signal::SIGKILL);
     actix_rt::time::timeout(VANISH, group.emptied()).await.ok();
+    // The system always tells how a child has ended.
+    let reason = ExitReason::of(status.unwrap_or_default(), group.wrappers > 0);
     // The id of an empty group may be reused.
-    group.leader = None;
-    status.map_or(ExitReason::Unknown, |status| ExitReason::of(status, group.wrappers > 0))
+    std::mem::forget(group);
+    reason
 }
 
 /// Kills a process group when it is dropped.
 struct KillOnDrop {
-    leader: Option<Pid>,
+    leader: Pid,
     wrappers: usize,
 }
 
 impl KillOnDrop {
     fn signal(&self, signal: Signal) {
-        if let Some(group) = self.leader {
-            // The only possible error is that the group is empty, as intended.
-            killpg(group, signal).ok();
-        }
+        // The only possible error is that the group is empty, as intended.
+        killpg(self.leader, signal).ok();
     }
 
     /// Sends SIGTERM to what is really run. Its wrappers must not get it: they would end at once, and all that is inside with
     /// them.
     fn ask_to_end(&self) {
-        let Some(leader) = self.leader.filter(|_| self.wrappers > 0) else {
-            return self.signal(Signal::SIGTERM);
-        };
-        let mut inside = vec![leader.as_raw()];
+        let mut inside = vec![self.leader.as_raw()];
         for _ in 0..self.wrappers {
             inside = inside.into_iter().flat_map(process_tree::children).collect();
         }
-        let is_asked = inside.into_iter().any(|child| killpg(Pid::from_raw(child), Signal::SIGTERM).is_ok());
-        if !is_asked {
-            // bubblewrap has not started anything yet.
-            self.signal(Signal::SIGKILL);
+        for leader in inside {
+            // The only possible error is that its group is empty, as intended.
+            killpg(Pid::from_raw(leader), Signal::SIGTERM).ok();
         }
     }
 
     /// Waits until the group is empty.
     async fn emptied(&self) {
-        while self.leader.is_some_and(|group| killpg(group, None) != Err(Errno::ESRCH)) {
+        while killpg(self.leader, None) != Err(Errno::ESRCH) {
             actix_rt::time::sleep(POLL).await;
         }
     }
@@ -198,12 +192,11 @@ impl Drop for KillOnDrop {
 impl ExitReason {
     /// How a program ended. bubblewrap reports a signal as shells do: 128 plus its number.
     fn of(status: ExitStatus, in_sandbox: bool) -> Self {
-        let signal = status.signal().and_then(|number| u8::try_from(number).ok());
-        match u8::try_from(status.code().unwrap_or_default()).unwrap_or_default() {
-            _ if signal.is_some() => Self::Signal(signal.unwrap_or_default()),
-            NOT_FOUND => Self::NotStarted,
-            code if in_sandbox && code > SIGNALLED => Self::Signal(code - SIGNALLED),
-            code => Self::Code(code),
+        match (status.signal(), status.code().unwrap_or_default()) {
+            (Some(signal), _) => Self::Signal(signal),
+            (None, NOT_FOUND) => Self::NotStarted,
+            (None, code) if in_sandbox && code > SIGNALLED => Self::Signal(code - SIGNALLED),
+            (None, code) => Self::Code(code),
         }
     }
 }
@@ -211,14 +204,13 @@ impl ExitReason {
 impl fmt::Display for ExitReason {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Code(0) => out.write_str("ended"),
+            Self::Code(0) => out.write_str("has ended"),
             Self::Code(code) => write!(out, "ended with exit code {code}"),
             Self::NotStarted => out.write_str("could not be started"),
-            Self::Unknown => out.write_str("has ended, the system does not tell how"),
-            Self::Signal(number) => match Signal::try_from(i32::from(*number)) {
-                Ok(signal) => write!(out, "was ended by the signal {signal}"),
-                Err(_) => write!(out, "was ended by signal {number}"),
-            },
+            Self::Signal(number) => {
+                let name = Signal::try_from(*number).map_or("of an unknown name", Signal::as_str);
+                write!(out, "was ended by the signal {name}")
+            }
         }
     }
 }

@@ -1,13 +1,11 @@
 //! The process trees of simulations: how to find their processes, and how to kill those of a run that has ended. Linux:
 //! `/proc`.
 
-use std::collections::HashSet;
 use std::ffi::OsStr;
-use std::fs::{File, Metadata};
-use std::io::{ErrorKind, Read};
-use std::os::unix::ffi::OsStrExt;
+use std::fs::Metadata;
+use std::io::ErrorKind;
 use std::os::unix::fs::MetadataExt;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::Duration;
 
 use nix::sys::signal::{Signal, kill, killpg};
@@ -38,12 +36,10 @@ pub fn children(pid: i32) -> Vec<i32> {
 }
 
 /// Kills every process that has the mark of an instance below `folder`, and the groups that such processes lead.
-/// Returns the number of marked processes.
 ///
 /// It looks until it has found none twice in a row: a process may have forked meanwhile, and one that is just executing
 /// another program has no environment for a moment. Blocks for 5 ms at least, for some seconds at most.
-pub fn kill_marked(folder: &Path) -> usize {
-    let mut known = HashSet::new();
+pub fn kill_marked(folder: &Path) {
     let mut found_none = false;
     for _ in 0..MOST_SCANS {
         let found = marked(folder);
@@ -51,41 +47,29 @@ pub fn kill_marked(folder: &Path) -> usize {
             break;
         }
         found_none = found.is_empty();
-        for process in found {
-            let pid = Pid::from_raw(process.pid());
+        for pid in found {
             // The only possible error is that the process has exited, as intended.
             if getpgid(Some(pid)) == Ok(pid) {
                 killpg(pid, Signal::SIGKILL).ok();
             } else {
                 kill(pid, Signal::SIGKILL).ok();
             }
-            known.insert(process.pid());
         }
         std::thread::sleep(BETWEEN_SCANS);
     }
-    known.len()
 }
 
 /// Largest number of scans for marked processes.
 const MOST_SCANS: usize = 200;
 /// Pause between two scans: killed processes need a moment to exit.
 const BETWEEN_SCANS: Duration = Duration::from_millis(5);
-/// Limit of what is read of a process's environment, in bytes: a process can set any size.
-const ENVIRONMENT: u64 = 128 * 1024;
 
-fn marked(folder: &Path) -> Vec<Process> {
-    let carries_mark = |process: &Process| mark(process.pid()).is_some_and(|mark| mark.starts_with(folder));
-    all_processes().into_iter().flatten().flatten().filter(carries_mark).collect()
-}
-
-/// The mark of a process. A zombie has no environment.
-fn mark(pid: i32) -> Option<PathBuf> {
-    let mut environment = Vec::new();
-    File::open(format!("/proc/{pid}/environ")).ok()?.take(ENVIRONMENT).read_to_end(&mut environment).ok()?;
-    let mut variables = environment.split(|byte| *byte == 0);
-    variables
-        .find_map(|one| one.strip_prefix(MARK.as_bytes())?.strip_prefix(b"="))
-        .map(|mark| OsStr::from_bytes(mark).into())
+/// The processes with the mark of an instance below `folder`. A zombie has no environment.
+fn marked(folder: &Path) -> Vec<Pid> {
+    let mark = |process: &Process| process.environ().ok()?.remove(OsStr::new(MARK));
+    let is_marked = |process: &Process| mark(process).is_some_and(|mark| Path::new(&mark).starts_with(folder));
+    let marked = all_processes().into_iter().flatten().flatten().filter(is_marked);
+    marked.map(|process| Pid::from_raw(process.pid())).collect()
 }
 
 /// The files that a process has open and that have lost their names. `None` if it hides what it has open.
@@ -107,31 +91,4 @@ pub fn nameless_files(pid: i32) -> Option<Vec<Metadata>> {
 /// Whether a process has not ended. One that has, and was not waited for, shows its files to nobody.
 fn is_running(pid: i32) -> bool {
     Process::new(pid).and_then(|process| process.stat()).is_ok_and(|stat| !matches!(stat.state, 'Z' | 'X'))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use std::process::Command;
-
-    #[test]
-    fn no_more_is_read_of_an_environment_than_is_allowed() {
-        let folder = tempfile::tempdir().unwrap();
-        let mark = folder.path().join("instance");
-        let found = |size: usize| {
-            let mut sleep = Command::new("sleep");
-            // Variables are sorted by name.
-            sleep.arg("100").env_clear().env("PATH", "/usr/bin:/bin").env(MARK, &mark);
-            for name in ["A", "B", "C"] {
-                sleep.env(name, "x".repeat(size));
-            }
-            let mut sleep = sleep.spawn().unwrap();
-            let found = marked(folder.path()).len();
-            sleep.kill().unwrap();
-            sleep.wait().unwrap();
-            found
-        };
-        assert_eq!(found(1000), 1);
-        assert_eq!(found(50_000), 0, "the mark comes after 128 KiB");
-    }
 }

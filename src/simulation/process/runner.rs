@@ -1,4 +1,6 @@
 //! Runs a program to its end: without a shell, within limits. Dropping the future kills it.
+//!
+//! Also runs other work on a thread of its own, which programs that it runs may block.
 
 use std::ffi::OsString;
 use std::io;
@@ -9,6 +11,8 @@ use futures_util::FutureExt;
 use rustix::process::{Pid, Resource, Rlimit, prlimit, setpriority_process};
 use tokio::io::{AsyncRead, AsyncReadExt};
 use tokio::net::unix::pipe::Receiver;
+use tokio::runtime::Builder;
+use tokio_util::sync::CancellationToken;
 
 use super::lines::Lines;
 use super::process_group::{ExitReason, ProcessGroup, SpawnSpec};
@@ -21,8 +25,6 @@ pub struct Run {
     pub time: Duration,
     /// Size limit of its answer, in bytes. Where it is 0, there is none: its standard output is told with its errors.
     pub answer: u64,
-    /// Longest line that is kept, in bytes.
-    pub line: usize,
     /// Resource limits of it and its children. They apply a moment after the start.
     pub limits: Vec<(Resource, u64)>,
     /// Its niceness.
@@ -64,7 +66,7 @@ impl Run {
     /// A program of the server's own with its arguments, in the server's environment and with this mark.
     pub fn new<A: Into<OsString>>(command: impl IntoIterator<Item = A>, mark: &Path, time: Duration) -> Self {
         let spec = SpawnSpec::new(command.into_iter().map(Into::into).collect(), mark);
-        Self { spec, time, answer: 1 << 20, line: 1000, limits: Vec::new(), niceness: 0, may_block: false }
+        Self { spec, time, answer: 1 << 20, limits: Vec::new(), niceness: 0, may_block: false }
     }
 
     /// The same as [`Self::run`], but blocks the calling thread.
@@ -74,7 +76,7 @@ impl Run {
     pub fn blocking(mut self, told: impl FnMut(String) + Send) -> Result<Ran, RunError> {
         self.may_block = true;
         let run = || {
-            let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+            let runtime = Builder::new_current_thread().enable_all().build()?;
             runtime.block_on(self.run(told))
         };
         // The calling thread may have a runtime already.
@@ -89,7 +91,7 @@ impl Run {
     /// # Errors
     /// When it can't be started, or is killed because it exceeds a limit.
     pub async fn run(self, told: impl FnMut(String)) -> Result<Ran, RunError> {
-        let Self { spec, time, answer: most, line, limits, niceness, may_block } = self;
+        let Self { spec, time, answer: most, limits, niceness, may_block } = self;
         let ((output, mut answer), (said, errors)) = (io::pipe()?, io::pipe()?);
         if most == 0 {
             answer = errors.try_clone()?;
@@ -113,12 +115,32 @@ impl Run {
             output.take(most + 1).read_to_end(&mut answer).await.ok();
             answer
         };
-        let all = async { tokio::join!(answer, tell(said, line, told), ended) };
+        let all = async { tokio::join!(answer, tell(said, told), ended) };
         let Ok((answer, (), ending)) = actix_rt::time::timeout(time, all).await else {
             return Err(RunError::Slow(time));
         };
         if answer.len() as u64 > most { Err(RunError::TooLong) } else { Ok(Ran { ending, answer }) }
     }
+}
+
+/// Runs a future on a thread of the blocking pool, in a runtime of its own. On a busy machine each step of a future waits
+/// until its thread gets a core: here they do not wait for the steps of others. Dropping the returned future drops it.
+///
+/// # Errors
+/// When there is no thread or runtime for it, or it panics.
+pub async fn on_own_thread<T, F>(work: impl FnOnce() -> F + Send + 'static) -> io::Result<T>
+where
+    T: Send + 'static,
+    F: Future<Output = T>,
+{
+    let dropped = CancellationToken::new();
+    let _guard = dropped.clone().drop_guard();
+    let run = move || {
+        let runtime = Builder::new_current_thread().enable_all().build()?;
+        let done = runtime.block_on(dropped.run_until_cancelled_owned(work()));
+        done.ok_or_else(|| io::ErrorKind::Interrupted.into())
+    };
+    actix_rt::task::spawn_blocking(run).await?
 }
 
 /// Limits a program that has just been started. Its children inherit the limits.
@@ -134,8 +156,8 @@ fn bound(leader: i32, limits: &[(Resource, u64)], niceness: i32) {
 }
 
 /// Passes on each line, made printable; also lines that the program overwrites.
-async fn tell(mut said: impl AsyncRead + Unpin, longest: usize, mut told: impl FnMut(String)) {
-    let (mut lines, mut chunk) = (Lines::new(longest), vec![0; CHUNK.0]);
+async fn tell(mut said: impl AsyncRead + Unpin, mut told: impl FnMut(String)) {
+    let (mut lines, mut chunk) = (Lines::default(), vec![0; CHUNK.0]);
     while let Ok(length @ 1..) = said.read(&mut chunk).await {
         let mut pauses = u32::from(length == CHUNK.0) * LINES;
         lines.feed(chunk.get(..length).unwrap_or_default(), |line| {
@@ -196,7 +218,7 @@ mod tests {
     async fn short_lines_without_end_are_read_at_their_pace() {
         let begin = Instant::now();
         let mut number = 0;
-        tell("x\n".repeat(10_000).as_bytes(), 10, |_| number += 1).await;
+        tell("x\n".repeat(10_000).as_bytes(), |_| number += 1).await;
         assert_eq!(number, 10_000);
         assert!(begin.elapsed() > Duration::from_millis(500), "{:?}", begin.elapsed());
     }

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use actix::prelude::*;
 
 use super::event::WebotsEvent;
-use super::webots::{IdleEnd, Webots};
+use super::webots::Webots;
 use crate::simulation::ends::EndReason;
 
 /// Time between the notice to the client and the end; at most half of `idleTimeout`.
@@ -21,7 +21,7 @@ pub struct Keep;
 impl Webots {
     /// Records that the simulation was used: if it is paused now, its `idleTimeout` begins.
     pub(super) fn used(&mut self, ctx: &mut Context<Self>) {
-        if let Some(IdleEnd { timer, is_announced }) = self.idle_end.take() {
+        if let Some((timer, is_announced)) = self.idle_end.take() {
             ctx.cancel_future(timer);
             if is_announced {
                 self.send(WebotsEvent::IdleEnd(None));
@@ -38,9 +38,9 @@ impl Webots {
             let timer = ctx.run_later(notice, move |this, _| {
                 this.stop(EndReason::Idle, &format!("The simulation was paused for {minutes} minutes"));
             });
-            this.idle_end = Some(IdleEnd { timer, is_announced: true });
+            this.idle_end = Some((timer, true));
         });
-        self.idle_end = Some(IdleEnd { timer, is_announced: false });
+        self.idle_end = Some((timer, false));
     }
 }
 

@@ -1,39 +1,16 @@
-//! Prepares the target on which a Webots runs, starts its process there, and waits until its whole process tree has ended.
+//! Starts the process of a Webots, on the machine or in containers, and waits until its whole process tree has ended.
 
-use std::future::Future;
-use std::path::PathBuf;
-use std::sync::Arc;
 use std::time::Duration;
 
 use actix::prelude::*;
 
 use super::launch_spec::LaunchSpec;
 use super::output::{self, OutputEvent, Tail};
-use crate::shared::run::RotatedFile;
-use crate::simulation::container::{Cause, SimulationContainers, StartError};
-use crate::simulation::ends::{FOLDER_OF_RUNNING, Taken};
-use crate::simulation::isolation::{Display, Peak};
+use crate::shared::run::{RotatedFile, seconds_since_1970};
+use crate::simulation::container::{Cause, SimulationContainers};
+use crate::simulation::ends::{EndReason, FOLDER_OF_RUNNING, Taken};
 use crate::simulation::process::{ExitReason, ProcessGroup};
-
-/// The target on which a Webots runs.
-pub enum LaunchTarget {
-    /// The machine, with this display.
-    Machine(Display),
-    /// Containers.
-    Containers(Box<SimulationContainers>),
-}
-
-/// A Webots that was started.
-pub struct Launched {
-    /// Its processes.
-    pub group: ProcessGroup,
-    /// The last lines of its output.
-    pub tail: Tail,
-    /// The file of its output.
-    pub log: Option<PathBuf>,
-    /// Records its usage, if it has no control group of its own.
-    pub peak: Option<Arc<Peak>>,
-}
+use crate::simulation::snapshot::Stage;
 
 /// How a Webots has ended.
 #[derive(Debug)]
@@ -51,38 +28,16 @@ const MAX_LOG: u64 = 500_000;
 /// Timeout of reading the rest of an output.
 const LAST_OUTPUT: Duration = Duration::from_secs(1);
 
-impl LaunchTarget {
-    /// Prepares the target of a Webots: containers, a display of its own, or nothing. `progress` receives each step as text.
-    /// Dropping the future discards what was created. Its error says why it failed, and whether the project or this server
-    /// is the cause.
-    pub fn prepare<P: Fn(String) + Send + Sync + 'static>(
-        spec: &LaunchSpec,
-        progress: P,
-    ) -> impl Future<Output = Result<Self, StartError>> + use<P> {
-        let containers = spec.containers.as_ref().map(|containers| (Arc::clone(containers), spec.request()));
-        let (xvfb, display, instance) = (spec.config.xvfb, spec.display(), spec.project.instance.path().to_owned());
-        async move {
-            if let Some((containers, request)) = containers {
-                let mut prepared = containers.prepare(request, &progress).await?;
-                prepared.start_others().await?;
-                return Ok(Self::Containers(Box::new(prepared)));
-            }
-            let display = if xvfb { Display::new_virtual(&instance) } else { Ok(Display::Outside(display)) };
-            let failed = |error| StartError::Server(format!("The virtual display (Xvfb) can't be started: {error}"));
-            display.map(Self::Machine).map_err(failed)
-        }
-    }
-}
-
-/// Starts a Webots on its target. The future resolves when its whole process tree has ended.
+/// Starts a Webots in these containers, or else on the machine. Returns its processes and the last lines of its output. The
+/// future resolves when its whole process tree has ended.
 ///
 /// # Errors
 /// When a process, a thread or a directory can't be created.
 pub fn launch(
     spec: &LaunchSpec,
-    target: LaunchTarget,
+    containers: Option<SimulationContainers>,
     events: Recipient<OutputEvent>,
-) -> std::io::Result<(Launched, impl Future<Output = End> + use<>)> {
+) -> std::io::Result<(ProcessGroup, Tail, impl Future<Output = End> + use<>)> {
     let folder = spec.config.log_dir.0.join("simulation").join(FOLDER_OF_RUNNING);
     let log = folder.join(format!("{}.log", spec.slot.lease.id()));
     let file = RotatedFile::open(&log, MAX_LOG, "").inspect_err(|error| {
@@ -93,38 +48,79 @@ pub fn launch(
     let (reader, output) = std::io::pipe()?;
     let (tail, all_read) = output::follow(reader, spec.config.limits.output << 10, file.ok(), events)?;
     let errors = output.try_clone()?;
-    let (process, cgroup) = match &target {
-        LaunchTarget::Containers(containers) => (containers.spawn_spec(spec.config.timing.grace), None),
-        LaunchTarget::Machine(display) => spec.spawn_spec(display)?,
+    let (process, cgroup) = match &containers {
+        Some(containers) => (containers.spawn_spec(spec.config.timing.grace), None),
+        None => spec.spawn_spec()?,
     };
     let (group, ended) = ProcessGroup::start(&process, output.into(), errors.into())?;
-    let peak = cgroup.is_none().then(|| peak_of(&target));
-    let seen = peak.clone();
+    let pid = group.leader();
+    spec.slot.lease.update(move |one| {
+        (one.stage, one.launched) = (Stage::Launching, Some(seconds_since_1970()));
+        (one.pid, one.log) = (Some(pid), log);
+    });
     let ended = async move {
         let reason = ended.await;
         let mut in_container = None;
-        if let LaunchTarget::Containers(containers) = target {
+        if let Some(containers) = containers {
             in_container = containers.cause(reason).await;
             containers.remove().await;
         }
         // This ends also what has left the process group.
         let (on_machine, taken) = match cgroup {
             Some(cgroup) => actix_rt::task::spawn_blocking(move || cgroup.end()).await.unwrap_or_default(),
-            None => (false, seen.map(|peak| peak.taken()).unwrap_or_default()),
+            None => (false, Taken::default()),
         };
         // The last output shows the cause. A process that can't be killed may keep the pipe open.
         actix_rt::time::timeout(LAST_OUTPUT, all_read).await.ok();
         End { reason, cause: in_container.or(on_machine.then_some(Cause::OutOfMemory)), taken }
     };
-    Ok((Launched { group, tail, log, peak }, ended))
+    Ok((group, tail, ended))
 }
 
-/// Hears what a Webots takes that runs on this.
-fn peak_of(target: &LaunchTarget) -> Arc<Peak> {
-    let LaunchTarget::Containers(containers) = target else { return Arc::default() };
-    let (ids, peak) = (containers.ids(), Arc::new(Peak::of_containers()));
-    let named = Arc::clone(&peak);
-    // Its start does not wait for that.
-    actix_rt::spawn(async move { named.name_containers(ids.await) });
-    peak
+impl End {
+    /// Its kind, and the reason as text, of one that was not stopped; `was_ready` tells whether it had listened.
+    pub fn verdict(&self, was_ready: bool) -> (EndReason, String) {
+        let kind = match (self.cause, self.reason) {
+            (Some(cause), _) if cause.is_own() => EndReason::Fault,
+            (Some(_), _) => EndReason::Limit,
+            (None, ExitReason::Code(0)) => EndReason::Finished,
+            (None, _) if was_ready => EndReason::Crashed,
+            (None, _) => EndReason::NoWebots,
+        };
+        let why = match self.cause {
+            Some(cause) => words(cause).to_owned(),
+            None => format!("Webots {}", self.reason),
+        };
+        (kind, why)
+    }
+}
+
+/// The cause of a container's end, as text for the client.
+fn words(cause: Cause) -> &'static str {
+    match cause {
+        Cause::OutOfMemory => "The simulation has taken more memory than it may (limits.memory)",
+        Cause::NotStarted => "Docker can't start the simulation's container on this simulation server",
+        Cause::Docker => "Docker has stopped on this simulation server, and all simulations in it have ended",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_end_has_its_kind() {
+        let end = |reason, cause| End { reason, cause, taken: Taken::default() };
+        let (ok, killed) = (ExitReason::Code(0), ExitReason::Signal(9));
+        for (end, was_ready, kind, words) in [
+            (end(ok, None), true, EndReason::Finished, "Webots has ended"),
+            (end(killed, None), true, EndReason::Crashed, "Webots was ended by the signal SIGKILL"),
+            (end(ExitReason::Code(3), None), false, EndReason::NoWebots, "Webots ended with exit code 3"),
+            (end(ExitReason::NotStarted, None), false, EndReason::NoWebots, "Webots could not be started"),
+            (end(killed, Some(Cause::OutOfMemory)), true, EndReason::Limit, super::words(Cause::OutOfMemory)),
+            (end(ok, Some(Cause::Docker)), true, EndReason::Fault, super::words(Cause::Docker)),
+        ] {
+            assert_eq!(end.verdict(was_ready), (kind, words.to_owned()), "{end:?}");
+        }
+    }
 }

@@ -1,15 +1,13 @@
 //! A running Webots: its command line, its output, and its actor.
 
-mod command;
 mod event;
 mod idleness;
 mod launch_spec;
 mod launched;
 mod output;
-mod verdict;
 mod webots;
 
 pub use event::{WebotsEvent, WebotsExit};
 pub use idleness::Keep;
 pub use launch_spec::LaunchSpec;
-pub use webots::{ResetController, Stop, Webots};
+pub use webots::{Stop, Webots};

@@ -7,7 +7,7 @@ use std::collections::VecDeque;
 use std::io::{PipeReader, Read, Write};
 use std::path::Path;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use actix::prelude::*;
 use parking_lot::Mutex;
@@ -33,24 +33,19 @@ pub enum OutputEvent {
     Reset,
 }
 
-/// The last lines of an output.
+/// The last lines of an output, the latest first.
 #[derive(Debug, Clone, Default)]
 pub struct Tail(Arc<Mutex<VecDeque<String>>>);
 
 /// Number of lines that are kept.
 const LINES: usize = 20;
-/// Bytes that are kept of a line.
-const LINE_SIZE: usize = 1000;
 /// Size of a read, in bytes.
 const CHUNK: usize = 8 * 1024;
-/// Cost of a line besides its length, in bytes: each line is parsed, kept and written separately.
-const LINE: u64 = 200;
-/// Cost of a read besides its length, in bytes: a program that writes byte by byte causes a read for each.
-const READ: u64 = 200;
-/// Bytes without a pause: ordinary output is read at once.
-const FREE: u64 = 1024;
-/// Shortest time between two events. Webots prints its state every few seconds; a program that floods it is blocked.
-const BETWEEN_EVENTS: Duration = Duration::from_millis(20);
+/// Cost of a line, and of a read, besides its length, in bytes: each line is parsed, kept and written separately, and a
+/// program that writes byte by byte causes a read for each.
+const STEP: u64 = 200;
+/// Pause after an event. Webots prints its state every few seconds; a program that floods it is blocked.
+const AFTER_EVENT: Duration = Duration::from_millis(20);
 
 impl OutputEvent {
     /// The event of a line; `None` for the simulation's own lines.
@@ -74,16 +69,14 @@ impl Tail {
         if lines.is_empty() {
             return ".".to_owned();
         }
-        let lines: Vec<&str> = lines.iter().map(String::as_str).collect();
+        let lines: Vec<&str> = lines.iter().rev().map(String::as_str).collect();
         format!(". Its last output: {}", lines.join(" | ").replace(&format!("{}/", project.display()), ""))
     }
 
     fn push(&self, line: String) {
         let mut lines = self.0.lock();
-        if lines.len() == LINES {
-            lines.pop_front();
-        }
-        lines.push_back(line);
+        lines.push_front(line);
+        lines.truncate(LINES);
     }
 }
 
@@ -102,14 +95,10 @@ pub fn follow(
     let kept = tail.clone();
     let (end, ended) = oneshot::channel();
     std::thread::Builder::new().name("output".to_owned()).spawn(move || {
-        let mut told: Option<Instant> = None;
         let mut take = |line: String| {
             if let Some(event) = OutputEvent::parse(&line) {
-                if let Some(told) = told {
-                    std::thread::sleep(BETWEEN_EVENTS.saturating_sub(told.elapsed()));
-                }
                 events.do_send(event);
-                told = Some(Instant::now());
+                std::thread::sleep(AFTER_EVENT);
             } else {
                 if let Some(file) = &mut file {
                     // On a full disk the lines are lost, and the simulation continues.
@@ -118,17 +107,14 @@ pub fn follow(
                 kept.push(line);
             }
         };
-        let (mut lines, mut chunk, mut debt) = (Lines::new(LINE_SIZE), vec![0; CHUNK], 0);
+        let (mut lines, mut chunk) = (Lines::default(), vec![0; CHUNK]);
         while let Ok(length @ 1..) = output.read(&mut chunk) {
-            debt += READ + u64::try_from(length).unwrap_or_default();
+            let mut cost = STEP + u64::try_from(length).unwrap_or_default();
             lines.feed(chunk.get(..length).unwrap_or_default(), |line| {
-                debt += LINE;
+                cost += STEP;
                 take(line);
             });
-            if debt > FREE {
-                std::thread::sleep(Duration::from_micros(1_000_000 * debt / limit.max(1)));
-                debt = 0;
-            }
+            std::thread::sleep(Duration::from_micros(1_000_000 * cost / limit.max(1)));
         }
         lines.end(take);
         // The receiver may have been dropped.
@@ -139,6 +125,8 @@ pub fn follow(
 
 #[cfg(test)]
 mod tests {
+    use std::time::Instant;
+
     use super::*;
 
     struct Nobody;

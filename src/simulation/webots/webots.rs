@@ -12,12 +12,9 @@ use tokio::sync::Notify;
 
 use super::event::{WebotsEvent, WebotsExit};
 use super::launch_spec::LaunchSpec;
-use super::launched::{self, End, LaunchTarget, Launched};
+use super::launched::{self, End};
 use super::output::{OutputEvent, Tail};
-use super::verdict::verdict;
-use crate::shared::run::seconds_since_1970;
-use crate::simulation::checkout::CheckoutError;
-use crate::simulation::container::StartError;
+use crate::simulation::container::{SimulationContainers, StartError};
 use crate::simulation::ends::{EndReason, Taken};
 use crate::simulation::process::ProcessGroup;
 use crate::simulation::snapshot::Stage;
@@ -27,17 +24,10 @@ use crate::simulation::snapshot::Stage;
 #[rtype(result = "()")]
 pub struct Stop(pub EndReason);
 
-/// Requests to restore a file below the project's `controllers` directory to the state of the checkout.
-#[derive(Message)]
-#[rtype(result = "Result<(), CheckoutError>")]
-pub struct ResetController(pub String);
-
 /// The actor.
 pub struct Webots {
     pub(super) spec: LaunchSpec,
-    /// Its session, until it hears of the end.
-    hears_end: Option<Recipient<WebotsEvent>>,
-    /// The preparation of its target, while it runs.
+    /// The preparation of its containers, while it runs.
     preparing: Option<SpawnHandle>,
     group: Option<ProcessGroup>,
     /// Restarts the controller of a competition's participant.
@@ -48,19 +38,14 @@ pub struct Webots {
     pub(super) listening: bool,
     /// Whether the simulation is not paused.
     pub(super) runs: bool,
-    /// The wait until one that is paused ends.
-    pub(super) idle_end: Option<IdleEnd>,
+    /// The wait until one that is paused ends, and whether its client was notified of that end.
+    pub(super) idle_end: Option<(SpawnHandle, bool)>,
     last_heartbeat: Instant,
     hanging: bool,
     /// Why it was stopped, if it was.
     stopped_for: Option<(EndReason, String)>,
-}
-
-/// The wait until a simulation that is paused ends.
-pub(super) struct IdleEnd {
-    pub(super) timer: SpawnHandle,
-    /// Whether its client was notified of that end.
-    pub(super) is_announced: bool,
+    /// How it has ended, if it has: its session hears of it when this is dropped.
+    exit: Option<WebotsExit>,
 }
 
 /// So many heartbeats may be missed before Webots counts as hanging.
@@ -70,7 +55,6 @@ impl Webots {
     /// Creates the actor; Webots starts with it.
     pub fn new(spec: LaunchSpec) -> Self {
         Self {
-            hears_end: Some(spec.events.clone()),
             spec,
             preparing: None,
             group: None,
@@ -83,31 +67,37 @@ impl Webots {
             last_heartbeat: Instant::now(),
             hanging: false,
             stopped_for: None,
+            exit: None,
         }
     }
 
-    /// Prepares Webots' target, then starts it.
+    /// Prepares its containers, where it runs in some, then starts it. Dropping the preparation discards what was created.
     fn prepare(&mut self, ctx: &mut Context<Self>) {
-        let client = self.spec.events.clone();
+        let Some(containers) = self.spec.containers.clone() else { return self.launch(None, ctx) };
+        let (client, request) = (self.spec.events.clone(), self.spec.request());
         // A full mailbox drops this line.
         let progress = move |text| drop(client.try_send(WebotsEvent::Progress(text)));
-        let prepared = LaunchTarget::prepare(&self.spec, progress).into_actor(self);
-        self.preparing = Some(ctx.spawn(prepared.map(|prepared, this, ctx| match prepared {
-            Ok(target) => this.launch(target, ctx),
-            Err(StartError::Project(why)) => this.not_started(EndReason::NoWebots, &why, ctx),
-            Err(StartError::Server(why)) => this.not_started(EndReason::Fault, &why, ctx),
+        let prepared = async move {
+            let mut prepared = containers.prepare(request, &progress).await?;
+            prepared.start_others().await.map(|()| prepared)
+        };
+        self.preparing = Some(ctx.spawn(prepared.into_actor(self).map(|prepared, this, ctx| match prepared {
+            Ok(containers) => this.launch(Some(containers), ctx),
+            Err(StartError::Project(why)) => this.over(EndReason::NoWebots, &why, Taken::default(), ctx),
+            Err(StartError::Server(why)) => this.over(EndReason::Fault, &why, Taken::default(), ctx),
         })));
     }
 
-    fn launch(&mut self, target: LaunchTarget, ctx: &mut Context<Self>) {
+    fn launch(&mut self, containers: Option<SimulationContainers>, ctx: &mut Context<Self>) {
         self.preparing = None;
-        if let LaunchTarget::Containers(containers) = &target {
+        if let Some(containers) = &containers {
             self.restart = containers.restart();
             containers.warnings.iter().cloned().for_each(|warning| self.send(WebotsEvent::Progress(warning)));
             containers.texts.iter().cloned().for_each(|text| self.send(WebotsEvent::Text(text)));
         }
-        if let Err(error) = self.spawn(target, ctx) {
-            return self.not_started(EndReason::Fault, &format!("Webots can't be started: {error}"), ctx);
+        if let Err(error) = self.spawn(containers, ctx) {
+            let why = format!("Webots can't be started: {error}");
+            return self.over(EndReason::Fault, &why, Taken::default(), ctx);
         }
         self.send(WebotsEvent::Started);
         // A container prints when it runs.
@@ -127,37 +117,27 @@ impl Webots {
     }
 
     /// Starts the process, and calls [`Self::ended`] when it has ended.
-    fn spawn(&mut self, target: LaunchTarget, ctx: &mut Context<Self>) -> std::io::Result<()> {
-        // Another program may have taken it during the checkout, and would be taken for Webots.
-        if self.spec.is_port_taken() {
-            return Err(std::io::ErrorKind::AddrInUse.into());
-        }
-        let (Launched { group, tail, log, peak }, ended) =
-            launched::launch(&self.spec, target, ctx.address().recipient())?;
+    fn spawn(&mut self, containers: Option<SimulationContainers>, ctx: &mut Context<Self>) -> std::io::Result<()> {
+        let (group, tail, ended) = launched::launch(&self.spec, containers, ctx.address().recipient())?;
         let (program, world) = (self.spec.program.display(), self.spec.project.world.path.display());
         let pid = group.leader();
         self.log(Level::Info, &format!("started {program} for {world} (process {pid})"));
-        self.spec.slot.lease.update(move |one| {
-            (one.stage, one.launched) = (Stage::Launching, Some(seconds_since_1970()));
-            (one.pid, one.log) = (Some(pid), log);
-        });
         (self.tail, self.group) = (tail, Some(group));
         ended.into_actor(self).map(|end, this, ctx| this.ended(&end, ctx)).spawn(ctx);
-        let excess = self.spec.until_too_much(pid, peak).into_actor(self);
+        let excess = self.spec.until_too_much(pid).into_actor(self);
         excess.map(|why, this, _| this.stop(EndReason::Limit, &why)).spawn(ctx);
         Ok(())
     }
 
-    /// Waits until it listens, unless it does already or the wait has begun.
+    /// Waits until it listens, unless the wait has begun.
     fn await_port(&mut self, ctx: &mut Context<Self>) {
-        if let (None, false) = (self.awaiting, self.listening) {
+        if self.awaiting.is_none() {
             let ready = self.spec.until_ready().into_actor(self);
             self.awaiting = Some(ctx.spawn(ready.map(|(), this, ctx| this.ready(ctx))));
         }
     }
 
     fn ready(&mut self, ctx: &mut Context<Self>) {
-        self.awaiting.take().map(|awaiting| ctx.cancel_future(awaiting));
         if self.stopped_for.is_some() || self.listening {
             return;
         }
@@ -212,57 +192,34 @@ impl Webots {
 
     fn ended(&mut self, end: &End, ctx: &mut Context<Self>) {
         self.log(Level::Info, &format!("Webots {}", end.reason));
-        let (kind, why) = verdict(self.stopped_for.take(), end, self.listening);
-        self.spec.slot.lease.end(kind, &why, end.taken);
-        let mut exit = match kind {
-            EndReason::Finished => WebotsExit { clean: true, own: false, why },
-            EndReason::Fault => WebotsExit { own: true, ..self.failure(&why) },
-            _ => self.failure(&why),
-        };
-        if self.listening || matches!(kind, EndReason::Finished | EndReason::Fault) {
-            return self.exited(exit, ctx);
+        let (kind, why) = self.stopped_for.take().unwrap_or_else(|| end.verdict(self.listening));
+        self.over(kind, &why, end.taken, ctx);
+    }
+
+    /// Reports the end, and ends. If Webots has not become ready, that is this server's own fault, but in containers the
+    /// project's, because the project determines what they run.
+    fn over(&mut self, kind: EndReason, why: &str, taken: Taken, ctx: &mut Context<Self>) {
+        self.spec.slot.lease.end(kind, why, taken);
+        let clean = kind == EndReason::Finished;
+        let own = kind == EndReason::Fault || !(clean || self.listening || self.spec.containers.is_some());
+        let mut why = why.to_owned();
+        if !clean {
+            why += &self.tail.last_words(&self.spec.project.instance.project());
         }
-        let hint = self.spec.hint().into_actor(self);
-        hint.map(move |hint, this, ctx| {
-            exit.why += &hint;
-            this.exited(exit, ctx);
-        })
-        .spawn(ctx);
-    }
-
-    fn not_started(&mut self, kind: EndReason, why: &str, ctx: &mut Context<Self>) {
-        self.spec.slot.lease.end(kind, why, Taken::default());
-        self.exited(WebotsExit { own: kind == EndReason::Fault, ..self.failure(why) }, ctx);
-    }
-
-    fn exited(&mut self, exit: WebotsExit, ctx: &mut Context<Self>) {
-        self.tell_end(exit);
+        if kind == EndReason::NoWebots && self.group.is_some() {
+            why += self.spec.launcher.remark();
+        }
+        self.exit = Some(WebotsExit { clean, own, why });
         ctx.stop();
-    }
-
-    fn tell_end(&mut self, exit: WebotsExit) {
-        if let Some(session) = self.hears_end.take() {
-            session.do_send(WebotsEvent::Exited(exit));
-        }
-    }
-
-    /// An abnormal exit. In containers it is the project's own, because the project determines what they run.
-    fn failure(&self, why: &str) -> WebotsExit {
-        let why = format!("{why}{}", self.tail.last_words(&self.spec.project.instance.project()));
-        WebotsExit { clean: false, own: !self.listening && self.spec.containers.is_none(), why }
     }
 
     pub(super) fn send(&self, event: WebotsEvent) {
         self.spec.events.do_send(event);
     }
 
-    /// Logs an event with its port. Without a password everybody reads `/output`, and a relayed stream is reached by its
-    /// token only: then it has no port.
+    /// Logs an event with its port, which is not for everybody who reads of it: who has only a token reaches no port.
     fn log(&self, level: Level, event: &str) {
-        let (config, port) = (&self.spec.config, self.spec.slot.port);
-        let is_shown = config.ports_are_public() || config.admin_password.is_some();
-        let line = format!("port {port}: {event}");
-        self.spec.slot.lease.log(level, &line, if is_shown { &line } else { event });
+        self.spec.slot.lease.log(level, &format!("port {}: {event}", self.spec.slot.port), event);
     }
 }
 
@@ -270,7 +227,8 @@ impl Drop for Webots {
     /// Its session always hears of its end, also if it panics and is dropped.
     fn drop(&mut self) {
         let why = "The simulation was lost by a fault of this server".to_owned();
-        self.tell_end(WebotsExit { clean: false, own: true, why });
+        let exit = self.exit.take().unwrap_or(WebotsExit { clean: false, own: true, why });
+        self.send(WebotsEvent::Exited(exit));
     }
 }
 
@@ -306,15 +264,6 @@ impl Handler<OutputEvent> for Webots {
     }
 }
 
-impl Handler<ResetController> for Webots {
-    type Result = ResponseFuture<Result<(), CheckoutError>>;
-
-    fn handle(&mut self, ResetController(file): ResetController, _: &mut Self::Context) -> Self::Result {
-        let (checkouts, project) = (Arc::clone(&self.spec.checkouts), Arc::clone(&self.spec.project));
-        Box::pin(async move { checkouts.restore_controller(&project, &file).await })
-    }
-}
-
 impl Handler<Stop> for Webots {
     type Result = ();
 
@@ -327,7 +276,7 @@ impl Handler<Stop> for Webots {
         self.stop(kind, why);
         if let Some(preparing) = self.preparing.take() {
             ctx.cancel_future(preparing);
-            self.not_started(kind, why, ctx);
+            self.over(kind, why, Taken::default(), ctx);
         }
     }
 }
