@@ -197,7 +197,7 @@ upgrade() {
     length=$(stat --format=%s "$WORK/client.log")
     commands Upgrades 2 | follow fleet.lab.example &
     renewal=$!
-    eventually drains webots-simulation@main
+    eventually drains
     [[ $(in_machine dpkg-query --show webots-fleet) == *999.0.0-2 ]] || fail 'it is not upgraded'
     ! is_later "/proc/$old/exe" || fail 'the simulation runs with the new version already'
     eventually page https://fleet.lab.example/request '^0$'

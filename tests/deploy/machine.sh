@@ -250,8 +250,8 @@ is_later() { # FILE
     in_machine tail --bytes=8 "$1" | grep --quiet --text --line-regexp '# later'
 }
 
-drains() { # UNIT
-    [[ $(property "$1" StatusText) == draining:* ]]
+drains() {
+    answers 2000 /status '"draining":true'
 }
 
 # Whether a unit runs, with another process than this one.

@@ -149,7 +149,7 @@ main() {
     echo 'renews the simulation server when its last simulation has ended'
     in_machine webots-fleet-renew main >"$WORK/renew.log" &
     local renewal=$!
-    eventually drains webots-simulation@main
+    eventually drains
     sleep 2
     runs demo-simulator || fail 'the simulation was lost'
     eventually hears_more "$(stat --format=%s "$WORK/client.log")"
@@ -167,7 +167,7 @@ main() {
         eventually runs demo-simulator
         in_machine webots-fleet-renew main >"$WORK/renew.log" 2>&1 &
         renewal=$!
-        eventually drains webots-simulation@main
+        eventually drains
         in_machine systemctl "$act" webots-simulation@main
         old=$(property webots-simulation@main MainPID)
         wait "$renewal" || fail "it has failed: $(<"$WORK/renew.log")"
@@ -184,7 +184,7 @@ main() {
     grep --quiet "webots-simulation@main.service runs on as it was" "$WORK/renew.log" || fail "$(<"$WORK/renew.log")"
     in_machine mv /etc/webots-fleet/simulation/main.json.good /etc/webots-fleet/simulation/main.json
     [[ $(property webots-simulation@main MainPID) == "$old" ]] || fail 'it was drained, and has ended'
-    ! drains webots-simulation@main || fail 'it drains'
+    ! drains || fail 'it drains'
 
     echo 'does not try again with a wrong configuration'
     in_machine sh -c 'echo "{}" >/etc/webots-fleet/session/wrong.json'
