@@ -1,4 +1,4 @@
-//! A service manager: it hears when a server is ready, reloads, drains and stops. `tests/deploy/package.sh` has a real one.
+//! A service manager: it hears when a server is ready, has drained and stops. `tests/deploy/package.sh` has a real one.
 
 use nix::sys::signal::Signal;
 use tokio::net::UnixDatagram;
@@ -32,9 +32,9 @@ async fn tells(server: Builder, signals: &[(Signal, &[&str])]) {
 }
 
 #[actix_rt::test]
-async fn a_service_manager_is_told_when_a_server_is_ready_drains_and_stops() {
+async fn a_service_manager_is_told_when_a_server_is_ready_has_drained_and_stops() {
     tells(session_server(&["localhost:1".to_owned()]), &[(Signal::SIGTERM, &["STOPPING=1\n"])]).await;
-    let drained: (_, &[&str]) = (Signal::SIGUSR1, &["STATUS=draining", "STOPPING=1\nSTATUS=drained"]);
+    let drained: (_, &[&str]) = (Signal::SIGUSR1, &["STOPPING=1\nSTATUS=drained"]);
     tells(demo_server(1), &[drained]).await;
     tells(demo_server(1), &[(Signal::SIGTERM, &["STOPPING=1\nSTATUS=stopping"])]).await;
 }

@@ -37,9 +37,7 @@ pub async fn the_whole_way(rules: Rules) -> Fleet {
     }
     assert_eq!(browser.get(&at_the_door("/monitor")).await.status, 200);
     assert_eq!(browser.get(&at_the_door("/assets/style.css")).await.status, 200);
-    let viewer = browser.get(&at_the_door("/viewer")).await;
-    let policy = viewer.header("content-security-policy").unwrap();
-    assert!(policy.contains(&format!("https://{0} wss://{0}", browser.host)), "{policy}");
+    assert_eq!(browser.get(&at_the_door("/viewer")).await.status, 200);
     until("the door is open", async || browser.get(&at_the_door("/request")).await.text() == "1").await;
 
     // The door.

@@ -87,7 +87,7 @@ async fn a_mail_arrives_once_the_server_is_there() {
     let servers = [StandIn::start(Manner::Reset)];
     let session = mailing(&addresses(&servers), port).start().await;
     let tries = async |count: usize| {
-        until("it is tried", async || times_logged(&session, "mail not sent, next try in") >= count).await;
+        until("it is tried", async || times_logged(&session, "mail not sent, it is tried again") >= count).await;
     };
     tries(2).await;
     assert!(session.log().contains("Connection refused"), "{}", session.log());

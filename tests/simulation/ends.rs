@@ -74,7 +74,7 @@ async fn a_simulation_has_one_id_from_its_first_message_to_its_last_trace() {
     assert!(page.contains("crashed") && page.contains(&format!("output?id={id}")), "{page}");
     assert!(!page.contains("last words"), "who may see the page may not see the output");
     let log = server.log();
-    for words in ["asks for https", "is for Webots", "started ", ": ready", "Webots ended with exit code 3", "gone"] {
+    for words in ["asks for https", "is for Webots", "started ", ": ready", "Webots ended with exit code 3"] {
         assert!(log.lines().any(|line| line.contains(&id) && line.contains(words)), "{words:?}: {log}");
     }
 }

@@ -138,7 +138,7 @@ async fn each_webots_gets_a_virtual_display_of_its_own() {
 #[actix_rt::test]
 async fn a_virtual_display_that_does_not_start_is_told() {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let without = programs(&["git", "bash", "env", "sh", "rm"]);
+    let without = programs(&["git", "bash", "env", "sh", "rm", "prlimit"]);
     let server = demo_server(1).set("xvfb", true).env("PATH", without.path().to_str().unwrap()).start().await;
     is_told(&server, &arm(), "(xvfb), but has no Xvfb").await;
     let xvfb = Wrapper::of("Xvfb", "echo 'first words' >&2; echo 'no screens found' >&2; exit 1");
