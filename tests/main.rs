@@ -13,6 +13,9 @@
 )]
 #![allow(clippy::pedantic, reason = "tests are read one by one")]
 
+#[macro_use]
+mod support;
+
 mod demo_simulator;
 mod deploy;
 mod inputs;
@@ -23,4 +26,3 @@ mod proxy;
 mod rehearsal;
 mod session;
 mod simulation;
-mod support;

@@ -23,7 +23,6 @@ export function advice(text) {
     [/teacher has stopped/i, 'Ask your teacher before you connect again.'],
     [/waited longest|did not come back/i, 'Connect again for another simulation.'],
     [/time limit|was paused for/i, 'Connect again for another simulation.'],
-    [/may not connect to/, 'Load this page again: the fleet may have grown. Else the key server of that simulation server has to name the host that the session server lists in simulationServers.'],
     [/simulator could not be reached/, 'A firewall may be in the way: the ports above the simulation server’s own have to be open, or forwarded.'],
     [/takes no new clients/i, 'Connect again in a moment: the session server chooses another simulation server as soon as there is one.'],
   ];

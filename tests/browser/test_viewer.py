@@ -78,21 +78,5 @@ class Viewing(BrowserTest):
         expect(page.tab.get_by_label("URL of a world")).to_have_value(WORLD.format("carousel"))
 
 
-class Stranger(BrowserTest):
-    # The fleet knows it as 127.0.0.1.
-    simulation = {"server": "localhost"}
-
-    def test_a_server_that_calls_itself_otherwise_is_told_of_in_words(self):
-        page = self.browser.page()
-        self.addCleanup(page.close)
-        page.tab.goto(self.fleet.session.url("viewer"))
-        expect(page.tab.locator("#light.on")).to_be_visible()
-        page.tab.get_by_role("button", name="Playground").click()
-        page.tab.get_by_role("button", name="Connect", exact=True).click()
-        expect(page.tab.locator("#problem-text")).to_contain_text("may not connect to ws://localhost:")
-        expect(page.tab.locator("#problem-advice")).to_contain_text("simulationServers")
-        expect(page.tab.locator("[data-step=simulation].failed")).to_be_visible()
-
-
 if __name__ == "__main__":
     unittest.main()

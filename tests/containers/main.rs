@@ -12,6 +12,7 @@
 )]
 #![allow(clippy::pedantic, reason = "tests are read one by one")]
 
+#[macro_use]
 #[path = "../support/mod.rs"]
 mod support;
 

@@ -3,8 +3,6 @@
 use std::path::Path;
 use std::process::Command;
 
-use crate::support::needs;
-
 /// A stand-in for libController, which writes down what it is asked for. The simulation ends at the third step.
 const LIBRARY: &str = r#"
     #include <stdio.h>
@@ -25,8 +23,8 @@ const LIBRARY: &str = r#"
 
 #[test]
 fn a_participant_s_program_runs_connected_and_is_not_missed_when_it_ends() {
-    needs("cc", "gcc");
-    needs("python3", "python3");
+    needs!("cc");
+    needs!("python3");
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);
     std::fs::create_dir_all(path("home/lib/controller")).unwrap();

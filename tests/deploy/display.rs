@@ -34,6 +34,7 @@ impl Drop for Xvfb {
 
 #[actix_rt::test]
 async fn the_display_of_each_gpu_is_checked() {
+    needs!("Xvfb");
     let _alone = display::alone().await;
     let server = Xvfb::start();
     let [first, second] = [0, 1].map(|screen| format!("{}.{screen}", server.display));
@@ -50,6 +51,7 @@ async fn the_display_of_each_gpu_is_checked() {
 
 #[actix_rt::test]
 async fn check_tells_whether_a_display_answers() {
+    needs!("Xvfb");
     let _alone = display::alone().await;
     let server = Xvfb::start();
     let open = server.display.as_str();

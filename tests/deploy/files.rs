@@ -3,15 +3,13 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use crate::support::needs;
-
 fn deploy(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("deploy").join(path)
 }
 
 #[test]
 fn the_units_expose_little() {
-    needs("systemd-analyze", "systemd");
+    needs!("systemd-analyze");
     // The simulation server runs programs of others on the graphics card and a display, and can't close itself off more.
     // A user's own manager can't take away more than system calls.
     for (unit, most) in [
@@ -33,7 +31,7 @@ fn the_units_expose_little() {
 
 #[test]
 fn the_autostart_entries_run_the_programs_of_the_units() {
-    needs("desktop-file-validate", "desktop-file-utils");
+    needs!("desktop-file-validate");
     for kind in ["session", "simulation"] {
         let file = deploy(&format!("autostart/webots-{kind}.desktop"));
         let text = std::fs::read_to_string(&file).unwrap();

@@ -6,7 +6,7 @@ use std::sync::LazyLock;
 
 use serde_json::Value;
 
-use crate::support::{needs, skip};
+use crate::support::skip;
 
 fn project(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join(path)
@@ -26,12 +26,12 @@ struct Made {
 
 /// The base, the overlays, and the base with all that may be added. Nothing, and a word, where kubectl is too old for them.
 static ALL: LazyLock<Vec<Made>> = LazyLock::new(|| {
-    needs("kubectl", "kubernetes-client");
+    needs!("kubectl", Vec::new());
     let version = text(Command::new("kubectl").args(["version", "--client", "--output=json"]).output().unwrap());
     let version: Value = serde_json::from_str(&version).unwrap();
     let minor = version["clientVersion"]["minor"].as_str().unwrap().trim_end_matches('+').parse::<u32>().unwrap();
     if minor < 25 {
-        skip("deploy::kubernetes", "kubectl is older than 1.25");
+        skip("kubectl is older than 1.25");
         return Vec::new();
     }
     let make = |name, folder: &Path| {

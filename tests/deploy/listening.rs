@@ -30,7 +30,7 @@ fn without_a_word_on_it_a_server_listens_on_both_families() {
         .find(|command| Command::new("sh").args(["-c", &format!("{command} true")]).output().unwrap().status.success());
     let Some(own_network) = own_network else {
         assert!(std::env::var_os("CI").is_none(), "unshare --net is not allowed here");
-        return crate::support::skip("deploy::listening", "unshare --net is not allowed here");
+        return crate::support::skip("unshare --net is not allowed here");
     };
     let folder = tempfile::tempdir().unwrap();
     let inside = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use nix::sched::{CloneFlags, setns, unshare};
 use webots_fleet::simulation::container::packet_filter;
 
-use crate::support::{SOON, needs, skip};
+use crate::support::{SOON, skip};
 
 /// What clouds and carriers have at addresses of their own.
 const SPECIAL: [&str; 4] = ["169.254.169.254", "168.63.129.16", "100.64.0.9", "10.9.9.9"];
@@ -115,8 +115,7 @@ struct Network {
 impl Network {
     /// Nothing, and a word, where it can't be made.
     fn new() -> Option<Self> {
-        needs("ip", "iproute2");
-        let skip = |why: &str| skip("deploy::packet_filter", why);
+        needs!("ip", None);
         let Some(machine) = Place::new() else {
             skip("only root may make networks");
             return None;
@@ -308,7 +307,7 @@ fn a_container_does_not_reach_its_neighbour() {
     let shown = network.machine.within(|| std::fs::read_to_string("/proc/sys/net/bridge/bridge-nf-call-iptables"));
     if !shown.is_ok_and(|shown| shown.trim() == "1") {
         // dockerd loads br_netfilter, without which no filter sees what goes through a bridge.
-        return skip("deploy::packet_filter", "there is no br_netfilter");
+        return skip("there is no br_netfilter");
     }
     let _controller = network.neighbour.listen("[::]:2001");
     for is_loaded in [false, true] {

@@ -9,7 +9,7 @@ use serde_json::Value;
 
 use crate::simulation::readings;
 use crate::support::program::{demo_server, session_server};
-use crate::support::{http, needs, until};
+use crate::support::{http, until};
 
 fn project(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join(path)
@@ -21,7 +21,7 @@ fn read(path: &str) -> String {
 
 /// Runs promtool, which has to be content.
 fn promtool(arguments: &[&str], file: &Path) {
-    needs("promtool", "prometheus");
+    needs!("promtool");
     let output = Command::new("promtool").args(arguments).arg(file).output().unwrap();
     assert!(output.status.success(), "promtool {arguments:?} {}: {output:?}", file.display());
 }

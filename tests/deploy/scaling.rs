@@ -10,8 +10,8 @@ use std::path::Path;
 use std::process::Command;
 
 use crate::support::authority::Authority;
+use crate::support::make_program;
 use crate::support::page::{blocks, commands, page, section};
-use crate::support::{make_program, needs};
 
 const DOCKER: &str = r#"while [[ $1 != --file ]]; do shift; done
 grep -q " AS $4\$" "$2""#;
@@ -39,7 +39,7 @@ fn run(folder: &Path, programs: &Path, command: &str) -> String {
 
 #[test]
 fn the_commands_of_the_page_on_kubernetes_apply_what_is_there() {
-    needs("kubectl", "kubernetes-client");
+    needs!("kubectl");
     let text = section(&page("scaling.md"), "## Kubernetes");
     let project = Path::new(env!("CARGO_MANIFEST_DIR"));
     let (programs, own) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());

@@ -51,7 +51,7 @@ impl Site {
         let ports: Vec<u16> = (0..SERVERS).map(|_| ports::block(PLACES + 12)).collect();
         let site = Self {
             relay: Relay::to(ports[LINKED]).await,
-            names: NameServer::start("a server by a name, and faults of names"),
+            names: NameServer::start(),
             clock: Clock::new(),
             forge: Forge::with_arm(),
             webots: Webots::launcher(),

@@ -40,7 +40,7 @@ async fn a_server_with_a_full_disk_takes_nobody_and_the_whole_class_runs_elsewhe
     let folder = tempfile::tempdir().unwrap();
     let small = folder.path().join("small");
     if !disk::small_disk(&small, 64) {
-        return skip("a full disk", "only root may mount one");
+        return skip("only root may mount one");
     }
     let healthy = server(&folder.path().join("healthy")).start().await;
     let full = server(&small).start().await;

@@ -39,10 +39,10 @@ impl Stage {
     }
 
     /// One whose folder elsewhere is shown in a sandbox. Nothing, and a word, where there can be no such folder.
-    fn apart(test: &str) -> Option<Self> {
+    fn apart() -> Option<Self> {
         if apart().is_none() {
             let hidden = "the home and folders for temporary files, which a sandbox hides";
-            skip(test, &format!("this user can write nowhere but in {hidden}"));
+            skip(&format!("this user can write nowhere but in {hidden}"));
         }
         apart().map(|_| Self::new())
     }
@@ -153,7 +153,8 @@ async fn compare(stage: &Stage, change: impl Fn(Builder) -> Builder, levels: &[u
 
 #[actix_rt::test]
 async fn a_world_sees_and_changes_what_its_level_allows() {
-    let Some(stage) = Stage::apart("a_world_sees_and_changes_what_its_level_allows") else { return };
+    needs!("bwrap");
+    let Some(stage) = Stage::apart() else { return };
     compare(&stage, |builder| builder.set("limits.output", 10_000), &[1, 0]).await;
 }
 
@@ -162,7 +163,7 @@ pub fn as_nobody() -> Option<&'static str> {
     let program = Path::new(env!("CARGO_BIN_EXE_simulation-server"));
     let may_be_run = |folder: &Path| folder.metadata().unwrap().permissions().mode() & 1 == 1;
     if !nix::unistd::getuid().is_root() || !program.ancestors().all(may_be_run) {
-        skip("a sandbox of an ordinary user", "only root can become somebody else, who may run what was built");
+        skip("only root can become somebody else, who may run what was built");
         return None;
     }
     Some("exec setpriv --reuid=65534 --regid=65534 --clear-groups \"$0\" \"$@\"")
@@ -171,7 +172,7 @@ pub fn as_nobody() -> Option<&'static str> {
 #[actix_rt::test]
 async fn a_sandbox_holds_for_an_ordinary_user_too() {
     let Some(nobody) = as_nobody() else { return };
-    let Some(stage) = Stage::apart("a_sandbox_holds_for_an_ordinary_user_too") else { return };
+    let Some(stage) = Stage::apart() else { return };
     compare(&stage, |builder| builder.before(nobody), &[1]).await;
     // One of them is bubblewrap.
     let processes = [("be bounded by the kernel", "test $(ulimit -u) = 71".to_owned())];
@@ -181,6 +182,7 @@ async fn a_sandbox_holds_for_an_ordinary_user_too() {
 
 #[actix_rt::test]
 async fn temporary_folders_are_the_simulations_own_wherever_they_are() {
+    needs!("bwrap");
     let folder = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap();
     std::fs::write(folder.path().join("secret"), "a secret").unwrap();
     let there = shown(&folder);
@@ -195,7 +197,7 @@ async fn temporary_folders_are_the_simulations_own_wherever_they_are() {
 
 #[actix_rt::test]
 async fn folders_are_shown_and_opened_by_keys() {
-    let Some(stage) = Stage::apart("folders_are_shown_and_opened_by_keys") else { return };
+    let Some(stage) = Stage::apart() else { return };
     let (home, elsewhere) = (shown(&stage.home), shown(&stage.elsewhere));
     let deeds = [
         ("read home", format!("grep secret {home}/secret")),
@@ -215,6 +217,7 @@ async fn folders_are_shown_and_opened_by_keys() {
 
 #[actix_rt::test]
 async fn the_environment_is_what_webots_needs_and_what_a_key_adds() {
+    needs!("bwrap");
     let stage = Stage::new();
     let has = |name: &str| format!("test -n \"${{{name}}}\"");
     let deeds = ["PATH", "HOME", "DISPLAY", "LC_ALL", "SECRET_OF_THE_SERVER", "ROS_DOMAIN_ID", "ONE", "ONE_MORE"]
@@ -230,9 +233,10 @@ async fn the_environment_is_what_webots_needs_and_what_a_key_adds() {
 
 #[actix_rt::test]
 async fn what_is_empty_in_a_sandbox_stays_so_and_its_shared_memory_is_bounded() {
+    needs!("bwrap");
     let help = Command::new("bwrap").arg("--help").output().unwrap();
     if !String::from_utf8_lossy(&help.stdout).contains("--disable-userns") {
-        return skip("what_is_empty_in_a_sandbox_stays_so", "bubblewrap is older than 0.8");
+        return skip("bubblewrap is older than 0.8");
     }
     let stage = Stage::new();
     let set = |file: &str| format!("value=$(cat {file}) && echo $value > {file}");

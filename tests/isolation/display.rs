@@ -8,7 +8,7 @@ use super::deeds::{as_nobody, open};
 use super::limits::Delegated;
 use crate::simulation::scene::nothing_left;
 use crate::support::wrapper::Wrapper;
-use crate::support::{Client, DEMO, Server, Webots, demo_server, display, instances_below, needs, server_of, until};
+use crate::support::{Client, DEMO, Server, Webots, demo_server, display, instances_below, server_of, until};
 
 fn xvfb(server: &Server) -> i32 {
     instances_below(&server.folder).into_iter().find(|(_, words)| words.contains("Xvfb -screen")).unwrap().0
@@ -20,8 +20,9 @@ fn namespace(pid: &str, name: &str) -> PathBuf {
 
 #[actix_rt::test]
 async fn a_virtual_display_is_inside_of_the_sandbox() {
-    needs("Xvfb", "xvfb");
-    needs("xset", "x11-xserver-utils");
+    needs!("bwrap");
+    needs!("Xvfb");
+    needs!("xset");
     let mut users = vec![("root", "true")];
     users.extend(as_nobody().map(|nobody| ("nobody", nobody)));
     for (user, before) in users {
@@ -74,6 +75,7 @@ async fn told_memory(server: &Server) -> u64 {
 
 #[actix_rt::test]
 async fn what_a_virtual_display_takes_counts_for_its_simulation() {
+    needs!("Xvfb");
     let _alone = display::alone().await;
     let large = Wrapper::of("Xvfb", "set -- \"${@/1280x1024x24/8192x8192x24}\"");
     for level in ["sandbox", "none"] {

@@ -66,6 +66,7 @@ async fn where_no_sandbox_can_be_had_auto_falls_back_with_a_warning_on_log_and_m
 
 #[actix_rt::test]
 async fn a_sandbox_is_what_a_machine_has_by_itself() {
+    needs!("bwrap");
     let server = demo_server(1).start().await;
     assert_eq!(server.status().await["isolation"], "sandbox");
     let page = server.monitor().await;
@@ -104,6 +105,7 @@ async fn limits_that_a_machine_can_not_keep_are_told_at_the_start_and_by_a_check
 
 #[actix_rt::test]
 async fn a_webots_that_does_not_become_ready_tells_its_level_and_the_keys() {
+    needs!("bwrap");
     for (isolation, is_told) in [("sandbox", true), ("none", false)] {
         let webots = Webots::script("echo 'no module named arm'; exit 1");
         let server = server_of(webots, 1).set("isolation", isolation).start().await;

@@ -26,6 +26,7 @@ async fn told_for(deed: &str, level: &str, key: &str, value: u64) -> String {
 
 #[actix_rt::test]
 async fn who_fills_the_disk_is_told_and_ended() {
+    needs!("bwrap");
     let words = "The simulation has written more than 5 MiB, the limit of this server (limits.disk)";
     let many = |folder: &str| format!("for n in $(seq 20); do head -c 500000 /dev/zero > {folder}/file$n; done");
     let nameless = "for n in $(seq 20); do exec {file}<> own; rm own; head -c 500000 /dev/zero >&$file; done";
@@ -48,6 +49,7 @@ async fn who_fills_the_disk_is_told_and_ended() {
 
 #[actix_rt::test]
 async fn files_are_bounded_in_size_and_those_that_are_open_in_number() {
+    needs!("bwrap");
     let script = "head -c 20000000 /dev/zero > large; wc -c < large\n\
         echo \"files $(ulimit -Sn) $(ulimit -Hn) core $(ulimit -c)\"; exit 1";
     for level in LEVELS {
@@ -72,6 +74,7 @@ fn taken(server: &Server) -> f64 {
 
 #[actix_rt::test]
 async fn a_flood_of_output_costs_no_more_than_a_tenth_of_a_core() {
+    needs!("bwrap");
     for (flood, level) in [
         ("yes", "none"),
         ("yes", "sandbox"),
@@ -145,10 +148,7 @@ impl Drop for Delegated {
 #[actix_rt::test]
 async fn a_simulation_has_a_control_group_of_its_own_where_they_are_delegated() {
     let Some(delegated) = Delegated::new() else {
-        return skip(
-            "a control group of a simulation's own",
-            "there is no cgroup v2 in which this user may make groups",
-        );
+        return skip("there is no cgroup v2 in which this user may make groups");
     };
     for level in LEVELS {
         let hidden = long();

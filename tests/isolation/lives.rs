@@ -25,6 +25,7 @@ pub fn long() -> String {
 /// One is in the group of its simulation, another has left it, and the last has no mark either.
 #[actix_rt::test]
 async fn what_hides_on_purpose_ends_with_its_sandbox() {
+    needs!("bwrap");
     for (level, reason, survivors) in [
         ("sandbox", "client", vec![]),
         ("sandbox", "kill", vec![]),
@@ -63,7 +64,8 @@ async fn what_hides_on_purpose_ends_with_its_sandbox() {
 
 #[actix_rt::test]
 async fn a_simulation_has_its_grace_time_at_each_level() {
-    for (level, user, network) in levels("a_simulation_has_its_grace_time_at_each_level") {
+    needs!("bwrap");
+    for (level, user, network) in levels() {
         let stage = Stage::new();
         let (open, written) = (stage.elsewhere.path().to_str().unwrap(), stage.elsewhere.path().join("written"));
         // As Webots' launcher does: it hands SIGTERM on, and waits.
@@ -80,7 +82,8 @@ async fn a_simulation_has_its_grace_time_at_each_level() {
 
 #[actix_rt::test]
 async fn a_simulation_that_takes_no_notice_is_killed_after_its_grace_time() {
-    for (level, user, network) in levels("a_simulation_that_takes_no_notice_is_killed_after_its_grace_time") {
+    needs!("bwrap");
+    for (level, user, network) in levels() {
         let stage = Stage::new();
         let webots = Webots::script(&format!("trap '' TERM\n{DEMO} \"$@\" &\nwhile true; do wait; sleep 0.1; done"));
         let builder = stage.builder(&webots, level).before(user).set("sandbox.network", network);

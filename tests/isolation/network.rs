@@ -15,24 +15,25 @@ use super::deeds::{Stage, as_nobody};
 use crate::simulation::scene::{gone_within, nothing_left};
 use crate::support::client::Heard;
 use crate::support::{
-    Builder, Client, DEMO, Server, Webots, arm, display, instances_below, is_told, needs, programs, skip, until,
+    Builder, Client, DEMO, Server, Webots, arm, display, instances_below, is_told, programs, skip, until,
 };
 
 /// What runs a server as an ordinary user who can have networks; nothing, and a word, where there is none.
-fn ordinary(test: &str) -> Option<&'static str> {
-    needs("pasta", "passt");
+fn ordinary() -> Option<&'static str> {
+    needs!("bwrap", None);
+    needs!("pasta", None);
     let mode = |device: &Path| device.metadata().map_or(0, |data| data.permissions().mode());
     if mode(Path::new("/dev/net/tun")) & 0o006 != 0o006 {
-        skip(test, "an ordinary user can't open /dev/net/tun here");
+        skip("an ordinary user can't open /dev/net/tun here");
         return None;
     }
     if nix::unistd::getuid().is_root() { as_nobody() } else { Some("true") }
 }
 
 /// What a simulation is kept in: a level, who runs the server, and the network.
-pub fn levels(test: &str) -> Vec<(&'static str, &'static str, &'static str)> {
+pub fn levels() -> Vec<(&'static str, &'static str, &'static str)> {
     let mut levels = vec![("none", "true", "shared"), ("sandbox", "true", "shared")];
-    levels.extend(ordinary(test).map(|user| ("sandbox", user, "own")));
+    levels.extend(ordinary().map(|user| ("sandbox", user, "own")));
     levels
 }
 
@@ -51,7 +52,7 @@ fn python(line: &str) -> String {
 
 #[actix_rt::test]
 async fn a_world_in_its_own_network_reaches_nothing_of_the_machine() {
-    let Some(user) = ordinary("a_world_in_its_own_network_reaches_nothing_of_the_machine") else { return };
+    let Some(user) = ordinary() else { return };
     let stage = Stage::new();
     let name = format!("fleet-test-{}", rand::random::<u64>());
     let _abstract = UnixListener::bind_addr(&SocketAddr::from_abstract_name(&name).unwrap()).unwrap();
@@ -117,7 +118,7 @@ const TAKES_ALL: &str = "python3 -c \"import ctypes, socket, time; ctypes.CDLL(N
 
 #[actix_rt::test]
 async fn who_takes_all_ports_in_its_own_network_keeps_nobody_out() {
-    let Some(user) = ordinary("who_takes_all_ports_in_its_own_network_keeps_nobody_out") else { return };
+    let Some(user) = ordinary() else { return };
     for network in ["own", "shared"] {
         let stage = Stage::new();
         let webots = Webots::script(&format!("export PYTHONUNBUFFERED=1\n{PORT}\n{TAKES_ALL}\n{DEMO} \"$@\" & wait"));
@@ -143,13 +144,14 @@ async fn who_takes_all_ports_in_its_own_network_keeps_nobody_out() {
 
 #[actix_rt::test]
 async fn a_display_is_within_reach_at_each_level_and_of_its_own_network() {
+    needs!("Xvfb");
     let _alone = display::alone().await;
-    needs("xhost", "x11-xserver-utils");
+    needs!("xhost");
     let deeds = [
         ("use the display", "xhost".to_owned()),
         ("use it without its authority", "XAUTHORITY=/dev/null xhost".to_owned()),
     ];
-    for (level, user, network) in levels("a_display_is_within_reach_of_its_own_network") {
+    for (level, user, network) in levels() {
         let change = |builder: Builder| builder.before(user).set("sandbox.network", network).set("xvfb", true);
         assert_eq!(Stage::new().tried(&deeds, level, change).await, ["use the display"], "{level}, {network}");
     }
@@ -162,7 +164,7 @@ fn all_of(server: &Server) -> Vec<(i32, String)> {
 
 #[actix_rt::test]
 async fn pasta_ends_with_its_simulation_and_with_the_server() {
-    let Some(user) = ordinary("pasta_ends_with_its_simulation_and_with_the_server") else { return };
+    let Some(user) = ordinary() else { return };
     for end in ["client", "pasta", "server"] {
         let stage = Stage::new();
         let webots = Webots::script(&format!("(env -i setsid sleep 1000 &)\n{DEMO} \"$@\" & wait"));
@@ -203,7 +205,7 @@ async fn pasta_ends_with_its_simulation_and_with_the_server() {
 
 #[actix_rt::test]
 async fn how_a_program_has_ended_is_told_from_its_own_network() {
-    let Some(user) = ordinary("how_a_program_has_ended_is_told_from_its_own_network") else { return };
+    let Some(user) = ordinary() else { return };
     let stage = Stage::new();
     for (script, words) in [
         ("echo LAST; exit 7", "Webots ended with exit code 7. Its last output: LAST"),
@@ -217,7 +219,7 @@ async fn how_a_program_has_ended_is_told_from_its_own_network() {
 
 #[actix_rt::test]
 async fn which_network_simulations_have_is_told() {
-    let Some(user) = ordinary("which_network_simulations_have_is_told") else { return };
+    let Some(user) = ordinary() else { return };
     let names = ["git", "bash", "env", "sh", "setpriv", "bwrap", "prlimit", "unshare", "pasta"];
     let (all, none) = (programs(&names), programs(&names[..8]));
     let path = |folder: &tempfile::TempDir| folder.path().to_str().unwrap().to_owned();
@@ -244,12 +246,11 @@ async fn which_network_simulations_have_is_told() {
 
 #[actix_rt::test]
 async fn a_machine_without_ipv4_or_ipv6_has_networks_of_simulations_own() {
-    let test = "a_machine_without_ipv4_or_ipv6_has_networks_of_simulations_own";
-    let Some(user) = ordinary(test) else { return };
+    let Some(user) = ordinary() else { return };
     for (ip, address, route) in [("ip -6", "2001:db8::2/64", "2001:db8::1"), ("ip -4", "192.0.2.2/24", "192.0.2.1")] {
         // What this thread starts from here on is on a machine of its own, with this address and route alone.
         if unshare(CloneFlags::CLONE_NEWNET).is_err() {
-            return skip(test, "only root can make a network namespace");
+            return skip("only root can make a network namespace");
         }
         let script = format!(
             "ip link set lo up && ip link add out type veth peer name far && ip link set far up && sysctl -qw net.ipv6.conf.out.accept_dad=0 && \
@@ -257,7 +258,7 @@ async fn a_machine_without_ipv4_or_ipv6_has_networks_of_simulations_own() {
         );
         let made = std::process::Command::new("sh").args(["-ec", &script]).output().unwrap();
         if !made.status.success() {
-            return skip(test, &format!("no network: {}", String::from_utf8_lossy(&made.stderr)));
+            return skip(&format!("no network: {}", String::from_utf8_lossy(&made.stderr)));
         }
         for streaming in ["direct", "relay"] {
             let (stage, webots) = (Stage::new(), Webots::script(&format!("{DEMO} \"$@\" & wait")));

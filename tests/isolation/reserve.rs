@@ -98,10 +98,7 @@ async fn on_a_quiet_machine_simulations_never_use_up_the_reserve_of_the_disk() {
     let folder = open_folder();
     let small = folder.path().join("small");
     if !disk::small_disk(&small, SIZE) {
-        return skip(
-            "on_a_quiet_machine_simulations_never_use_up_the_reserve_of_the_disk",
-            "only root may mount a small disk",
-        );
+        return skip("only root may mount a small disk");
     }
     let mut users = vec![("root", "true")];
     users.extend(as_nobody().map(|nobody| ("nobody", nobody)));
@@ -139,7 +136,7 @@ async fn no_simulation_ends_where_another_program_fills_the_disk() {
     disk::hide_mounts_from_others();
     let folder = tempfile::tempdir().unwrap();
     if !disk::small_disk(folder.path(), 64) {
-        return skip("no_simulation_ends_where_another_program_fills_the_disk", "only root may mount a small disk");
+        return skip("only root may mount a small disk");
     }
     let server = server(Webots::launcher(), folder.path(), |builder| builder.set("diskReserve", 8)).await;
     let mut client = Client::ready(&server).await;

@@ -10,6 +10,7 @@ const ORIGINAL: &str = "print('original')\n";
 
 #[actix_rt::test]
 async fn a_reset_replaces_a_link_and_follows_none() {
+    needs!("bwrap");
     let table = [
         ("ln -sf VICTIM controllers/c/c.py", true),
         ("rm -r controllers/c; ln -s OUTSIDE controllers/c", false),
@@ -66,6 +67,7 @@ const EXCHANGE: &str = "import ctypes, os, sys\n\
 
 #[actix_rt::test]
 async fn who_exchanges_folders_and_links_during_a_reset_leads_nothing_out_of_the_project() {
+    needs!("bwrap");
     let outside = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap();
     let outside_shown = outside.path().display();
     let webots = Webots::script(&format!("python3 -c \"{EXCHANGE}\" '{outside_shown}' &\n{DEMO} \"$@\" & wait"));

@@ -49,6 +49,7 @@ async fn talk(project: &Project, url: &str, message: &str, last: &str) -> Vec<St
 
 #[actix_rt::test]
 async fn the_demo_runs_from_its_start_to_its_stop() {
+    needs!("bwrap");
     let project = Project::copy();
     let told = project.done(&["start", "demo"]).await;
     let (session, simulation) = (project.session, project.simulation);
@@ -89,6 +90,7 @@ async fn the_demo_runs_from_its_start_to_its_stop() {
 
 #[actix_rt::test]
 async fn a_server_that_does_not_end_is_killed_with_what_it_started() {
+    needs!("bwrap");
     let project = Project::copy();
     project.configure("simulation/demo", |config| config["timing"] = serde_json::json!({"stop": 1}));
     project.done(&["start", "demo"]).await;

@@ -68,6 +68,7 @@ async fn when_one_server_does_not_start_its_last_words_are_shown_and_the_other_i
 
 #[actix_rt::test]
 async fn a_wrong_configuration_is_refused_in_one_line_and_stops_nothing_that_runs() {
+    needs!("bwrap");
     let project = Project::copy();
     project.done(&["start", "demo"]).await;
     project.configure("simulation/demo", |config| config["maxConnections"] = "many".into());
@@ -83,6 +84,7 @@ async fn a_wrong_configuration_is_refused_in_one_line_and_stops_nothing_that_run
 
 #[actix_rt::test]
 async fn a_stale_pid_file_neither_hinders_a_start_nor_ends_another_process() {
+    needs!("bwrap");
     let project = Project::copy();
     let file = project.path("log/simulation/demo.pid");
     std::fs::create_dir_all(file.parent().unwrap()).unwrap();

@@ -41,7 +41,7 @@ async fn servers(session: &Server) -> Vec<(String, String)> {
 
 #[actix_rt::test]
 async fn servers_behind_a_name_come_and_go() {
-    let Some(names) = NameServer::start("servers_behind_a_name_come_and_go") else { return };
+    let Some(names) = NameServer::start() else { return };
     let port = ports::block(1);
     let mut first = stand_ins(&loopback([2, 3]), port);
     names.set("fleet.test", &loopback([2, 3]));
@@ -89,9 +89,7 @@ async fn servers_behind_a_name_come_and_go() {
 
 #[actix_rt::test]
 async fn a_name_server_that_fails_or_has_nothing_to_tell_changes_nothing_and_is_told_once() {
-    let Some(mut names) =
-        NameServer::start("a_name_server_that_fails_or_has_nothing_to_tell_changes_nothing_and_is_told_once")
-    else {
+    let Some(mut names) = NameServer::start() else {
         return;
     };
     let port = ports::block(1);
@@ -143,7 +141,7 @@ async fn a_name_server_that_fails_or_has_nothing_to_tell_changes_nothing_and_is_
 
 #[actix_rt::test]
 async fn a_thousand_servers_are_found_behind_one_name() {
-    let Some(names) = NameServer::start("a_thousand_servers_are_found_behind_one_name") else { return };
+    let Some(names) = NameServer::start() else { return };
     let port = ports::block(1);
     let addresses: Vec<IpAddr> =
         (0..1000).map(|number| [127, 1, (number / 250) as u8, (number % 250) as u8 + 1].into()).collect();
@@ -161,7 +159,7 @@ async fn a_thousand_servers_are_found_behind_one_name() {
 #[actix_rt::test]
 async fn a_name_whose_lookup_hangs_holds_up_only_its_own_server() {
     const HANGING: usize = 20;
-    let Some(names) = NameServer::start("a_name_whose_lookup_hangs_holds_up_only_its_own_server") else { return };
+    let Some(names) = NameServer::start() else { return };
     names.signal(Signal::SIGSTOP);
     let well = StandIn::start(good());
     let mut servers: Vec<String> = (0..HANGING).map(|number| format!("{number}.test:2000")).collect();

@@ -86,7 +86,10 @@ async fn a_world_runs_only_where_its_repository_is_allowed() {
         (format!("https://github.com/LAB/Secret.git/{end}"), is_blocked),
         ("https://github.com/lab/secret/src/branch/main/worlds/a.wbt".to_owned(), is_blocked),
         ("https://github.com/lab/secret/-/blob/main/worlds/a.wbt".to_owned(), is_blocked),
-        (format!("https://github.com/lab/%2e%2e/lab-evil/arm/{end}"), "https://github.com/lab-evil/arm is not one of them"),
+        (
+            format!("https://github.com/lab/%2e%2e/lab-evil/arm/{end}"),
+            "https://github.com/lab-evil/arm is not one of them",
+        ),
     ];
     for (url, words) in table {
         is_told(&server, &url, words).await;

@@ -5,7 +5,7 @@ use std::path::Path;
 use super::opened::reader;
 use crate::support::git::git;
 use crate::support::wrapper::Wrapper;
-use crate::support::{Forge, Webots, arm, is_told, make_program, needs, outcome, programs, simulation_server};
+use crate::support::{Forge, Webots, arm, is_told, make_program, outcome, programs, simulation_server};
 
 const ATTRIBUTES: &str = "*.dae filter=lfs diff=lfs merge=lfs -text\n";
 const POINTER: &str = "version https://git-lfs.github.com/spec/v1\noid sha256:0000000000000000000000000000000000000000000000000000000000000000\nsize 12345\n";
@@ -37,7 +37,7 @@ async fn what_a_forge_sends_as_large_files_is_bounded_whatever_the_pointers_say(
 
 #[actix_rt::test]
 async fn files_in_git_lfs_are_loaded() {
-    needs("git-lfs", "git-lfs");
+    needs!("git-lfs");
     let forge = Forge::with_arm();
     let webots = Webots::script(
         "for last; do :; done\ncd \"$(dirname \"$last\")/..\"\necho \"mesh [$(head -c 20 meshes/a.dae)]\"\nexit 1",

@@ -81,6 +81,7 @@ async fn webots_is_given_the_documented_command_line_and_a_display() {
 
 #[actix_rt::test]
 async fn paths_may_have_spaces_and_quotes() {
+    needs!("Xvfb");
     let _alone = display::alone().await;
     let (forge, folder) = (Forge::new(), tempfile::tempdir().unwrap());
     forge.commit("lab/arm", "main", &[("p q's/worlds/b  \"c\".wbt", &world_text("opened"))]);
@@ -117,6 +118,7 @@ async fn display_of(server: &Server, client: &Client) -> String {
 
 #[actix_rt::test]
 async fn each_webots_gets_a_virtual_display_of_its_own() {
+    needs!("Xvfb");
     let _alone = display::alone().await;
     // It tells which display it has, and fails without.
     let webots = Webots::script(&format!(
@@ -137,6 +139,7 @@ async fn each_webots_gets_a_virtual_display_of_its_own() {
 
 #[actix_rt::test]
 async fn a_virtual_display_that_does_not_start_is_told() {
+    needs!("bwrap");
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     let without = programs(&["git", "bash", "env", "sh", "rm", "prlimit"]);
     let server = demo_server(1).set("xvfb", true).env("PATH", without.path().to_str().unwrap()).start().await;

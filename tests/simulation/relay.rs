@@ -117,6 +117,7 @@ where
 
 #[actix_rt::test]
 async fn a_simulation_is_steered_and_its_files_are_had_through_the_server_alone() {
+    needs!("bwrap");
     for level in ["none", "sandbox"] {
         let server = relay(|builder| builder.set("isolation", level)).await;
         let (client, path) = start(&server).await;
@@ -216,7 +217,7 @@ async fn a_viewer_that_does_not_read_holds_up_nobody_and_fills_no_memory() {
 #[actix_rt::test]
 async fn a_viewer_that_has_vanished_is_noticed_though_nothing_is_sent() {
     let Some(network) = Network::hide_from_others() else {
-        return skip("simulation::relay", "packets can't be filtered");
+        return skip("packets can't be filtered");
     };
     let played = Played::new(|builder| builder.set("timing.ping", 1).set("timing.silence", 2)).await;
     let (_client, path) = start(&played.server).await;

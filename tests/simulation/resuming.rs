@@ -26,6 +26,7 @@ async fn refused(server: &Server, token: &str) -> String {
 
 #[actix_rt::test]
 async fn who_comes_back_finds_the_simulation_as_it_runs_at_each_level() {
+    needs!("bwrap");
     for level in ["none", "sandbox"] {
         let server = quick(demo_server(2)).set("isolation", level).start().await;
         let (client, first) = Client::resumable(&server).await;

@@ -13,6 +13,7 @@
 )]
 #![allow(clippy::pedantic, reason = "tests are read one by one")]
 
+#[macro_use]
 #[path = "../support/mod.rs"]
 mod support;
 

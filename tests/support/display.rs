@@ -7,6 +7,5 @@ static DISPLAYS: Mutex<()> = Mutex::const_new(());
 /// Waits until no other test of this process starts or ends displays: the number of one that is gone may be taken by
 /// another at once.
 pub async fn alone() -> MutexGuard<'static, ()> {
-    super::needs("Xvfb", "xvfb");
     DISPLAYS.lock().await
 }

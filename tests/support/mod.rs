@@ -2,7 +2,16 @@
 //!
 //! Everything that a test starts ends with it, and a test that fails prints the logs of what it had started.
 
-#![allow(dead_code, unused_imports, reason = "each test crate uses its own part of this")]
+#![allow(dead_code, unused_imports, unused_macros, reason = "each test crate uses its own part of this")]
+
+/// Leaves a test, or a part that then has nothing, where a program is missing that it needs, and says so. Where CI is set it fails: everything is tested there.
+macro_rules! needs {
+    ($program:literal $(, $nothing:expr)?) => {
+        if !$crate::support::is_there($program) {
+            return $($nothing)?;
+        }
+    };
+}
 
 pub mod authority;
 pub mod client;
@@ -40,11 +49,14 @@ use nix::sys::resource::{Resource, getrlimit, setrlimit};
 /// How long anything may take that should happen soon. Far more than it needs: the machine may be busy.
 pub const SOON: Duration = Duration::from_secs(20);
 
-/// Fails where a program is missing that a test needs; `package` is what has it in Debian.
-pub fn needs(program: &str, package: &str) {
-    let paths = std::env::var_os("PATH").unwrap();
-    let is_there = std::env::split_paths(&paths).any(|folder| folder.join(program).is_file());
-    assert!(is_there, "this test needs {program}: apt install {package}");
+/// Whether a program is there that a test needs, see `needs`.
+pub fn is_there(program: &str) -> bool {
+    let is_there = which::which(program).is_ok();
+    if !is_there {
+        assert!(std::env::var_os("CI").is_none(), "this test needs {program}");
+        skip(&format!("there is no {program}: tests/run.sh installs it"));
+    }
+    is_there
 }
 
 /// A folder that other users can read.
@@ -62,7 +74,6 @@ pub fn make_program(path: &Path, script: &str) {
 
 /// A folder with a shared library of this name, made of a file below `tests`.
 pub fn shared_library(source: &str, name: &str) -> tempfile::TempDir {
-    needs("cc", "gcc");
     let folder = tempfile::tempdir().unwrap();
     let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests").join(source);
     let mut compiler = Command::new("cc");
@@ -84,7 +95,8 @@ pub fn programs(names: &[&str]) -> tempfile::TempDir {
 
 /// Says that a test, or a part of it, is left out here, and why. Not by a macro: what those print is shown for tests that fail
 /// only.
-pub fn skip(test: &str, why: &str) {
+pub fn skip(why: &str) {
+    let test = std::thread::current().name().unwrap_or_default().to_owned();
     std::io::stderr().write_all(format!("SKIPPED, for {why}: {test}\n").as_bytes()).unwrap();
 }
 

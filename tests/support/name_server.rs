@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
-use super::{SOON, needs, skip};
+use super::{SOON, skip};
 
 /// The port of name servers in `/etc/resolv.conf`.
 const PORT: u16 = 53;
@@ -52,10 +52,10 @@ pub fn asking(address: Ipv4Addr, folder: &std::path::Path) -> Option<String> {
 
 impl NameServer {
     /// Starts one that knows no name; `None` where this machine does not allow it, which it says.
-    pub fn start(test: &str) -> Option<Self> {
-        needs("dnsmasq", "dnsmasq-base");
+    pub fn start() -> Option<Self> {
+        needs!("dnsmasq", None);
         let Some(address) = free_address().filter(|_| own_mounts().is_some()) else {
-            skip(test, "unshare --mount or port 53 is not allowed here");
+            skip("unshare --mount or port 53 is not allowed here");
             return None;
         };
         let folder = tempfile::tempdir().unwrap();

@@ -4,7 +4,7 @@
 //! the lowest last report. The [`LoadBalancer`] therefore counts each of its own placements as load at once, until the
 //! reports show it.
 //!
-//! - `load_balancer`: the servers sorted by load, the choice between them, and its parameters;
+//! - `load_balancer`: the servers sorted by load, and the choice between them; `policy`: its parameters;
 //! - `backend`: what is known of one server;
 //! - `cost`: what a client costs a server, learned from its reports;
 //! - `ejection`: which servers come last, because their starts fail;
@@ -17,6 +17,8 @@ mod backend;
 mod cost;
 mod ejection;
 mod load_balancer;
+mod policy;
 mod replicas;
 
-pub use load_balancer::{LoadBalancer, PlacementPolicy};
+pub use load_balancer::LoadBalancer;
+pub use policy::PlacementPolicy;
