@@ -10,12 +10,12 @@
 //! | [`shared::domain`] | addresses, loads, world URLs and the forges that they name (`project_url`), a server's report |
 //! | [`shared::run`] | start, readiness, log, stop |
 //! | [`shared::http`] | pages, live updates, WebSockets, limits, certificates, metrics |
-//! | [`session::placement`] | which server gets the next client: ranking (`load_balancer`), the load that is ranked (`backend`), cost |
-//! | [`session::mail`] | notices: to whom (key `administrator`: `config/session_config`, `config/mail_address`) and how (`channel`, `smtp`), what is in them (`notice_text`), when they go (`outbox`) |
+//! | [`session::placement`] | which server gets the next client: the load of a server and the key that servers are sorted by (`backend`), the choice of the first (`load_balancer`), cost |
+//! | [`session::mail`] | notices: to whom (`smtp`, one address, from the key `administrator` in `config/session_config`) and how (`channel`), what is in them (`notice_text`), when they go (`outbox`) |
 //! | [`session::fleet`] | the registry and the monitors of simulation servers |
 //! | [`session::web`] | routes, pages, `/status`, Prometheus gauges (`metrics`; counters: `app`) and the WebSocket of the session server |
 //! | [`simulation::process`] | process trees: how they start and end (`process_group`; what a server that has died left: `process_tree`, `guardian`); directories of simulations |
-//! | [`simulation::machine`] | readings of the machine and its GPUs, the load; which GPU a simulation gets (`spread`) |
+//! | [`simulation::machine`] | readings of the machine (`sensors`) and its GPUs (`gpus`), the load and `monitor.csv` (`load_monitor`); which GPU a simulation gets (`spread`) |
 //! | [`simulation::checkout`] | worlds checked out with git; `timing.checkout` limits a whole checkout (`checkout_service`) and a stalled fetch (`git`), `projectSize` its size; `config/mirrors` has the address of each Git host |
 //! | `simulation::isolation` | how a simulation is launched: its level of isolation (`launcher`), the variables that it inherits, limits; the control group that ends with it (`cgroup`) |
 //! | [`simulation::container`] | simulations in containers: what a project requests, its image, its compose project (its GPU and user, too) |
@@ -25,13 +25,14 @@
 //! | [`simulation::sessions`] | how a connection is attached to its session, and how a client resumes it |
 //! | [`simulation::slots`] | the slots that clients wait for: leases, the queue and the shares of addresses and users (`slot_pool`), the streams of simulations and the tokens that lead to them (`stream`) |
 //! | `simulation::relay` | a stream between a client and the port of its Webots |
-//! | `simulation::web` | routes, pages, `/status` and Prometheus gauges of the simulation server (`metrics`; counters and histograms: `app`, `ends`) |
+//! | `simulation::web` | routes, pages, `/status` and Prometheus gauges of the simulation server (`metrics`; counters: `app`, `ends`) |
 //!
 //! The HTML of pages is in `templates/session` and `templates/simulation` (`monitor.html`: the head of
 //! the monitor's table, `row.html`: a row), their styles (`style.css`) and scripts in `templates/assets`.
 //!
 //! Each server also has a folder `config` (every key; time limits in `timing`), its `app` (start and end) and its `state`
-//! (what its paths share). Files of `simulation` are the wire [`protocol`](simulation::protocol), the `snapshot` of all
+//! (what its paths share). Files of `simulation` are the [`protocol`](simulation::protocol), which words all
+//! messages to clients (but the reason in an error, which its cause words), the `snapshot` of all
 //! simulations, the `simulation_id`, the `client_identity`, the `announcer` (key `notify`), `preflight` (`--check`) and `readiness` (`/health`).
 //! The programs are in `src/bin`.
 //! Imports point down only, in the order that `tests/project/layering.rs` lists. `session` and `simulation` never see each

@@ -28,7 +28,7 @@ pub struct AppState {
     pub phase: watch::Receiver<Phase>,
     /// Limits and counts connections.
     pub connections: ConnectionLimiter,
-    /// Counters and histograms for `/metrics`.
+    /// Counters for `/metrics`.
     pub metrics: Metrics,
     /// Counts requests for a simulation server, by outcome.
     pub picks: prometheus::IntCounterVec,

@@ -1,6 +1,6 @@
 //! Counters and gauges in Prometheus' text format.
 
-use prometheus::{Encoder, GaugeVec, Histogram, HistogramOpts, IntCounterVec, Opts, Registry, TextEncoder};
+use prometheus::{Encoder, GaugeVec, IntCounterVec, Opts, Registry, TextEncoder};
 
 /// The metrics of one server.
 ///
@@ -42,17 +42,6 @@ impl Metrics {
         let counter = IntCounterVec::new(Opts::new(name, help), &[label])?;
         self.counters.register(Box::new(counter.clone()))?;
         Ok(counter)
-    }
-
-    /// Adds a histogram of seconds, with buckets from 1 ms to 10 s.
-    ///
-    /// # Errors
-    /// When the name is not a valid metric name, or is taken.
-    pub fn histogram(&self, name: &str, help: &str) -> Result<Histogram, prometheus::Error> {
-        let buckets = vec![0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0];
-        let histogram = Histogram::with_opts(HistogramOpts::new(name, help).buckets(buckets))?;
-        self.counters.register(Box::new(histogram.clone()))?;
-        Ok(histogram)
     }
 
     /// Writes the counters and these gauges.
