@@ -87,27 +87,27 @@ wait "${jobs[@]}" || true
 jobs=()
 echo "built: $(elapsed)"
 
-# All of these wait most of the time, and run side by side, the longest first. What needs a machine of its own, or a daemon with
-# images, is in memory: where there is little of it, these run one after another.
-containers="tests/own_network.sh ${CARGO[*]} --test containers"
-beside=("$containers" 'tests/browser/run' "${CARGO[*]} --test faults -- --skip on_a_quiet_machine" "${CARGO[*]} --test simulation_limits")
+# All of these wait much of the time, and run side by side. What needs a machine of its own, or a daemon with images, is in
+# memory: where there is little of it, these run one after another.
 memory=$(awk '$1 == "MemAvailable:" { print int($2 / 1024) }' /proc/meminfo)
-# The package is mostly systemd that waits: what is measured beside it does not notice.
-start tests/deploy/package.sh
-((memory > 10000)) || finish tests/deploy/package.sh
+beside=()
+run_beside() { # COMMAND...
+    beside+=("$*")
+    start "$@"
+    ((memory > 10000)) || finish "$@"
+}
+run_beside tests/own_network.sh "${CARGO[@]}" --test containers
+run_beside tests/deploy/package.sh
 tests/own_tmp.sh "${CARGO[@]}" --lib --bins --test integration -- --skip on_a_quiet_machine || failed+=('cargo test')
-echo "runs side by side, and tells when each has ended: ${beside[*]@Q}"
-for command in "${beside[@]}"; do
-    # shellcheck disable=SC2086 # None of its words has a space.
-    start $command
-    # shellcheck disable=SC2086
-    ((memory > 10000)) || finish $command
-done
+run_beside tests/browser/run
+run_beside "${CARGO[@]}" --test faults -- --skip on_a_quiet_machine
+run_beside "${CARGO[@]}" --test simulation_limits
+echo "run side by side, and tell when each has ended: ${beside[*]@Q}"
 # The images of this one don't wait for a machine of its own.
 touch "$logs/busy"
 ((memory <= 10000)) || start tests/swarm.sh
-for command in tests/deploy/package.sh "${beside[@]}"; do
-    # shellcheck disable=SC2086
+for command in "${beside[@]}"; do
+    # shellcheck disable=SC2086 # None of its words has a space.
     [[ -z ${jobs[$command]-} ]] || finish $command
 done
 # These depend on how fast the machine is: nothing runs beside them.
