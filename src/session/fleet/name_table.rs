@@ -5,7 +5,9 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
+use std::time::Duration;
 
+use actix_rt::time::timeout;
 use futures_util::future::join_all;
 
 use super::fleet_status::NameStatus;
@@ -28,6 +30,8 @@ struct ResolvedName {
     error: Option<String>,
 }
 
+/// Limit of one lookup, all tries of the resolver together: it delays the others.
+const LONGEST_LOOKUP: Duration = Duration::from_secs(2);
 /// Longest error text that is kept, in characters.
 const MAX_ERROR_LENGTH: usize = 120;
 
@@ -41,7 +45,7 @@ pub async fn look_up_all(names: Vec<PublicAddress>) -> Vec<(PublicAddress, Looku
 }
 
 async fn servers(name: &PublicAddress) -> LookupResult {
-    let addresses = look_up(name.host()).await?;
+    let addresses = timeout(LONGEST_LOOKUP, look_up(name.host())).await.map_err(|_| "timed out".to_owned())??;
     addresses.into_iter().map(|address| SocketAddr::new(address, name.port()).to_string().parse()).collect()
 }
 

@@ -141,7 +141,7 @@ impl Registry {
         let ServerTable { records, fleet, .. } = &mut self.servers;
         let accepts = |address: &PublicAddress, world| records.get(address)?.accepts(world);
         let eligible = |address: &PublicAddress| world.is_none_or(|world| accepts(address, world) == Some(true));
-        fleet.pick(Instant::now(), self.quota.take(from), eligible).ok_or_else(|| match world {
+        fleet.pick(Instant::now(), self.quota.take(from, true), eligible).ok_or_else(|| match world {
             Some(world) if is_refused(records.values(), world) => PickError::NotAccepted(world.repository()),
             _ => PickError::Unavailable,
         })

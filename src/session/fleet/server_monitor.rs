@@ -64,7 +64,8 @@ fn client(interval: Duration, tls: Option<Arc<ClientConfig>>) -> awc::Client {
     let idle = (interval * 3).max(Duration::from_secs(15));
     // The whole probe has a timeout, its parts have none.
     let tcp = TcpConnector::new(Resolver::custom(HostResolver)).service();
-    let mut connector = awc::Connector::new().connector(tcp).conn_keep_alive(idle).timeout(NEVER);
+    let connector = awc::Connector::new().connector(tcp).conn_keep_alive(idle);
+    let mut connector = connector.conn_lifetime(NEVER).timeout(NEVER);
     if let Some(config) = tls {
         connector = connector.rustls_0_23(config);
     }

@@ -44,7 +44,7 @@ impl ServerTable {
             monitors: HashMap::new(),
             records: HashMap::new(),
             listed: Vec::new(),
-            tls: tls::client_config(),
+            tls: None,
             thread: Arbiter::new(),
             results,
         }
@@ -52,6 +52,7 @@ impl ServerTable {
 
     /// Applies a configuration. Each server is probed at once, by a new monitor.
     pub fn apply(&mut self, config: &Arc<SessionConfig>) {
+        self.tls = tls::client_config();
         for server in self.listed.clone() {
             self.start_monitor(server, config);
         }

@@ -37,9 +37,8 @@ impl StateHistory {
             let error = record.last_error.clone().filter(|_| !event.is_about_load());
             let notice = Notice { server: server.clone(), event, load, error, at: at.clone() };
             for mailer in &self.mailers {
-                if mailer.send(notice.clone()).is_err() {
-                    log::error!("{server}: no notice is sent: its mailer has panicked");
-                }
+                // Without a receiver the server stops.
+                mailer.send(notice.clone()).ok();
             }
         }
         self.recent.truncate(KEPT - 1);

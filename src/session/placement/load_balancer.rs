@@ -57,7 +57,7 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
         }
     }
 
-    /// Changes the policy, from the next report of each server on. What was learned of the servers stays.
+    /// Changes the policy, for each server when it is next looked at. What was learned of the servers stays.
     pub fn set_policy(&mut self, policy: PlacementPolicy) {
         self.policy = policy;
     }

@@ -48,6 +48,9 @@ impl TryFrom<String> for UrlPrefix {
             format!("{text:?} is no URL prefix: {problem}; allowed are such as https://github.com/USER")
         };
         let (host, mut segments) = split_url(&text).map_err(wrong)?;
+        if text.contains(['*', '?', '#']) {
+            return Err(wrong(ProjectUrlError("it has a wildcard, a query or a fragment".to_owned())));
+        }
         if split_repository(&segments).is_ok() {
             return Err(wrong(ProjectUrlError("it names a part of a repository".to_owned())));
         }

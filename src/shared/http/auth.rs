@@ -52,7 +52,7 @@ impl BasicAuth {
     pub fn check(&self, request: &HttpRequest, peer: Peer) -> Result<(), AuthError> {
         let given = password_of(request).ok_or(AuthError::NoPassword)?;
         // Proxies that don't report client addresses share one quota.
-        if !self.attempts.take(Some(peer.rate_limit_key().unwrap_or(Ipv6Addr::UNSPECIFIED.into()))) {
+        if !self.attempts.take(Some(peer.rate_limit_key().unwrap_or(Ipv6Addr::UNSPECIFIED.into())), false) {
             return Err(AuthError::TooMany);
         }
         if given.as_bytes().ct_eq(self.password.reveal().as_bytes()).into() {

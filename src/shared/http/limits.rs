@@ -170,14 +170,14 @@ impl AddressQuota {
     }
 
     /// Takes one from the quota of an address. Returns whether it had one left; always true if the address is unknown,
-    /// or if too many addresses are tracked.
-    pub fn take(&self, address: Option<IpAddr>) -> bool {
+    /// and `when_full` if too many addresses are tracked.
+    pub fn take(&self, address: Option<IpAddr>, when_full: bool) -> bool {
         let Some(address) = address else { return true };
         if self.0.len() >= MAX_ADDRESSES {
             // Drops the addresses whose whole quota is available again.
             self.0.retain_recent();
         }
-        self.0.len() >= MAX_ADDRESSES || self.0.check_key(&address).is_ok()
+        if self.0.len() >= MAX_ADDRESSES { when_full } else { self.0.check_key(&address).is_ok() }
     }
 }
 
@@ -222,8 +222,9 @@ mod tests {
     fn the_addresses_that_are_remembered_are_bounded() {
         let quota = AddressQuota::new(NonZeroU32::new(200).unwrap(), NonZeroU32::new(12).unwrap());
         for number in 0..12_000 {
-            assert!(quota.take(Some(std::net::Ipv4Addr::from_bits(number).into())));
+            assert!(quota.take(Some(std::net::Ipv4Addr::from_bits(number).into()), true));
         }
         assert!(quota.0.len() <= MAX_ADDRESSES);
+        assert!(!quota.take(Some(std::net::Ipv4Addr::from_bits(12_000).into()), false));
     }
 }

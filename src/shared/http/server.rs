@@ -39,6 +39,9 @@ pub fn listen(address: SocketAddr) -> io::Result<TcpListener> {
         }
         socket => socket?,
     };
+    if address.is_ipv6() {
+        socket.set_only_v6(false)?;
+    }
     socket.set_reuse_address(true)?;
     socket.bind(&address.into())?;
     socket.listen(BACKLOG)?;
