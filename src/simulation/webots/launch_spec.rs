@@ -1,8 +1,11 @@
 //! The launch specification: everything that one Webots is started with.
 
 use std::ffi::OsString;
+use std::io::ErrorKind;
+use std::net::{SocketAddr, TcpStream};
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::Duration;
 
 use actix::prelude::*;
 
@@ -15,6 +18,9 @@ use crate::simulation::machine::sensors::Gpu;
 use crate::simulation::process::{SpawnSpec, until_answering};
 use crate::simulation::protocol::Mode;
 use crate::simulation::slots::Slot;
+
+/// A port that does not even refuse a connection for so long has a program that does not take it.
+const SILENCE: Duration = Duration::from_millis(100);
 
 /// Everything that one Webots is started with.
 pub struct LaunchSpec {
@@ -95,10 +101,22 @@ impl LaunchSpec {
         self.watcher.clone().until_too_much(disk)
     }
 
+    /// Where this server reaches it.
+    fn address(&self) -> SocketAddr {
+        let address = self.launcher.reached().unwrap_or_else(|| self.config.address_of_simulations());
+        (address, self.slot.port).into()
+    }
+
+    /// Whether another program listens there. It is not bound to find out: a process that is just being started elsewhere
+    /// would inherit that.
+    pub fn is_port_taken(&self) -> bool {
+        let connected = TcpStream::connect_timeout(&self.address(), SILENCE);
+        connected.map_or_else(|error| error.kind() == ErrorKind::TimedOut, |_| true)
+    }
+
     /// Waits until it is ready at its port.
     pub fn until_ready(&self) -> impl Future<Output = ()> + use<> {
         let is_forwarded = self.containers.is_some() || self.launcher.reached().is_some();
-        let address = self.launcher.reached().unwrap_or_else(|| self.config.address_of_simulations());
-        until_answering((address, self.slot.port).into(), is_forwarded)
+        until_answering(self.address(), is_forwarded)
     }
 }

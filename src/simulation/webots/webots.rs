@@ -118,6 +118,10 @@ impl Webots {
 
     /// Starts the process, and calls [`Self::ended`] when it has ended.
     fn spawn(&mut self, containers: Option<SimulationContainers>, ctx: &mut Context<Self>) -> std::io::Result<()> {
+        // Another program may have taken it during the checkout, and would be taken for Webots.
+        if self.spec.is_port_taken() {
+            return Err(std::io::ErrorKind::AddrInUse.into());
+        }
         let (group, tail, ended) = launched::launch(&self.spec, containers, ctx.address().recipient())?;
         let (program, world) = (self.spec.program.display(), self.spec.project.world.path.display());
         let pid = group.leader();
