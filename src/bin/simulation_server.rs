@@ -7,9 +7,8 @@ use clap::Parser;
 use webots_fleet::shared::run::start;
 use webots_fleet::simulation::app::{self, Application};
 use webots_fleet::simulation::config::SimulationConfig;
-use webots_fleet::simulation::container;
-use webots_fleet::simulation::preflight;
 use webots_fleet::simulation::process::guardian;
+use webots_fleet::simulation::{container, preflight};
 
 /// Runs one Webots per web client.
 #[derive(Parser)]

@@ -27,7 +27,7 @@ pub fn start(config: &SimulationConfig) {
         ("allowedRepositories", allowed.join(",")),
     ];
     for address in &config.notify {
-        actix_rt::spawn(announce(address.clone(), form.clone(), config.timing.announce));
+        actix_rt::spawn(announce(address.to_string(), form.clone(), config.timing.announce));
     }
 }
 

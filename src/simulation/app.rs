@@ -8,20 +8,20 @@ use actix::{Actor, Arbiter};
 use actix_web::{App, web};
 use tokio::sync::watch;
 
-use super::announcer;
 use super::config::SimulationConfig;
 use super::ends::Ends;
-use super::readiness;
 use super::slots::SlotPool;
 use super::state::AppState;
+use super::{announcer, readiness};
 use crate::shared::domain::AdmissionRules;
 use crate::shared::http::server::{self, HttpServerOptions};
-use crate::shared::http::{BasicAuth, ConnectionLimiter, LiveUpdates, Metrics, STREAMS_PER_CLIENT, TCP_PER_CLIENT};
+use crate::shared::http::{
+    AddressQuota, BasicAuth, ConnectionLimiter, LiveUpdates, Metrics, STREAMS_PER_CLIENT, TCP_PER_CLIENT,
+};
 use crate::shared::run::{
     AppError, Phase, ServerCommand, Signals, limit_clients, permanent, raise_open_files, service_manager, start,
 };
 use crate::simulation::checkout::{CacheDir, CheckoutService};
-use crate::simulation::client::quota;
 use crate::simulation::container::ContainerService;
 use crate::simulation::isolation::{Launcher, Watcher};
 use crate::simulation::machine::{LoadMonitor, Spread, UsageMonitor};
@@ -204,7 +204,8 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
         connections: ConnectionLimiter::new(max_tcp(&config), config.max_clients, config.max_clients_per_address),
         metrics,
         starts,
-        start_quota: quota::starts(config.max_connections),
+        // Each start costs a checkout and a Webots. A class that takes all slots, and then reloads its pages, stays within it.
+        start_quota: AddressQuota::new(200.max(2 * u32::from(config.max_connections)), 60),
         live: LiveUpdates::default(),
         administrators: LiveUpdates::default(),
         usage: UsageMonitor::default(),

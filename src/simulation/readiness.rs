@@ -12,14 +12,16 @@ use which::which;
 
 use super::config::SimulationConfig;
 use crate::simulation::container::{daemon_fault, data_folder};
-use crate::simulation::machine::Readings;
-use crate::simulation::machine::display;
+use crate::simulation::machine::{Readings, display};
 use crate::simulation::process::DiskRoom;
 
 /// Interval between two checks.
 const PERIOD: Duration = Duration::from_secs(5);
 /// Interval while the server is not ready.
 const PERIOD_WHILE_NOT_READY: Duration = Duration::from_secs(1);
+/// Timeout of a check: a disk that does not answer blocks its writers. The next check starts only after the last one has
+/// ended.
+const HUNG: Duration = Duration::from_mins(1);
 /// Bytes that each check writes to the disk. An empty file can be created on a full disk.
 const WRITTEN: usize = 1 << 20;
 
@@ -65,8 +67,14 @@ pub fn watch(
             actix_rt::time::sleep(pause).await;
             let (config, run, readings) = (Arc::clone(&config), run.clone(), Arc::clone(&readings.borrow()));
             let all = move || check(&config, &run, Some(&readings)).err();
-            // The next check starts only after this one has ended: a disk that does not answer blocks its writers.
-            let found = actix_rt::task::spawn_blocking(all).await;
+            let mut checked = actix_rt::task::spawn_blocking(all);
+            let found = match actix_rt::time::timeout(HUNG, &mut checked).await {
+                Ok(found) => found,
+                Err(_) => {
+                    publish(&sender, Some("This server's disk or Docker does not answer".to_owned()), &failed_starts);
+                    checked.await
+                }
+            };
             if let Ok(found) = found {
                 publish(&sender, found, &failed_starts);
             }

@@ -22,18 +22,12 @@ pub enum ServerEntry {
 impl ServerEntry {
     /// The address of the simulation server, unless this is a name.
     pub fn server(&self) -> Option<&PublicAddress> {
-        match self {
-            Self::Server(address) => Some(address),
-            Self::Name(_) => None,
-        }
+        if let Self::Server(address) = self { Some(address) } else { None }
     }
 
     /// The name to resolve and the port, if this is one.
     pub fn name(&self) -> Option<&PublicAddress> {
-        match self {
-            Self::Name(name) => Some(name),
-            Self::Server(_) => None,
-        }
+        if let Self::Name(name) = self { Some(name) } else { None }
     }
 }
 

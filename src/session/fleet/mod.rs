@@ -1,6 +1,5 @@
 //! The simulation servers: which there are, the last report of each, and which one gets the next client.
 
-mod fleet_status;
 mod name_table;
 mod registry;
 mod resolver;
@@ -9,6 +8,5 @@ mod server_record;
 mod server_table;
 mod state_history;
 
-pub use fleet_status::{FleetStatus, NameStatus, ServerStatus};
 pub use registry::{GetStatus, Pick, PickError, Reconfigure, Registry};
-pub use server_record::{ServerRecord, ServerState, StateChange};
+pub use server_record::{FleetStatus, NameStatus, ServerRecord, ServerState, ServerStatus, StateChange};

@@ -10,8 +10,8 @@ use std::time::Duration;
 use actix_rt::time::timeout;
 use futures_util::future::join_all;
 
-use super::fleet_status::NameStatus;
 use super::resolver::look_up;
+use super::server_record::NameStatus;
 use crate::session::config::ServerEntry;
 use crate::shared::domain::PublicAddress;
 use crate::shared::text::excerpt;
@@ -30,8 +30,6 @@ struct ResolvedName {
     error: Option<String>,
 }
 
-/// Limit of one lookup, all tries of the resolver together: it delays the others.
-const LONGEST_LOOKUP: Duration = Duration::from_secs(2);
 /// Longest error text that is kept, in characters.
 const MAX_ERROR_LENGTH: usize = 120;
 
@@ -45,7 +43,9 @@ pub async fn look_up_all(names: Vec<PublicAddress>) -> Vec<(PublicAddress, Looku
 }
 
 async fn servers(name: &PublicAddress) -> LookupResult {
-    let addresses = timeout(LONGEST_LOOKUP, look_up(name.host())).await.map_err(|_| "timed out".to_owned())??;
+    // All tries of the resolver together: they delay the other names.
+    let addresses =
+        timeout(Duration::from_secs(2), look_up(name.host())).await.map_err(|_| "timed out".to_owned())??;
     addresses.into_iter().map(|address| SocketAddr::new(address, name.port()).to_string().parse()).collect()
 }
 

@@ -4,16 +4,15 @@
 //! and every pick, so that a pick counts at once. It looks names up, and starts a monitor for each simulation server.
 
 use std::net::IpAddr;
-use std::num::NonZeroU32;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use actix::prelude::*;
 use tokio::sync::watch;
 
-use super::fleet_status::{FleetStatus, ServerStatus};
 use super::name_table::look_up_all;
 use super::server_monitor::ProbeResult;
+use super::server_record::{FleetStatus, ServerStatus};
 use super::server_record::{ServerRecord, ServerState, is_refused};
 use super::server_table::ServerTable;
 use super::state_history::StateHistory;
@@ -76,10 +75,6 @@ pub struct Registry {
     changes: StateHistory,
 }
 
-/// Placements of an address that may reserve room at once: 200, a large class behind one address.
-const BURST: NonZeroU32 = NonZeroU32::MIN.saturating_add(199);
-/// Further placements that may reserve room, per minute: 12.
-const PER_MINUTE: NonZeroU32 = NonZeroU32::MIN.saturating_add(11);
 /// Pause between two lookups of the names.
 const LOOKUP_INTERVAL: Duration = Duration::from_secs(1);
 /// Interval between checks of what changes without a report: placements that expire.
@@ -91,7 +86,8 @@ impl Registry {
         Self::create(|ctx| {
             let servers = ServerTable::new(&config, ctx.address().recipient());
             Self {
-                quota: AddressQuota::new(BURST, PER_MINUTE),
+                // A large class behind one address may reserve room at once.
+                quota: AddressQuota::new(200, 12),
                 changes: StateHistory::new(&config),
                 config,
                 servers,

@@ -9,10 +9,9 @@ use actix_web::{HttpRequest, HttpResponse, Result, web};
 use percent_encoding::percent_decode_str;
 use serde::Deserialize;
 
-use super::metrics;
-use super::page_routes;
 use super::status::status_page;
 use super::web_client::WebClient;
+use super::{metrics, page_routes};
 use crate::session::fleet::PickError;
 use crate::session::state::AppState;
 use crate::shared::http::routing::{self, GET, POST, READ, json_body, path, retry_after};

@@ -1,8 +1,7 @@
 //! Secrets of a configuration, and the files that may contain them.
 
-use std::fmt;
-use std::io;
 use std::path::{Path, PathBuf};
+use std::{fmt, io};
 
 use serde::{Deserialize, Serialize, Serializer};
 

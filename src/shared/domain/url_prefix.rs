@@ -48,11 +48,8 @@ impl TryFrom<String> for UrlPrefix {
             format!("{text:?} is no URL prefix: {problem}; allowed are such as https://github.com/USER")
         };
         let (host, mut segments) = split_url(&text).map_err(wrong)?;
-        if text.contains(['*', '?', '#']) {
-            return Err(wrong(ProjectUrlError("it has a wildcard, a query or a fragment".to_owned())));
-        }
-        if split_repository(&segments).is_ok() {
-            return Err(wrong(ProjectUrlError("it names a part of a repository".to_owned())));
+        if text.contains(['*', '?', '#']) || split_repository(&segments).is_ok() {
+            return Err(wrong(ProjectUrlError("it is more than a prefix".to_owned())));
         }
         if segments.len() >= 2 {
             segments = plain_repository(segments).map_err(wrong)?;

@@ -2,7 +2,6 @@
 //! guesses.
 
 use std::net::Ipv6Addr;
-use std::num::NonZeroU32;
 
 use actix_web::http::header;
 use actix_web::{HttpRequest, HttpResponse};
@@ -14,11 +13,6 @@ use super::limits::AddressQuota;
 use super::peer::Peer;
 use super::routing::retry_after;
 use crate::shared::config::Secret;
-
-/// Passwords that an address may send in a burst: 30.
-const BURST: NonZeroU32 = NonZeroU32::MIN.saturating_add(29);
-/// Passwords that an address may send per minute after a burst: 12.
-const PER_MINUTE: NonZeroU32 = NonZeroU32::MIN.saturating_add(11);
 
 /// Checks the password of requests.
 #[derive(Debug)]
@@ -41,7 +35,8 @@ pub enum AuthError {
 impl BasicAuth {
     /// Creates an authenticator for this password.
     pub fn new(password: Secret) -> Self {
-        Self { password, attempts: AddressQuota::new(BURST, PER_MINUTE) }
+        // Thirty passwords at once, and twelve a minute.
+        Self { password, attempts: AddressQuota::new(30, 12) }
     }
 
     /// Checks the password of a request, in constant time. Right passwords count as attempts too, so that a client over

@@ -165,7 +165,8 @@ pub struct AddressQuota(DefaultKeyedRateLimiter<IpAddr>);
 
 impl AddressQuota {
     /// An unused quota: `burst` times at once, and `per_minute` times in each minute after that.
-    pub fn new(burst: NonZeroU32, per_minute: NonZeroU32) -> Self {
+    pub fn new(burst: u32, per_minute: u32) -> Self {
+        let [burst, per_minute] = [burst, per_minute].map(|number| NonZeroU32::MIN.saturating_add(number - 1));
         Self(RateLimiter::keyed(Quota::per_minute(per_minute).allow_burst(burst)))
     }
 
@@ -220,7 +221,7 @@ mod tests {
 
     #[test]
     fn the_addresses_that_are_remembered_are_bounded() {
-        let quota = AddressQuota::new(NonZeroU32::new(200).unwrap(), NonZeroU32::new(12).unwrap());
+        let quota = AddressQuota::new(200, 12);
         for number in 0..12_000 {
             assert!(quota.take(Some(std::net::Ipv4Addr::from_bits(number).into()), true));
         }

@@ -13,4 +13,4 @@ pub use open_files::{limit_clients, raise_open_files};
 pub use rotated_file::RotatedFile;
 pub use signals::{Phase, ServerCommand, Signals, closing};
 pub use start::AppError;
-pub use timestamp::{seconds_since_1970, serialize_timestamp, timestamp, timestamp_in_milliseconds};
+pub use timestamp::{seconds_since_1970, timestamp, timestamp_in_milliseconds};

@@ -14,14 +14,6 @@ pub fn timestamp_in_milliseconds(time: SystemTime) -> String {
     format_rfc3339_millis(time).to_string()
 }
 
-/// Serializes a time as RFC 3339 in UTC, to the second.
-///
-/// # Errors
-/// When the output fails.
-pub fn serialize_timestamp<S: serde::Serializer>(time: &SystemTime, serializer: S) -> Result<S::Ok, S::Error> {
-    serializer.serialize_str(&timestamp(*time))
-}
-
 /// Returns the current time in seconds since 1970-01-01 UTC.
 pub fn seconds_since_1970() -> u64 {
     SystemTime::UNIX_EPOCH.elapsed().map_or(0, |age| age.as_secs())

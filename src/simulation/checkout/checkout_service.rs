@@ -13,14 +13,11 @@ use tokio_util::task::AbortOnDropHandle;
 
 use super::checkout_error::{Cause, CheckoutError, refused};
 use super::commit_resolver::CommitResolver;
-use super::file_restore;
 use super::git::Git;
 use super::project::Project;
-use super::redirect;
 use super::repository_cache::{CacheDir, RepositoryCache};
 use super::single_flight::SharedProgress;
-use super::steps;
-use super::work_tree;
+use super::{file_restore, redirect, steps, work_tree};
 use crate::shared::domain::{AdmissionRules, ProjectUrl};
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::process::{InstanceDir, on_own_thread};

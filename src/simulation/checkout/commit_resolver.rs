@@ -7,12 +7,11 @@ use parking_lot::Mutex;
 use tokio::sync::watch;
 
 use super::checkout_error::{Cause, CheckoutError, refused};
-use super::redirect;
 use super::repository::Repository;
 use super::repository_cache::{COMMITS, HISTORY, RepositoryCache};
 use super::revision::{self, Revision, TrustSource};
 use super::single_flight::{OnProgress, SingleFlight};
-use super::steps;
+use super::{redirect, steps};
 use crate::shared::domain::{AdmissionRules, ProjectUrl};
 use crate::simulation::config::{Remote, SimulationConfig};
 

@@ -1,9 +1,8 @@
 //! Blocking file I/O on cached repositories.
 
-use std::fs;
-use std::io;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
+use std::{fs, io};
 
 use crate::simulation::process::disk_usage::{self, DiskUsage};
 

@@ -56,9 +56,10 @@ impl CacheDir {
         let folder = folder.canonicalize()?;
         let lock = File::options().write(true).create(true).truncate(false).open(folder.join("lock"))?;
         let deadline = Instant::now() + LOCK_WAIT;
-        while lock.try_lock().is_err() {
+        while let Err(error) = lock.try_lock() {
             if Instant::now() > deadline {
-                return Err(io::Error::other("another simulation server uses it, and each needs one of its own"));
+                let why = "another simulation server uses it, and each needs one of its own";
+                return Err(io::Error::other(format!("{why}: {error}")));
             }
             std::thread::sleep(RETRY_INTERVAL);
         }
@@ -130,12 +131,18 @@ impl RepositoryCache {
             if total <= budget {
                 return;
             }
-            // New users wait for the lock, and then create the repository again.
-            let in_use = self.in_use.blocking_lock();
-            if in_use.get(&path).is_some_and(|repository| repository.strong_count() > 0) {
-                continue;
+            // What a killed server leaves of it is evicted like a repository.
+            let removed = path.with_extension(rand::random::<u64>().to_string());
+            {
+                // New users wait for the lock, and then create the repository again.
+                let in_use = self.in_use.blocking_lock();
+                if in_use.get(&path).is_some_and(|repository| repository.strong_count() > 0)
+                    || std::fs::rename(&path, &removed).is_err()
+                {
+                    continue;
+                }
             }
-            match remove_tree(&path) {
+            match remove_tree(&removed) {
                 Ok(()) => {
                     log::info!("removed {} from the cache", path.display());
                     total -= size;

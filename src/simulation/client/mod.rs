@@ -1,6 +1,5 @@
 //! A web client, and the session of its simulation from the request for it to its end.
 
-pub mod quota;
 mod resume;
 mod session;
 mod start;

@@ -12,11 +12,10 @@ use crate::simulation::checkout::Project;
 use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::ends::EndReason;
 use crate::simulation::machine::sensors::Gpu;
-use crate::simulation::protocol;
-use crate::simulation::readiness;
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::slots::{Slot, SlotLease};
 use crate::simulation::webots::{LaunchSpec, Webots, WebotsEvent};
+use crate::simulation::{protocol, readiness};
 
 impl Session {
     /// Counts a request for a simulation, for `/metrics`.

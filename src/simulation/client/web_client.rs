@@ -68,9 +68,11 @@ impl WebClient {
     fn attach(&mut self, ctx: &mut Context) -> Connection {
         let (session, actions) = unbounded_channel();
         let attached = session.clone();
-        // A session has sent the last text before it drops the other end, unless it has panicked, or ended just now.
+        // A session has sent the last text before it drops the other end, unless it has panicked. That text comes before this.
         let gone = async move { attached.closed().await };
-        gone.into_actor(self).map(|(), _, ctx| Self::finish(protocol::ended(None), CloseCode::Normal, ctx)).spawn(ctx);
+        let lost =
+            || ToClient::End(protocol::error("This simulation was lost by a fault of the server"), CloseCode::Error);
+        gone.into_actor(self).map(move |(), _, ctx| ctx.address().do_send(lost())).spawn(ctx);
         self.session = Some(session);
         Connection { peer: self.peer, client: ctx.address().recipient(), actions }
     }

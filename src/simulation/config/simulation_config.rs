@@ -85,7 +85,7 @@ pub struct SimulationConfig {
     pub share_idle_time: f64 = 50.0,
     /// URLs to which the server announces itself when it starts. Default: none.
     #[serde(deserialize_with = "one_or_many")]
-    pub notify: Vec<String> = Vec::new(),
+    pub notify: Vec<url::Url> = Vec::new(),
     /// Number of slots: simulations that may run at a time. Webots uses port+1 .. port+maxConnections. Default: 100.
     #[serde(deserialize_with = "whole::<1, 10_000, _, _>")]
     pub max_connections: u16 = 100,

@@ -194,7 +194,7 @@ fn protected(
         ("pids_limit", json!(limits.processes)),
         ("ulimits", json!({ "nofile": { "soft": limits.open_files.min(1024), "hard": limits.open_files }, "core": 0 })),
         ("logging", json!({ "driver": "none" })),
-        // Reaps orphans and forwards signals. The server checks at its start that Docker has one.
+        // Reaps orphans and forwards signals.
         ("init", json!(true)),
         // The daemon would run it, at the interval of the image.
         ("healthcheck", json!({ "disable": true })),

@@ -59,7 +59,7 @@ impl Images {
     pub async fn pull(self: &Arc<Self>, image: &str, progress: OnProgress<'_>) -> Result<String, StartError> {
         let (this, name) = (Arc::clone(self), image.to_owned());
         let pull = move |sender: watch::Sender<String>| async move {
-            let _permit = this.permit(&sender).await;
+            let _permit = this.permit(&sender).await?;
             let on_line = |line: &str| drop(sender.send(format!("Step 1/{STEPS} : fetching {name}: {line}")));
             let command = ["docker", "pull", &name].map(OsString::from).to_vec();
             let pulled = this.docker.follow(command, this.config.timing.build, on_line).await;
@@ -124,7 +124,7 @@ impl Images {
         sender: watch::Sender<String>,
     ) -> Result<(), StartError> {
         // What has no step of a project takes seconds.
-        let _permit = if build.folder.is_some() { self.permit(&sender).await } else { None };
+        let _permit = if build.folder.is_some() { Some(self.permit(&sender).await?) } else { None };
         let ImageBuild { dockerfile, folder, arguments } = build;
         let (instance, root) = (project.instance.path().to_owned(), project.folder.clone());
         let prepare = move || {
@@ -156,13 +156,15 @@ impl Images {
     }
 
     /// Waits until it may be built.
-    async fn permit(&self, sender: &watch::Sender<String>) -> Option<SemaphorePermit<'_>> {
+    async fn permit(&self, sender: &watch::Sender<String>) -> Result<SemaphorePermit<'_>, StartError> {
         if let Ok(permit) = self.builds.try_acquire() {
-            return Some(permit);
+            return Ok(permit);
         }
         sender.send("waiting for images of others to be built".to_owned()).ok();
-        // It is never closed.
-        self.builds.acquire().await.ok()
+        let limit = self.config.timing.build;
+        let why = || format!("Images of others were being built for {} s (timing.build)", limit.as_secs());
+        let permit = actix_rt::time::timeout(limit, self.builds.acquire()).await.ok().and_then(Result::ok);
+        permit.ok_or_else(|| StartError::Server(why()))
     }
 
     /// What Docker says of an image in this format; `None` if it does not exist.

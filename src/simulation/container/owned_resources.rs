@@ -28,9 +28,10 @@ pub struct ProjectGuard {
 
 /// How containers are removed, whatever they do.
 pub const REMOVE: [&str; 3] = ["rm", "--force", "--volumes"];
-/// Attempts to remove the containers of a project before they are left to the next start, and the pause before each: Docker
-/// may still be creating one.
-const TRIES: u32 = 60;
+/// Attempts to remove the containers of a project before they are left to the next start, how many have to succeed, since
+/// Docker may still be creating one, and the pause before each.
+const TRIES: usize = 60;
+const LOOKS: usize = 3;
 const PAUSE: Duration = Duration::from_secs(2);
 
 impl ResourceOwner {
@@ -74,10 +75,12 @@ impl Drop for ProjectGuard {
     fn drop(&mut self) {
         let name = std::mem::take(&mut self.name);
         self.runtime.spawn(async move {
+            let mut looks = LOOKS;
             for _ in 0..TRIES {
                 actix_rt::time::sleep(PAUSE).await;
                 let project = name.clone();
-                if matches!(spawn_blocking(move || sweep(&project)).await, Ok(Ok(()))) {
+                looks -= usize::from(matches!(spawn_blocking(move || sweep(&project)).await, Ok(Ok(()))));
+                if looks == 0 {
                     return;
                 }
             }

@@ -5,7 +5,7 @@
 use std::ffi::OsString;
 use std::io;
 use std::net::IpAddr;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use nix::sys::resource::{Resource, getrlimit};
 use which::which;
@@ -37,6 +37,8 @@ pub struct Launcher {
     why_shared: Option<String>,
     cgroups: Option<Cgroups>,
     controllers: Vec<&'static str>,
+    /// The whole path: a program that is looked for after the fork makes the start of each slower by a millisecond.
+    prlimit: PathBuf,
     variables: Vec<VariableName>,
     limits: ResourceLimits,
 }
@@ -47,7 +49,8 @@ impl Launcher {
     /// # Errors
     /// When the configuration requires what this machine does not have, as text for an administrator.
     pub fn new(config: &SimulationConfig) -> Result<Self, String> {
-        if config.isolation != IsolationSetting::Container && which("prlimit").is_err() {
+        let prlimit = which("prlimit").unwrap_or_default();
+        if config.isolation != IsolationSetting::Container && prlimit.as_os_str().is_empty() {
             return Err("prlimit is not there; on Debian, Ubuntu and Fedora the package util-linux has it".to_owned());
         }
         // Before a sandbox is tried: what that has started may still be in this server's group.
@@ -80,6 +83,7 @@ impl Launcher {
             shortcoming,
             cgroups: None,
             controllers,
+            prlimit,
             variables: config.environment.clone(),
             limits: config.limits.clone(),
         })
@@ -224,7 +228,7 @@ impl Launcher {
     fn limited(&self) -> Vec<OsString> {
         let files = at_most(Resource::RLIMIT_NOFILE, self.limits.open_files);
         let size = at_most(Resource::RLIMIT_FSIZE, self.limits.disk << 20);
-        let mut words = vec!["prlimit".to_owned(), format!("--nofile={}:{files}", files.min(USUAL_FILES))];
+        let mut words = vec![format!("--nofile={}:{files}", files.min(USUAL_FILES))];
         words.extend([format!("--fsize={size}"), "--core=0".to_owned()]);
         // The kernel counts all processes of a user, but in a user namespace only those inside, one of which is
         // bubblewrap.
@@ -232,7 +236,7 @@ impl Launcher {
             words.push(format!("--nproc={}", at_most(Resource::RLIMIT_NPROC, self.limits.processes + 1)));
         }
         words.push("--".to_owned());
-        words.into_iter().map(OsString::from).collect()
+        std::iter::once(self.prlimit.clone().into()).chain(words.into_iter().map(OsString::from)).collect()
     }
 }
 

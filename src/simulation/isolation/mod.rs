@@ -3,7 +3,6 @@
 mod cgroup;
 mod disk;
 mod display;
-mod keyrings;
 mod launcher;
 mod mount;
 mod network;

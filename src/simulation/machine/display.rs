@@ -1,12 +1,13 @@
 //! The X display on which Webots opens its window: its name, and whether one answers there.
 
 use std::io;
-use std::net::{TcpStream, ToSocketAddrs};
-use std::os::unix::net::UnixStream;
+use std::net::ToSocketAddrs;
 use std::path::PathBuf;
 use std::time::Duration;
 
-/// Timeout of a connection to another host.
+use socket2::{SockAddr, Socket, Type};
+
+/// Timeout of a connection.
 const ANSWER: Duration = Duration::from_secs(2);
 /// Display N listens on this port + N, where it is reached by TCP.
 const FIRST_PORT: u16 = 6000;
@@ -39,8 +40,11 @@ pub fn check(display: &str) -> Result<(), String> {
         parse(display).ok_or_else(|| format!("{display:?} is no display; allowed is HOST:NUMBER or :NUMBER"))?;
     let connected = match socket(display) {
         // Not at the abstract address of that name, which anybody can take, and which a sandbox does not have.
-        Some(path) => UnixStream::connect(path).map(drop),
-        None => reach((host, FIRST_PORT + number)),
+        Some(path) => reach(SockAddr::unix(path)),
+        None => (host, FIRST_PORT + number).to_socket_addrs().and_then(|mut all| {
+            let any = all.find_map(|address| reach(Ok(address.into())).ok());
+            any.ok_or_else(|| io::ErrorKind::TimedOut.into())
+        }),
     };
     connected.map_err(|_| {
         format!(
@@ -50,7 +54,7 @@ pub fn check(display: &str) -> Result<(), String> {
     })
 }
 
-fn reach(address: (&str, u16)) -> io::Result<()> {
-    let address = address.to_socket_addrs()?.next().ok_or(io::ErrorKind::NotFound)?;
-    TcpStream::connect_timeout(&address, ANSWER).map(drop)
+fn reach(address: io::Result<SockAddr>) -> io::Result<()> {
+    let address = address?;
+    Socket::new(address.domain(), Type::STREAM, None)?.connect_timeout(&address, ANSWER)
 }

@@ -80,6 +80,9 @@ impl DiskUsage {
         let mut open: Vec<PathBuf> = vec![folder.to_owned()];
         let mut is_shown = true;
         while let Some(folder) = open.pop() {
+            if self.until.is_some_and(|until| Instant::now() >= until) {
+                return is_shown;
+            }
             let entries = match std::fs::read_dir(&folder) {
                 Ok(entries) => entries,
                 Err(error) => {

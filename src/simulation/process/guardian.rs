@@ -17,8 +17,7 @@ use std::process::{Child, Command, Stdio};
 use nix::sys::signal::{SigSet, Signal};
 use nix::unistd::setsid;
 
-use super::instance_dir;
-use super::process_tree;
+use super::{instance_dir, process_tree};
 
 /// The command line of a guardian.
 #[derive(Debug, clap::Args)]

@@ -144,7 +144,8 @@ impl Slots {
     fn refusal(&self, present: &Present) -> Option<String> {
         for party in &present.parties {
             let waiting = self.queue().filter(|one| one.parties.contains(party)).count();
-            if waiting >= party.1 {
+            // Whoever may have all slots leaves a part of the queue to others, too.
+            if waiting >= party.1.min((self.queue_capacity * 3 / 4).max(1)) {
                 let all = self.present.values().filter(|one| one.parties.contains(party)).count();
                 return Some(party.0.refusal(all - waiting, waiting));
             }

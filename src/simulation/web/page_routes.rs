@@ -11,8 +11,7 @@ use askama::Template;
 use serde::Deserialize;
 
 use super::access::Visitor;
-use super::pages;
-use super::webots_viewer;
+use super::{pages, webots_viewer};
 use crate::asset;
 use crate::shared::http::assets::{self, Asset};
 use crate::shared::http::routing::{GET, READ, path};

@@ -6,11 +6,8 @@ use actix_web::error::ErrorInternalServerError;
 use actix_web::{HttpRequest, HttpResponse, web};
 
 use super::access::{Visitor, check_origin};
-use super::actions;
-use super::metrics;
-use super::page_routes;
 use super::status::status_page;
-use super::stream_routes;
+use super::{actions, metrics, page_routes, stream_routes};
 use crate::shared::http::routing::{self, GET, READ, path};
 use crate::shared::http::{CONTENT_TYPE, ConnectionKind, websocket};
 use crate::simulation::client::WebClient;
