@@ -49,7 +49,7 @@ impl TryFrom<String> for UrlPrefix {
         };
         let (host, mut segments) = split_url(&text).map_err(wrong)?;
         if text.contains(['*', '?', '#']) || split_repository(&segments).is_ok() {
-            return Err(wrong(ProjectUrlError("it is more than a prefix".to_owned())));
+            return Err(wrong(ProjectUrlError("it names a part of a repository, or has *, ? or #".to_owned())));
         }
         if segments.len() >= 2 {
             segments = plain_repository(segments).map_err(wrong)?;
