@@ -68,12 +68,11 @@ pub fn watch(
             let (config, run, readings) = (Arc::clone(&config), run.clone(), Arc::clone(&readings.borrow()));
             let all = move || check(&config, &run, Some(&readings)).err();
             let mut checked = actix_rt::task::spawn_blocking(all);
-            let found = match actix_rt::time::timeout(HUNG, &mut checked).await {
-                Ok(found) => found,
-                Err(_) => {
-                    publish(&sender, Some("This server's disk or Docker does not answer".to_owned()), &failed_starts);
-                    checked.await
-                }
+            let found = if let Ok(found) = actix_rt::time::timeout(HUNG, &mut checked).await {
+                found
+            } else {
+                publish(&sender, Some("This server's disk or Docker does not answer".to_owned()), &failed_starts);
+                checked.await
             };
             if let Ok(found) = found {
                 publish(&sender, found, &failed_starts);
