@@ -7,7 +7,7 @@ const WORTH_A_WORD = 2;
 /** How long a try may take: a second one would take its token away. In milliseconds. */
 const TRY = 15_000;
 /** A server that refuses all tries for so long, while the session server answers, is gone with its simulations; in milliseconds. */
-const GONE = 3000;
+const GONE = 2500;
 /** Before the second try, doubled each time up to the longest, in milliseconds. */
 const FIRST_PAUSE = 1000;
 const LONGEST_PAUSE = 10_000;
