@@ -1,7 +1,7 @@
 //! What clients and pages may ask, and what they are told.
 
 use super::scene::stages;
-use crate::support::{Client, Server, arm, arm_at, demo_server, http, instances_below, until, world};
+use crate::support::{Client, arm, arm_at, demo_server, http, instances_below, until, world};
 
 #[actix_rt::test]
 async fn a_message_that_is_none_is_answered_in_words() {
@@ -9,9 +9,9 @@ async fn a_message_that_is_none_is_answered_in_words() {
     let mut running = Client::start(&server, &arm()).await;
     let url = running.until("webots:").await;
     let mut viewer = Client::connect(&format!("{}/", url.strip_prefix("webots:").unwrap())).await.with_scene().await;
-    let processes_of =
-        |server: &Server| instances_below(&server.folder).into_iter().map(|(pid, _)| pid).collect::<Vec<_>>();
-    let processes = processes_of(&server);
+    let of_git = |(_, words): &(i32, String)| words.contains("git");
+    until("its checkout has ended", async || !instances_below(&server.folder).iter().any(of_git)).await;
+    let processes = instances_below(&server.folder);
     assert!(processes.len() >= 2, "launcher and simulator");
     let start = |url: &str| serde_json::json!({"start": {"url": url}}).to_string();
     let table = [
@@ -42,7 +42,7 @@ async fn a_message_that_is_none_is_answered_in_words() {
         assert!(html.is_none() && client.heard.iter().any(|text| text.contains("\u{2039}img")), "{:?}", client.heard);
     }
     until("the others are gone", async || stages(&server).await.len() == 1).await;
-    assert_eq!(processes_of(&server), processes);
+    assert_eq!(instances_below(&server.folder), processes);
     viewer.send("pause").await;
     viewer.until("paused by client").await;
 }
