@@ -13,19 +13,19 @@
 //! | [`session::placement`] | which server gets the next client: the load of a server and the key that servers are sorted by (`backend`), the choice of the first (`load_balancer`), cost |
 //! | [`session::mail`] | notices: to whom (`smtp`, one address, from the key `administrator` in `config/session_config`) and how (`channel`), what is in them (`notice_text`), when they go (`outbox`) |
 //! | [`session::fleet`] | the registry and the monitors of simulation servers |
-//! | [`session::web`] | routes, pages, `/status`, Prometheus gauges (`metrics`; counters: `app`) and the WebSocket of the session server |
+//! | [`session::web`] | routes, pages, `/status`, Prometheus metrics (gauges in `metrics`, counters in `app`) and the WebSocket of the session server |
 //! | [`simulation::process`] | process trees: how they start and end (`process_group`; what a server that has died left: `process_tree`, `guardian`); directories of simulations |
 //! | [`simulation::machine`] | readings of the machine (`sensors`) and its GPUs (`gpus`), the load and `monitor.csv` (`load_monitor`); which GPU a simulation gets (`spread`) |
 //! | [`simulation::checkout`] | worlds checked out with git; `timing.checkout` limits a whole checkout (`checkout_service`) and a stalled fetch (`git`), `projectSize` its size; `config/mirrors` has the address of each Git host |
 //! | `simulation::isolation` | how a simulation is launched: its level of isolation (`launcher`), the variables that it inherits, limits; the control group that ends with it (`cgroup`) |
 //! | [`simulation::container`] | simulations in containers: what a project requests, its image, its compose project (its GPU and user, too) |
 //! | [`simulation::ends`] | how simulations have ended: counter, table, their logs (`kept_output`) |
-//! | [`simulation::webots`] | one running Webots: its command line and GPU (`launch_spec`), its log (opened by `launched`, written by `output`), its end (`launched`) |
+//! | [`simulation::webots`] | one running Webots: its command line and GPU (`launch_spec`), its log (path and size in `launched`, its lines in `output`), its end (`launched`) |
 //! | [`simulation::client`] | a client's WebSocket (`web_client`), the session of its simulation, which sends it nearly all messages (`session`; `start`: before Webots runs, with the choice of the GPU) |
 //! | [`simulation::sessions`] | how a connection is attached to its session, and how a client resumes it |
 //! | [`simulation::slots`] | the slots that clients wait for: leases, the queue and the shares of addresses and users (`slot_pool`), the streams of simulations and the tokens that lead to them (`stream`) |
 //! | `simulation::relay` | a stream between a client and the port of its Webots |
-//! | `simulation::web` | routes, pages, `/status` and Prometheus gauges of the simulation server (`metrics`; counters: `app`, `ends`) |
+//! | `simulation::web` | routes, pages, `/status` and Prometheus metrics of the simulation server (gauges in `metrics`, counters in `app` and `ends`) |
 //!
 //! The HTML of pages is in `templates/session` and `templates/simulation` (`monitor.html`: the head of
 //! the monitor's table, `row.html`: a row), their styles (`style.css`) and scripts in `templates/assets`.
