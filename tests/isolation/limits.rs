@@ -30,7 +30,7 @@ async fn who_fills_the_disk_is_told_and_ended() {
     let words = "The simulation has written more than 5 MiB, the limit of this server (limits.disk)";
     let many = |folder: &str| format!("for n in $(seq 20); do head -c 500000 /dev/zero > {folder}/file$n; done");
     let nameless = "for n in $(seq 20); do exec {file}<> own; rm own; head -c 500000 /dev/zero >&$file; done";
-    let deep = "for n in $(seq 3000); do mkdir deep; cd deep; done; head -c 5000000 /dev/zero > file";
+    let deep = "deep=$(printf deep/%.0s $(seq 500)); for n in $(seq 6); do mkdir -p $deep; cd $deep; done; head -c 5000000 /dev/zero > file";
     let hidden = "folders that nobody can look into";
     let mut deeds = vec![("sandbox", deep.to_owned(), hidden)];
     deeds.extend(["/tmp", "$HOME", "$XDG_RUNTIME_DIR"].map(|folder| ("sandbox", many(folder), words)));
