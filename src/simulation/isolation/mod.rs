@@ -7,6 +7,7 @@ mod launcher;
 mod mount;
 mod network;
 mod sandbox;
+mod system_calls;
 mod watcher;
 
 pub use cgroup::Cgroup;

@@ -33,8 +33,9 @@ pub struct OwnNetwork {
 /// second one.
 const RESOLVER: &str = "169.254.1.1";
 const RESOLVER_6: &str = "fd53::1:1";
-/// An address of the internet (for documentation), to which nothing is sent.
-const INTERNET: (Ipv4Addr, u16) = (Ipv4Addr::new(203, 0, 113, 7), 9);
+/// Addresses of the internet (for documentation), to which nothing is sent.
+const INTERNET: IpAddr = IpAddr::V4(Ipv4Addr::new(203, 0, 113, 7));
+const INTERNET_6: IpAddr = IpAddr::V6(Ipv6Addr::new(0x2001, 0xdb8, 0, 0, 0, 0, 0, 7));
 /// The file that names it, and that of a simulation in the folder of its instance.
 const RESOLV_CONF: &str = "/etc/resolv.conf";
 const OWN_RESOLV_CONF: &str = "resolv.conf";
@@ -67,7 +68,8 @@ impl OwnNetwork {
         if closed && nft.is_none() {
             return Err(missing("nft", "nftables"));
         }
-        let loopback = loopback();
+        // pasta makes networks without IPv4 where the machine has no route for it, and then forwards nothing from 127.0.0.1.
+        let loopback = if has_route(INTERNET) { Ipv4Addr::LOCALHOST.into() } else { Ipv6Addr::LOCALHOST.into() };
         let forwarded = if config.ports_are_public() { config.bind } else { loopback };
         Ok(Self { pasta, nft, closed, loopback, forwarded })
     }
@@ -96,6 +98,10 @@ impl OwnNetwork {
         // A port alone is one of all addresses, of either version of IP.
         let is_any = self.forwarded == Ipv6Addr::UNSPECIFIED;
         command.push(if is_any { port.to_string() } else { format!("{}/{port}", self.forwarded) }.into());
+        // It prints a warning about a version of IP for which it finds no route.
+        if self.loopback.is_ipv4() && !has_route(INTERNET_6) {
+            command.push("--ipv4-only".into());
+        }
         // Without the system's log it prints errors. With it, AppArmor may allow no other file.
         if !Path::new(SYSTEM_LOG).exists() {
             command.extend(["--log-file".into(), instance.join("pasta.log").into()]);
@@ -124,9 +130,8 @@ impl OwnNetwork {
     }
 }
 
-/// The machine's loopback address. pasta makes networks without IPv4 where the machine has no route for it, and then
-/// forwards nothing from 127.0.0.1.
-fn loopback() -> IpAddr {
-    let has_route = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).is_ok_and(|socket| socket.connect(INTERNET).is_ok());
-    if has_route { Ipv4Addr::LOCALHOST.into() } else { Ipv6Addr::LOCALHOST.into() }
+/// Whether the machine has a route to this address.
+fn has_route(address: IpAddr) -> bool {
+    let any: IpAddr = if address.is_ipv4() { Ipv4Addr::UNSPECIFIED.into() } else { Ipv6Addr::UNSPECIFIED.into() };
+    UdpSocket::bind((any, 0)).is_ok_and(|socket| socket.connect((address, 9)).is_ok())
 }
