@@ -64,27 +64,27 @@ impl WebClient {
         }
     }
 
-    /// The connection, for a session that this client requests.
-    fn attach(&mut self, ctx: &mut Context) -> Connection {
+    /// The connection, for a session that this client requests. `last` is for a session that drops it without a last text.
+    fn attach(&mut self, last: ToClient, ctx: &mut Context) -> Connection {
         let (session, actions) = unbounded_channel();
         let attached = session.clone();
-        // A session has sent the last text before it drops the other end, unless it has panicked. That text comes before this.
+        // What the session has sent before comes first, and after its last text the client is gone.
         let gone = async move { attached.closed().await };
-        let lost =
-            || ToClient::End(protocol::error("This simulation was lost by a fault of the server"), CloseCode::Error);
-        gone.into_actor(self).map(move |(), _, ctx| ctx.address().do_send(lost())).spawn(ctx);
+        gone.into_actor(self).map(move |(), _, ctx| ctx.address().do_send(last)).spawn(ctx);
         self.session = Some(session);
         Connection { peer: self.peer, client: ctx.address().recipient(), actions }
     }
 
     /// Requests from the session of a token to continue with this connection.
     fn resume(&mut self, token: &str, ctx: &mut Context) {
+        // Also for a session that ends before it reads this.
+        let ended = ToClient::End(protocol::ended(None), CloseCode::Normal);
         let found = Token::parse(token).and_then(|token| Some((token, self.server.sessions.find(token)?)));
         let Some((token, session)) = found else {
             log::info!("client {}: comes back to a simulation that has ended", self.peer);
-            return Self::finish(protocol::ended(None), CloseCode::Normal, ctx);
+            return Handler::handle(self, ended, ctx);
         };
-        session.do_send(Resume { token, connection: self.attach(ctx) });
+        session.do_send(Resume { token, connection: self.attach(ended, ctx) });
     }
 
     fn handle_request(&mut self, text: &str, ctx: &mut Context) {
@@ -101,7 +101,9 @@ impl WebClient {
             (ClientRequest { keep: true, .. }, Some(_)) => self.send(ClientAction::Keep),
             (ClientRequest { start: Some(start), .. }, None) => {
                 let identity = ClientIdentity::new(self.user.as_deref(), start.name.as_deref());
-                Session::open(Arc::clone(&self.server), identity, self.attach(ctx), &start);
+                // Only a session that has panicked says nothing.
+                let lost = ToClient::End(protocol::error("The server has lost this simulation"), CloseCode::Error);
+                Session::open(Arc::clone(&self.server), identity, self.attach(lost, ctx), &start);
             }
             _ => log::info!(
                 "client {}: a message that asks for nothing, or for a second simulation on one connection; ignored",

@@ -123,7 +123,7 @@ impl Present {
         let how = self.how.take().unwrap_or_else(|| {
             let (reason, why) = match self.shown.launched {
                 None => (EndReason::Left, "Its client has gone"),
-                Some(_) => (EndReason::Fault, "The simulation was lost by a fault of this server"),
+                Some(_) => (EndReason::Fault, "The server has lost this simulation"),
             };
             End { reason, why: why.to_owned(), taken: Taken::default() }
         });

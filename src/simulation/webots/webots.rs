@@ -230,7 +230,7 @@ impl Webots {
 impl Drop for Webots {
     /// Its session always hears of its end, also if it panics and is dropped.
     fn drop(&mut self) {
-        let why = "The simulation was lost by a fault of this server".to_owned();
+        let why = "The server has lost this simulation".to_owned();
         let exit = self.exit.take().unwrap_or(WebotsExit { clean: false, own: true, why });
         self.send(WebotsEvent::Exited(exit));
     }
