@@ -195,7 +195,7 @@ impl ExitReason {
         match (status.signal(), status.code().unwrap_or_default()) {
             (Some(signal), _) => Self::Signal(signal),
             (None, NOT_FOUND) => Self::NotStarted,
-            (None, code) if in_sandbox && code > SIGNALLED => Self::Signal(code - SIGNALLED),
+            (None, code) if in_sandbox && Signal::try_from(code - SIGNALLED).is_ok() => Self::Signal(code - SIGNALLED),
             (None, code) => Self::Code(code),
         }
     }
@@ -226,6 +226,11 @@ mod tests {
         assert_eq!(reason(127 << 8), ExitReason::NotStarted);
         assert_eq!(reason(9), ExitReason::Signal(9));
         assert_eq!(ExitReason::of(ExitStatus::from_raw(139 << 8), true), ExitReason::Signal(11));
+        assert_eq!(
+            ExitReason::of(ExitStatus::from_raw(255 << 8), true),
+            ExitReason::Code(255),
+            "no signal has this number"
+        );
     }
 
     fn shell(script: &str) -> SpawnSpec {
