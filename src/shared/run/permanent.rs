@@ -55,4 +55,17 @@ mod tests {
         .await;
         assert_eq!(starts, 2);
     }
+
+    #[actix_rt::test]
+    async fn a_task_that_panics_again_and_again_ends_the_server() {
+        // The process that ends is this test, started once more.
+        if std::env::var_os("PANICS").is_some() {
+            restarted("a task", async || panic!("this panic is part of a test")).await;
+        }
+        let this = concat!(module_path!(), "::a_task_that_panics_again_and_again_ends_the_server");
+        let this = this.split_once("::").unwrap().1;
+        let mut again = std::process::Command::new(std::env::current_exe().unwrap());
+        let ended = again.args(["--exact", this]).env("PANICS", "").output().unwrap();
+        assert_eq!(ended.status.code(), Some(1));
+    }
 }
