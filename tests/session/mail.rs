@@ -164,7 +164,7 @@ async fn a_test_mail_says_how_it_went() {
     }
     for key in ["administrator", "mailServer", "mailSender"] {
         let (code, said) = says("--test-mail", &keys(25, &json!({ key: null })), "/dev/null").await;
-        assert!(code == Some(1) && said.contains(&format!("notifications are off: {key} is not set")), "{said}");
+        assert!(code == Some(1) && said.contains(&format!("no mail is sent: {key} is not set")), "{said}");
     }
     let mut smtp = Smtp::start(&[]).await;
     let (code, said) = says("--test-mail", &keys(smtp.port, &json!({})), "/dev/null").await;

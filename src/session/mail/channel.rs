@@ -36,7 +36,7 @@ impl Channel {
     /// # Errors
     /// When a key without which no mail is sent is not set.
     pub fn mail(config: &SessionConfig) -> Result<Self, String> {
-        let relay = SmtpRelay::new(config).map_err(|key| format!("notifications are off: {key} is not set"))?;
+        let relay = SmtpRelay::new(config).map_err(|key| format!("no mail is sent: {key} is not set"))?;
         let (server, transport) = (relay.server(), Transport::Smtp(Box::new(relay)));
         Ok(Self { name: "mail", server, transport, time_limit: config.timing.mail_answer })
     }
