@@ -7,7 +7,7 @@
 //! |---|---|
 //! | [`shared::text`] | untrusted texts, made safe to show |
 //! | [`shared::config`] | configuration files: loading, errors, kinds of values, a macro for structs of keys (`keys`) |
-//! | [`shared::domain`] | addresses, loads, world URLs and the forges that they name (`project_url`), a server's report |
+//! | [`shared::domain`] | addresses, loads, world URLs and the Git hosts that they name (`project_url`), a server's report |
 //! | [`shared::run`] | start, readiness, log, stop |
 //! | [`shared::http`] | pages, live updates, WebSockets, limits, certificates, metrics |
 //! | [`session::placement`] | which server gets the next client: the load of a server and the key that servers are sorted by (`backend`), the choice of the first (`load_balancer`), cost |

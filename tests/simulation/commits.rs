@@ -64,7 +64,7 @@ async fn a_commit_that_no_branch_or_tag_vouches_for_runs_only_where_that_is_allo
                 if any {
                     assert_eq!(told.contains("opened [WorldInfo"), hash != none, "{told}");
                 } else {
-                    assert!(told.contains("is in no branch or tag of https://github.com/lab/arm. Forges"), "{told}");
+                    assert!(told.contains("is in no branch or tag of https://github.com/lab/arm. Git hosts"), "{told}");
                 }
             }
         }

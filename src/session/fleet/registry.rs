@@ -12,8 +12,7 @@ use tokio::sync::watch;
 
 use super::name_table::look_up_all;
 use super::server_monitor::ProbeResult;
-use super::server_record::{FleetStatus, ServerStatus};
-use super::server_record::{ServerRecord, ServerState, is_refused};
+use super::server_record::{FleetStatus, ServerRecord, ServerState, ServerStatus, is_refused};
 use super::server_table::ServerTable;
 use super::state_history::StateHistory;
 use crate::session::config::SessionConfig;

@@ -1,7 +1,6 @@
 //! Reads configuration files: JSON with camelCase keys.
 //!
-//! An error is one line with the file, the key, what was found and what is expected. An unknown key is a warning with
-//! the most similar known key.
+//! An error is one line with the file, the key, what was found and what is expected. An unknown key is a warning.
 
 use std::path::Path;
 

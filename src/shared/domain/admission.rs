@@ -88,7 +88,7 @@ mod tests {
         };
         let table = [
             ("lab/arm", true, 50.0, 99.0, "", "allowed at any load"),
-            ("LAB/arm", false, 0.0, 0.0, "", "forges don't tell cases apart"),
+            ("LAB/arm", false, 0.0, 0.0, "", "Git hosts ignore case"),
             ("lab/secret", true, 50.0, 0.0, "blocked", "blocked even where allowed"),
             ("evil/x", true, 50.0, 0.0, "blocked", "no way around by small letters"),
             ("lab-evil/arm", false, 50.0, 0.0, "Docker", "a like beginning is no prefix"),

@@ -80,7 +80,7 @@ mod tests {
             ("https://github.com/lab", "lab/x", true, "an owner"),
             ("https://github.com/lab/", "lab/x", true, "a slash at the end changes nothing"),
             ("https://github.com/", "lab/x", true, "a whole host"),
-            ("https://GitHub.com/LAB", "lab/x", true, "forges don't tell cases apart"),
+            ("https://GitHub.com/LAB", "lab/x", true, "Git hosts ignore case"),
             ("https://github.com/lab", "lab-evil/x", false, "another owner with the same beginning"),
             ("https://github.com/lab/x", "lab/xy", false, "another repository with the same beginning"),
             ("https://github.com/lab/x.git", "lab/x", true, "git's ending changes nothing"),

@@ -175,7 +175,7 @@ impl Search<'_> {
         let name = self.world.repository();
         if revision.trust == TrustSource::Url && !self.is_accepted(&revision.commit).await? {
             return Err(refused(format!(
-                "{} is in no branch or tag of {name}. Forges also hand out commits that a repository's owner never \
+                "{} is in no branch or tag of {name}. Git hosts also hand out commits that a repository's owner never \
                  accepted; this simulation server runs them only if its administrator sets anyCommit",
                 revision.name
             )));

@@ -59,9 +59,7 @@ impl WorldFile {
         let line = String::from_utf8_lossy(&line).trim().to_owned();
         match line.split_whitespace().collect::<Vec<_>>().as_slice() {
             ["#VRML_SIM", version, "utf8", ..] => Ok(Self { version: (*version).to_owned(), path }),
-            _ => {
-                Err(format!("{name} is no world file: its first line is {line:?}, not like \"#VRML_SIM R2025a utf8\""))
-            }
+            _ => Err(format!("{name} is no world file: its first line is {line:?}, not \"#VRML_SIM R2025a utf8\"")),
         }
     }
 }

@@ -25,7 +25,7 @@ pub async fn follow(
 ) -> Result<(ProjectUrl, Remote), CheckoutError> {
     let target = match location(repository).await {
         Some(location) => target(mirrors, rules, world, &location),
-        None => Err("to where its forge does not say".to_owned()),
+        None => Err("to where its Git host does not say".to_owned()),
     };
     let target = target.map_err(|why| refused(format!("{} has moved {why}", world.repository())))?;
     log::info!("{} is at {}", world.repository(), target.1.location);
@@ -43,7 +43,7 @@ async fn location(repository: &Repository) -> Option<String> {
     let mut call = repository.call(&["ls-remote", "--quiet", "--", REMOTE, "HEAD"]);
     let trace = ["GIT_TRACE_CURL", "GIT_TRACE_CURL_NO_DATA"];
     call.spec.environment.extend(trace.map(|name| (name.into(), "1".into())));
-    // It fails again, since the forge sends it elsewhere.
+    // It fails again, since the Git host sends it elsewhere.
     repository.git.run(call, on_line).await.ok();
     location
 }
@@ -60,7 +60,7 @@ fn target(
     let remote = Url::parse(&remote).map_err(no_url)?;
     let mut target = remote.join(location).map_err(no_url)?;
     if target.origin() != remote.origin() || !target.username().is_empty() || target.password().is_some() {
-        return Err("to another host. No forge is followed there: give the URL of where it is now".to_owned());
+        return Err("to another host. Redirects to other hosts are not followed: give its new URL".to_owned());
     }
     target.set_query(None);
     target.set_fragment(None);

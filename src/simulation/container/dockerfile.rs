@@ -112,10 +112,8 @@ impl Dockerfile {
 }
 
 fn wrong(number: usize, line: &str, why: &str) -> String {
-    format!(
-        "The Dockerfile of this project can't be used, line {number}, `{}`: {why}",
-        excerpt(line.trim(), MAX_EXCERPT)
-    )
+    let line = excerpt(line.trim(), MAX_EXCERPT);
+    format!("The Dockerfile of this project can't be used, line {number}, `{line}`: {why}")
 }
 
 #[cfg(test)]
