@@ -25,7 +25,7 @@ const OWN_FILES: usize = 128;
 /// Connections to one simulation server: one in use, one that is closing.
 const FILES_PER_SERVER: usize = 2;
 
-/// Timeout of open connections when the server stops, which takes at most five seconds.
+/// Timeout for closing open connections at shutdown, which takes at most five seconds in all.
 const STOP_TIMEOUT: Duration = Duration::from_secs(4);
 
 /// Values of the metric's label `outcome`. All of them are exported from the start.
@@ -86,11 +86,11 @@ async fn handle_commands(signals: &mut Signals, file: &Path, server: &AppState) 
     }
 }
 
-/// Returns the limits of connections and of clients, so that `files` open files are enough for them and the rest of the
-/// server. The limit of clients is lower: the remaining connections serve the error that there are too many clients.
+/// Returns the limits of connections and of clients that `files` open files allow. The limit of clients is lower: the
+/// remaining connections answer further clients with an error.
 fn bound_clients(files: u64, config: &SessionConfig) -> Result<(usize, usize), String> {
     let all = usize::try_from(files).unwrap_or(usize::MAX);
-    // It is not known yet how many servers names resolve to: they reserve a quarter.
+    // The names are not resolved yet, so their servers reserve a quarter.
     let has_names = config.simulation_servers.iter().any(|entry| entry.name().is_some());
     let servers = if has_names { all / 4 } else { FILES_PER_SERVER * config.simulation_servers.len() };
     let connections = all.saturating_sub(OWN_FILES + servers);
@@ -128,7 +128,7 @@ fn assemble(
     })
 }
 
-/// Reads the configuration file again. One that can't be used changes nothing.
+/// Reloads the configuration file. An invalid file changes nothing.
 fn reload(file: &Path, server: &AppState) {
     match config::load::<SessionConfig>(file) {
         Ok(loaded) => {
@@ -137,7 +137,7 @@ fn reload(file: &Path, server: &AppState) {
             }
             let entries = loaded.config.simulation_servers.len();
             log::info!("read {} again: {entries} entries in simulationServers", file.display());
-            // The URLs of the fleet stay as they were at the start.
+            // `client_urls` keeps the value of `ssl` from the start, so the probes keep it too.
             let config = SessionConfig { ssl: server.config.ssl, ..loaded.config };
             server.registry.do_send(Reconfigure(Arc::new(config)));
         }

@@ -20,7 +20,7 @@ pub struct AppState {
     pub registry: Addr<Registry>,
     /// Whether a simulation server can take a client; the registry publishes it.
     pub available: watch::Receiver<bool>,
-    /// The configuration at the start of the server: only the registry follows a change.
+    /// The configuration from the start of the server: only the registry applies a reloaded one.
     pub config: Arc<SessionConfig>,
     /// Forms the URLs of simulation servers for clients.
     pub client_urls: ClientUrls,
@@ -36,7 +36,7 @@ pub struct AppState {
     pub live: LiveUpdates,
     /// The administrator's announcement: one line of text, never markup; empty if there is none.
     pub announcement: watch::Sender<String>,
-    /// Checks the administrator's password, where one is configured.
+    /// Checks the administrator's password, if one is configured.
     pub admin_auth: Option<BasicAuth>,
     /// When the server was started.
     pub started: Instant,
@@ -56,11 +56,11 @@ impl AppState {
         self.registry.send(GetStatus).await.map_err(|_| ErrorServiceUnavailable("Error: the server stops."))
     }
 
-    /// Asks the registry for a simulation server for a client of this address, and returns its URL. The world is a URL, if
-    /// the client named one.
+    /// Asks the registry for a simulation server for the client at the address `from`, and returns the server's URL.
+    /// `world` is the world's URL, if the client named one.
     ///
     /// # Errors
-    /// Why there is none.
+    /// Why no server is available.
     pub async fn pick(&self, world: Option<&str>, from: Option<IpAddr>) -> Result<String, PickError> {
         let picked = async {
             let world = world.filter(|text| !text.is_empty()).map(ProjectUrl::parse).transpose()?;

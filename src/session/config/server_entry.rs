@@ -25,7 +25,7 @@ impl ServerEntry {
         if let Self::Server(address) = self { Some(address) } else { None }
     }
 
-    /// The name to resolve and the port, if this is one.
+    /// The name to resolve and the port, unless this is an address.
     pub fn name(&self) -> Option<&PublicAddress> {
         if let Self::Name(name) = self { Some(name) } else { None }
     }
@@ -57,7 +57,7 @@ impl From<ServerEntry> for String {
     }
 }
 
-/// Whether the host of an address is not known yet.
+/// Whether an address has a host name to resolve and a port that is not rewritten.
 fn is_name(address: &PublicAddress) -> bool {
     let is_address = address.host().starts_with('[') || address.host().parse::<IpAddr>().is_ok();
     !is_address && !address.is_rewritten()

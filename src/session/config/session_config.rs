@@ -36,31 +36,31 @@ pub struct SessionConfig {
     /// Whether a reverse proxy rewrites ports in URLs: HOST/PORT, not HOST:PORT. Default: true.
     pub port_rewrite: bool = true,
     /// How clients reach the simulation servers through one reverse proxy: a URL with the placeholders `{host}` and
-    /// `{port}`. Default: none, and each is reached under its own address.
+    /// `{port}`. Default: none, and each is reached at its own address.
     pub public_url: Option<PublicUrl> = None,
     /// The simulation servers: HOST:PORT, HOST/PORT, or `dns+NAME:PORT` for all addresses of a name.
     /// Required.
     pub simulation_servers: Vec<ServerEntry> = Vec::new(),
     /// Those of `simulationServers` that get no new clients. They are still monitored. Default: none.
     pub drained_servers: Vec<PublicAddress> = Vec::new(),
-    /// Mail address of the administrator, who gets notifications. Default: none, and there are no notifications.
+    /// Mail address of the administrator, who gets notifications. Default: none, and no mail is sent.
     #[serde(deserialize_with = "mail_address::optional")]
     pub administrator: Option<Mailbox> = None,
-    /// Host of the SMTP server. Default: none, and there are no notifications.
+    /// Host of the SMTP server. Default: none, and no mail is sent.
     pub mail_server: Option<String> = None,
     /// SMTP port. Default: 25, with a password 587.
     #[serde(deserialize_with = "optional_whole::<1, 65535, _, _>")]
     pub mail_server_port: Option<u16> = None,
     /// Whether the SMTP server encrypts from the first byte, without STARTTLS. Default: true for port 465, else false.
     pub mail_server_implicit_tls: Option<bool> = None,
-    /// Mail address that notifications come from. Default: none, and there are no notifications.
+    /// Mail address that notifications come from. Default: none, and no mail is sent.
     #[serde(deserialize_with = "mail_address::optional")]
     pub mail_sender: Option<Mailbox> = None,
     /// User name for SMTP. Default: `mailSender`.
     pub mail_sender_user: Option<String> = None,
     /// Password for SMTP. With a password the connection is always encrypted. Default: none.
     pub mail_sender_password: Option<Secret> = None,
-    /// URL to which each mail's notices are posted as JSON, `{"text": ...}`, as Slack and Matrix take them. Default: none.
+    /// URL that notices are posted to as JSON, `{"text": ...}`, as Slack and Matrix expect it. Default: none.
     pub webhook: Option<Secret> = None,
     /// Password for actions such as `/announcement`. Default: none, and actions are off.
     pub admin_password: Option<Secret> = None,
@@ -83,7 +83,7 @@ pub struct SessionConfig {
     #[serde(deserialize_with = "whole::<1, 1_000_000, _, _>")]
     pub max_clients: usize = 20_000,
     /// Limit of open client `WebSockets` per client address. Default: three quarters of `maxClients`, but at most 1000,
-    /// because a class sits behind one address.
+    /// because a class shares one address.
     #[serde(deserialize_with = "optional_whole::<1, 1_000_000, _, _>")]
     pub max_clients_per_address: Option<usize> = None,
     /// Reverse proxies, as addresses or networks, whose header `X-Forwarded-For` is trusted.

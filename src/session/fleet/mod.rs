@@ -1,4 +1,4 @@
-//! The simulation servers: which there are, the last report of each, and which one gets the next client.
+//! The simulation servers: their list, the last report of each, and the choice of one for the next client.
 
 mod name_table;
 mod registry;

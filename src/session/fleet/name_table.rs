@@ -43,7 +43,7 @@ pub async fn look_up_all(names: Vec<PublicAddress>) -> Vec<(PublicAddress, Looku
 }
 
 async fn servers(name: &PublicAddress) -> LookupResult {
-    // All tries of the resolver together: they delay the other names.
+    // One timeout for all attempts of the resolver, because they delay the results of the other names.
     let addresses =
         timeout(Duration::from_secs(2), look_up(name.host())).await.map_err(|_| "timed out".to_owned())??;
     addresses.into_iter().map(|address| SocketAddr::new(address, name.port()).to_string().parse()).collect()

@@ -56,7 +56,7 @@ impl PickError {
 #[rtype(result = "Arc<FleetStatus>")]
 pub struct GetStatus;
 
-/// Replaces the configuration: the servers, what is known of placing on them, and how they are probed.
+/// Replaces the configuration: the servers, the placement policy, and how servers are probed. What was learned stays.
 #[derive(Message)]
 #[rtype(result = "()")]
 pub struct Reconfigure(pub Arc<SessionConfig>);
@@ -155,7 +155,7 @@ impl Registry {
         }
     }
 
-    /// Looks all names up, again and again.
+    /// Looks up all names periodically.
     fn look_up_names(&mut self, ctx: &mut Context<Self>) {
         look_up_all(self.servers.names.names())
             .into_actor(self)

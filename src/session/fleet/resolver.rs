@@ -27,7 +27,7 @@ const TIMEOUT: Duration = Duration::from_secs(1);
 /// As text, when there is no answer or no address in it.
 pub async fn look_up(name: &str) -> Result<Vec<IpAddr>, String> {
     let found = async {
-        // Without /etc/resolv.conf there is /etc/hosts.
+        // Without /etc/resolv.conf, only /etc/hosts is used.
         let mut builder = TokioResolver::builder_tokio().unwrap_or_else(|_| {
             let none = ResolverConfig::from_name_servers(Vec::new());
             TokioResolver::builder_with_config(none, TokioRuntimeProvider::default())

@@ -1,12 +1,11 @@
 //! Task: probes one simulation server.
 //!
-//! Started by the registry for each simulation server. Every `loadRefresh` it requests the server's
-//! state, one request at a time, and sends the result to the registry. If the registry's mailbox is full, the result is
-//! dropped: the next probe replaces it. The task ends when the registry drops its channel; after a panic it
-//! begins again.
+//! Started by the registry for each simulation server. Every `loadRefresh` it requests the server's state, one request
+//! at a time, and sends the result to the registry. If the registry's mailbox is full, the result is dropped: the next
+//! probe replaces it. The task ends when the registry drops its channel, and restarts after a panic.
 //!
-//! It requests `/status`, or `/load` if the server has no such page: the original has only that. No answer is trusted:
-//! the whole probe has a timeout, the answer a size limit, and the load must be plausible.
+//! It requests `/status`, or `/load` if the server has no `/status`, as the original. No answer is trusted: the whole
+//! probe has a timeout, the answer a size limit, and the load must be plausible.
 
 use std::fmt::Display;
 use std::sync::{Arc, LazyLock};
@@ -52,7 +51,7 @@ const SLOT: Duration = Duration::from_millis(10);
 static BEGIN: LazyLock<Instant> = LazyLock::new(Instant::now);
 /// Longest text of a server that is kept, in characters.
 const MAX_REASON_LENGTH: usize = 500;
-/// How long only `/load` is requested from a server that has no `/status`.
+/// Time for which only `/load` is requested from a server without `/status`.
 const LOAD_ONLY: Duration = Duration::from_mins(1);
 
 /// Status codes of a server that has no such page; some servers answer only that the request is invalid.
@@ -72,8 +71,8 @@ fn client(interval: Duration, tls: Option<Arc<ClientConfig>>) -> awc::Client {
     awc::Client::builder().connector(connector).disable_timeout().disable_redirects().finish()
 }
 
-/// Probes a server now, and then at regular times in a random slot, until the registry stops: reports of all servers in
-/// the same slot would delay the requests of clients.
+/// Probes a server now, and then every `loadRefresh` until the registry stops. The slot is random: reports of all
+/// servers in the same slot would delay the requests of clients.
 pub async fn monitor(
     server: PublicAddress,
     config: &SessionConfig,
@@ -97,7 +96,7 @@ pub async fn monitor(
             // The registry has stopped, and the server with it.
             Err(SendError::Closed(_)) => return,
         }
-        // A time that has passed during the probe is left out.
+        // Skips a tick that passed during the probe.
         times.tick().now_or_never();
         times.tick().await;
     }
@@ -111,7 +110,7 @@ async fn probe(client: &awc::Client, url: &str, without_status: &mut Option<Inst
     }
     let body = get(client, &format!("{url}/load")).await?;
     let (bytes, length) = body.ok_or_else(|| bad_answer("it has neither /status nor /load"))?;
-    // awc takes the end of the connection for the end of the body: 95.5 may be 9. JSON that is cut off is none.
+    // awc takes the end of the connection for the end of the body: 95.5 may arrive as 9. Truncated JSON is not valid.
     if length != Some(bytes.len()) {
         return Err(bad_answer("an answer that does not end as its Content-Length says"));
     }
@@ -122,13 +121,13 @@ async fn probe(client: &awc::Client, url: &str, without_status: &mut Option<Inst
     Ok(report)
 }
 
-/// Returns the body of a page and its length as announced, `None` if the server has no such page.
+/// Returns the body of a page and its `Content-Length`, `None` if the server has no such page.
 ///
 /// # Errors
-/// When there is no answer, or one that is neither.
+/// When no valid answer arrives.
 async fn get(client: &awc::Client, url: &str) -> Result<Option<(Bytes, Option<usize>)>, String> {
     let answer = match client.get(url).send().await {
-        // A kept connection may have been closed, which is not a fault of the server.
+        // The server may have closed an idle connection, which is not a failure: retry once.
         Err(error) if is_broken(&error) => client.get(url).send().await,
         answer => answer,
     }

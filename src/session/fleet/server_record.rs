@@ -1,4 +1,4 @@
-//! What the registry knows of one simulation server, and what its changes mean. Part of the registry.
+//! What the registry knows of one simulation server, and which of its changes are mailed. Part of the registry.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -60,7 +60,7 @@ pub struct StateChange {
     pub why: String,
 }
 
-/// A change of a server's state, and what is mailed of it to the administrator.
+/// A change of a server's state, and the notice of it to the administrator, if any.
 pub type ServerChange = (StateChange, Option<NoticeKind>);
 
 impl ServerState {
@@ -85,8 +85,8 @@ impl ServerRecord {
         }
     }
 
-    /// Records a report that arrived at this time; the server counts as full from the load `limit` on, in percent.
-    /// Returns what has changed.
+    /// Records a report that arrived at this time. From a load of `limit` percent the server counts as full. Returns
+    /// what has changed.
     pub fn succeeded(&mut self, report: Arc<ServerReport>, at: Instant, limit: f64) -> Option<ServerChange> {
         let load = report.load.percent();
         let full = report.instances.filter(|instances| instances.present() >= instances.places);

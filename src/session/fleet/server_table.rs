@@ -81,7 +81,7 @@ impl ServerTable {
         }
     }
 
-    /// Starts the monitor of a server, in place of the one that it has.
+    /// Starts the monitor of a server, replacing one that runs.
     fn start_monitor(&mut self, server: PublicAddress, config: &Arc<SessionConfig>) {
         let (sender, stopped) = oneshot::channel();
         self.monitors.insert(server.clone(), sender);

@@ -17,7 +17,7 @@ pub struct StateHistory {
     mailers: Vec<UnboundedSender<Notice>>,
 }
 
-/// How many changes are kept.
+/// Number of changes that are kept.
 const KEPT: usize = 50;
 
 impl StateHistory {
@@ -26,7 +26,7 @@ impl StateHistory {
         Self { recent: VecDeque::new(), mailers: mail::start(config) }
     }
 
-    /// Adds a change of a server whose record is now `record`, with what is mailed of it.
+    /// Adds and logs a change, and notifies the administrator of `event`. `record` is the server's record after it.
     pub fn add(&mut self, record: &ServerRecord, change: StateChange, event: Option<NoticeKind>) {
         let StateChange { at, server, state, why } = &change;
         let level = if *state == ServerState::Down { log::Level::Warn } else { log::Level::Info };

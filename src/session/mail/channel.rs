@@ -1,7 +1,7 @@
-//! The channels on which notices go: by mail, and to a messenger.
+//! The channels for notices: mail, and the webhook of a messenger.
 //!
 //! A messenger takes one JSON object with the field `text`, as Slack, Matrix' hookshot and Mattermost do. Anybody who
-//! knows its URL can post there, so it is a secret: no log and no error contains it.
+//! knows the URL can post there, so the URL is a secret: no log and no error contains it.
 
 use std::time::Duration;
 
@@ -15,7 +15,7 @@ use crate::shared::config::Secret;
 use crate::shared::http::tls;
 use crate::shared::text::{client_text, one_line};
 
-/// A channel for notices. Each has its own retries: one that does not work holds up no other.
+/// A channel for notices. Each has its own retries: one that fails does not delay the other.
 pub struct Channel {
     /// Its name in the log.
     pub(super) name: &'static str,
@@ -34,7 +34,7 @@ impl Channel {
     /// To the administrator's mail address.
     ///
     /// # Errors
-    /// When a key without which no mail is sent is not set.
+    /// When a key that mail requires is not set.
     pub fn mail(config: &SessionConfig) -> Result<Self, String> {
         let relay = SmtpRelay::new(config).map_err(|key| format!("no mail is sent: {key} is not set"))?;
         let (server, transport) = (relay.server(), Transport::Smtp(Box::new(relay)));
@@ -53,7 +53,7 @@ impl Channel {
     /// Delivers a text within `timing.mailAnswer`. Returns the server's answer.
     ///
     /// # Errors
-    /// Why it is not taken, in one line.
+    /// Why the server did not accept it, in one line.
     pub(super) async fn deliver(&self, text: &str) -> Result<String, String> {
         let delivered = timeout(self.time_limit, async {
             match &self.transport {
@@ -66,10 +66,10 @@ impl Channel {
         delivered.await.unwrap_or_else(timed_out).map(|answer| one_line(&answer)).map_err(problem)
     }
 
-    /// Sends a test now. Returns what was answered.
+    /// Sends a test. Returns the server's answer, as text.
     ///
     /// # Errors
-    /// Why it was not taken.
+    /// Why the server did not accept it.
     pub async fn test(&self, config: &SessionConfig) -> Result<String, String> {
         let answer = self.deliver(&test_text(&signature(config))).await?;
         Ok(format!("{} took a test: {answer}", self.server))
@@ -78,9 +78,9 @@ impl Channel {
 
 /// Posts a text to a messenger. Returns the status of the answer.
 async fn post(url: &Secret, text: &str) -> Result<String, String> {
-    // Messengers take what is in angle brackets for links and calls.
+    // Messengers take text in angle brackets for links and mentions.
     let text: Vec<String> = text.lines().map(client_text).collect();
-    // The delivery as a whole has a timeout; awc has one of its own for connections that is shorter.
+    // The delivery as a whole has a timeout; awc's own timeout for connecting is shorter.
     let mut connector = awc::Connector::new().timeout(Duration::from_hours(24));
     if let Some(config) = tls::client_config() {
         connector = connector.rustls_0_23(config);

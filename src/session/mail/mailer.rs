@@ -1,7 +1,7 @@
 //! Task: sends notices to the administrator on one channel, by mail or by webhook.
 //!
-//! Started with the registry for each channel that is configured; after a panic it begins again. It receives [`Notice`]s.
-//! [`Outbox`] decides what is sent, and when. One batch is sent at a time; notices that come meanwhile wait in the channel.
+//! Started with the registry for each channel that is configured; restarted after a panic. It receives [`Notice`]s.
+//! [`Outbox`] decides what is sent, and when. One batch is sent at a time; notices that arrive meanwhile are queued.
 
 use std::time::Instant;
 
@@ -14,7 +14,7 @@ use super::outbox::{Notice, Outbox, WaitingNotice};
 use crate::session::config::SessionConfig;
 use crate::shared::run::permanent;
 
-/// Starts a mailer for each channel that is configured. Returns where their notices go.
+/// Starts a mailer for each channel that is configured. Returns the senders for their notices.
 pub fn start(config: &SessionConfig) -> Vec<UnboundedSender<Notice>> {
     let mail = Channel::mail(config).inspect_err(|why| log::info!("{why}"));
     let (signature, timing) = (signature(config), config.timing.clone());
@@ -31,7 +31,7 @@ pub fn start(config: &SessionConfig) -> Vec<UnboundedSender<Notice>> {
     mail.into_iter().chain(Channel::webhook(config)).map(start).collect()
 }
 
-/// Sends what comes, until the server ends.
+/// Sends the notices that arrive, until the server ends.
 async fn send_all(channel: &Channel, signature: &str, mut outbox: Outbox, notices: &mut UnboundedReceiver<Notice>) {
     loop {
         let due = outbox.due();

@@ -1,4 +1,4 @@
-//! Notices to the administrator, by mail and by webhook: what is worth one, how it is worded, and how it is sent.
+//! Notices to the administrator, by mail and by webhook: their kinds, text, batches and delivery.
 
 mod channel;
 mod mailer;

@@ -9,12 +9,12 @@ use crate::shared::text::excerpt;
 /// Longest untrusted text that is shown, in characters.
 const MAX_LETTERS: usize = 500;
 
-/// The last lines of each text: where the monitor is, and which session server has sent it.
+/// The last lines of each text: the URL of the monitor, and the session server that sends the text.
 pub fn signature(config: &SessionConfig) -> String {
     format!("Monitor: {}/monitor\nSent by the session server {}\n", config.http_url(), config.address())
 }
 
-/// The text about these entries, of several lines. The first is the subject of a mail.
+/// The text about these notices. Its first line is the subject of a mail.
 pub fn notice_text(entries: &[WaitingNotice], signature: &str) -> String {
     let paragraphs: String = entries.iter().map(|entry| paragraph(&entry.notice)).collect();
     format!("{}\n\n{paragraphs}{signature}", summary(entries))

@@ -64,7 +64,7 @@ impl NoticeKind {
 pub struct WaitingNotice {
     /// What has happened.
     pub notice: Notice,
-    /// When it has waited for others for long enough.
+    /// When its time to wait for others, `gather`, ends.
     gathered: Instant,
     /// When it is given up if it can't be sent.
     expires: Instant,
@@ -86,7 +86,7 @@ pub struct Outbox {
 #[derive(Debug, Default)]
 struct TopicState {
     waiting: Option<WaitingNotice>,
-    /// Until when its notices are held back, after an e-mail about it.
+    /// The end of the time in which its notices are held back, after an e-mail about it.
     held_until: Option<Instant>,
 }
 
@@ -115,7 +115,7 @@ impl Outbox {
         Some(first).max(self.retry_at)
     }
 
-    /// Removes and returns what is due for mail now, sorted by topic, then by server. The caller must report the
+    /// Removes and returns the notices that are due, sorted by topic, then by server. The caller must report the
     /// outcome by [`Self::succeeded`] or [`Self::failed`].
     pub fn take(&mut self, now: Instant) -> Vec<WaitingNotice> {
         self.topics.retain(|_, topic| topic.waiting.is_some() || topic.held_until > Some(now));
@@ -203,7 +203,7 @@ mod tests {
                     (21, vec![(4, NotResponding)]),
                 ],
             ),
-            // The end of a failure is told once the time of flapping is over.
+            // A recovery is mailed once the time of flapping is over.
             (vec![(0, 1, NotResponding), (100, 1, WorkingAgain)], vec![one(10, NotResponding), one(610, WorkingAgain)]),
             (vec![(0, 1, MaximumLoad), (590, 1, AvailableAgain)], vec![one(10, MaximumLoad), one(610, AvailableAgain)]),
             // A second failure soon after the first waits.
@@ -211,9 +211,9 @@ mod tests {
                 vec![(0, 1, NotResponding), (100, 1, WorkingAgain), (200, 1, NotResponding)],
                 vec![one(10, NotResponding), one(610, NotResponding)],
             ),
-            // A failure is told though the same server was at maximum load before.
+            // A failure is mailed although the same server was at maximum load before.
             (vec![(0, 1, MaximumLoad), (60, 1, NotResponding)], vec![one(10, MaximumLoad), one(70, NotResponding)]),
-            // One that flaps does not hold up the others.
+            // A server that flaps does not delay the others.
             (
                 vec![(0, 1, NotResponding), (20, 1, WorkingAgain), (21, 1, NotResponding), (30, 2, NotResponding)],
                 vec![one(10, NotResponding), (40, vec![(2, NotResponding)]), one(610, NotResponding)],

@@ -33,7 +33,7 @@ impl SmtpRelay {
     /// The SMTP server of the configuration.
     ///
     /// # Errors
-    /// The key that is required for e-mails and not set.
+    /// The first key that e-mails require and that is not set.
     pub(super) fn new(config: &SessionConfig) -> Result<Self, &'static str> {
         let from = config.mail_sender.clone().ok_or("mailSender")?;
         let host = config.mail_server.clone().ok_or("mailServer")?;
@@ -64,8 +64,8 @@ impl SmtpRelay {
         // Automatic responders must not answer (RFC 3834).
         let name = HeaderName::new_from_ascii_str("Auto-Submitted");
         message.headers_mut().insert_raw(HeaderValue::new(name, "auto-generated".to_owned()));
-        // lettre's timeout covers connecting only. Its pool would reuse a connection after a timeout for the next
-        // e-mail.
+        // The caller sets the timeout, because lettre's covers connecting only. Each e-mail gets a new connection:
+        // lettre's pool would reuse one that has timed out.
         let answer = async { self.transport()?.send(message).await }.await.map_err(|error| reason(&error))?;
         Ok(answer.first_line().unwrap_or_default().to_owned())
     }

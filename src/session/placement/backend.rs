@@ -71,15 +71,15 @@ pub(super) struct Backend {
     pub(super) in_flight: VecDeque<Placement>,
     /// Number of them that reserve room.
     reserved: usize,
-    /// Number of these that were placed since the last report.
+    /// Number of those that reserve room and were placed since the last report.
     fresh: usize,
     /// Number of clients that arrive per placement made here, including those of other session servers.
     clients_per_placement: f64,
     settling: VecDeque<ClientDelta>,
-    /// Number of clients that `settling` hid from the last report.
+    /// Number of clients in `settling` that the last report's load does not show.
     unseen: f64,
     fit: CostFit,
-    /// The estimate from that fit that the fleet has.
+    /// The estimate from `fit` that is part of the fleet's sums.
     pub(super) estimate: Estimate,
     /// What a client is expected to add to the load, in percent.
     pub(super) cost: f64,
@@ -117,14 +117,14 @@ impl Backend {
         let report = LastReport { at: now, load: report.load.percent(), instances: report.instances };
         self.note_changes(report, replicas);
         self.fresh = 0;
-        // What the load shows by now is dropped.
+        // Changes that the load shows by now are dropped.
         self.settling.retain(|change| change.unseen(now) != 0.0);
         self.unseen = self.settling.iter().map(|change| change.unseen(now)).sum();
         self.learn(report);
         self.last = Some(report);
         (self.up, self.accepting) = (true, accepting);
-        // A report of only a load teaches nothing, because it does not show which part of the load is clients: that
-        // server's cost is the fixed one.
+        // A report of only a load teaches nothing, because it does not show which part of the load is clients: such a
+        // server keeps the configured cost.
         let counts = report.instances.is_some();
         let estimate = if counts { self.fit.estimate(self.cost) } else { Estimate::default() };
         fleet.replace(self.estimate, estimate);
@@ -160,7 +160,7 @@ impl Backend {
             && self.last.is_some_and(|report| report.instances.is_none_or(has_slot))
     }
 
-    /// The load, in percent, from which on this server gets no client.
+    /// The load, in percent, from which this server gets no clients.
     pub(super) fn limit(&self, policy: &PlacementPolicy) -> f64 {
         // A server whose clients cost much is full earlier, because the next one would need more than the machine has.
         // A threshold above 100 means that the load never makes a server full.
@@ -173,8 +173,8 @@ impl Backend {
         self.load_with(self.reserved)
     }
 
-    /// The rank that it should have; `None` if it has no room. Servers are compared by their load with all clients that
-    /// were sent there.
+    /// The rank that the server should have; `None` if it has no room. Servers are compared by their load with all
+    /// clients that were sent to them.
     pub(super) fn current_rank(&self, policy: &PlacementPolicy) -> Option<Rank> {
         let load = self.load_with(self.in_flight.len()).filter(|_| self.has_room(policy))?;
         Some(Rank { is_ejected: self.ejection.until.is_some(), load: load.to_bits(), last_pick: self.last_pick })
@@ -277,7 +277,7 @@ mod tests {
             self.0.add_placement(self.at(seconds), true);
         }
 
-        /// A report with a load and, of the server's clients, those present and the arrivals.
+        /// Reports a load and the numbers of clients that are present and that have arrived.
         fn report(&mut self, seconds: f64, load: f64, counts: Option<(u32, u64)>) {
             let instances =
                 counts.map(|(running, arrivals)| Instances { running, places: 1000, arrivals, ..Instances::default() });

@@ -76,8 +76,8 @@ impl CostFit {
         Self { guess, idle_weight: BASE_TRUST, ..Self::default() }
     }
 
-    /// This server's own estimate. `believed` is the cost that was assumed until now, in percent: a high estimate is
-    /// not more precise for being high.
+    /// This server's own estimate. `believed` is the cost that was assumed until now, in percent. The variance is taken
+    /// relative to it, so that a high estimate does not count as more precise.
     pub(super) fn estimate(&self, believed: f64) -> Estimate {
         let (_, slope, variance) = self.fit();
         let relative = variance / (believed * believed);

@@ -1,11 +1,11 @@
 //! Ejects a server whose starts fail for reasons of its own: it comes last for a while.
 //!
 //! The rule is that of Envoy's outlier detection (`consecutive_5xx` with panic routing): once a server reports
-//! [`FAILURES`] failed starts in a row, it is ejected for [`EJECTION`], and with each further one again. A successful
-//! start ends that.
+//! [`FAILURES`] failed starts in a row, it is ejected for [`EJECTION`], and again with each further one. A successful
+//! start ends the ejection.
 //!
-//! An ejected server gets clients if no other has room: if all fail alike, as without a Git host, none of them is the
-//! cause.
+//! An ejected server gets clients if no other has room: if all fail alike, for example because the Git host is down,
+//! none of them is the cause.
 
 use std::time::{Duration, Instant};
 

@@ -9,7 +9,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::hash::Hash;
 use std::time::{Duration, Instant};
 
-/// The simulation servers, what is known of each, and the choice between them. `Id` is the owner's key of a server.
+/// The simulation servers, what is known of each, and the choice between them. `Id` identifies a server.
 ///
 /// ```
 /// use std::time::Instant;
@@ -29,14 +29,14 @@ use std::time::{Duration, Instant};
 pub struct LoadBalancer<Id> {
     policy: PlacementPolicy,
     servers: HashMap<Id, Backend>,
-    /// Those that have room, so that a choice among a thousand is as fast as one among ten. A server's rank is updated
-    /// when it is probed or chosen, when something of it expires, and with the policy.
+    /// The servers that have room, so that a choice among a thousand is as fast as one among ten. A server's rank is
+    /// updated when it is probed or chosen, and every [`CHECK_INTERVAL`].
     ranking: BTreeMap<Rank, Id>,
     cost: FleetCost,
     replicas: Replicas,
     /// Number of picks.
     picks: u64,
-    /// When placements and ejections were last checked for those that expire.
+    /// When the servers were last checked for placements and ejections that expire.
     checked: Option<Instant>,
 }
 
@@ -57,7 +57,7 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
         }
     }
 
-    /// Changes the policy, for each server when it is next looked at. What was learned of the servers stays.
+    /// Changes the policy, which applies to a server when its rank is updated. What was learned of the servers stays.
     pub fn set_policy(&mut self, policy: PlacementPolicy) {
         self.policy = policy;
     }
@@ -95,8 +95,8 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
     /// Returns the server with the lowest load among those that have room and are `eligible`, and counts the client as
     /// sent there. Of servers with equal loads it is the one that was chosen longest ago; ejected servers come last.
     ///
-    /// A client that may never arrive does not take room: it counts when servers are compared, but any number of these
-    /// does not make a server full before they have arrived.
+    /// A client that does not take room counts when servers are compared, but no number of such clients makes a server
+    /// full before they have arrived.
     pub fn pick(&mut self, now: Instant, takes_room: bool, eligible: impl Fn(&Id) -> bool) -> Option<Id> {
         self.expire(now);
         let id = self.ranking.values().find(|id| eligible(id))?.clone();
@@ -139,7 +139,7 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
         self.servers.get(id)?.effective_load()
     }
 
-    /// The load, in percent, from which on a server gets no client; `None` if it is not in the fleet.
+    /// The load, in percent, from which a server gets no clients; `None` if it is not in the fleet.
     pub fn limit(&self, id: &Id) -> Option<f64> {
         self.servers.get(id).map(|server| server.limit(&self.policy))
     }

@@ -2,7 +2,8 @@
 //!
 //! Session servers share nothing, so none sees what the others have placed since the last reports. But each sees how
 //! many clients arrive and how many of them it has sent, so it knows how many clients each of its placements stands
-//! for: four, with three others like it. It applies only until the server's next report, so an error is short-lived.
+//! for: four, with three others like it. That number is used only until the server's next report, so an error is
+//! short-lived.
 //!
 //! Goren, Vargaftik and Moses, "Stochastic Coordination in Heterogeneous Load Balancing Systems" (PODC 2021), describe
 //! dispatchers that multiply their own arrivals by their number; here the number is learned instead of set.

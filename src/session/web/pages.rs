@@ -17,7 +17,7 @@ use crate::shared::text::one_line;
 pub struct Monitor {
     /// When the server was started.
     pub started: String,
-    /// Whether administrators can do something here.
+    /// Whether the page offers the administrator's actions.
     pub has_actions: bool,
     /// The parts that change.
     pub view: PageView,

@@ -93,7 +93,7 @@ fn open_websocket(request: &HttpRequest, stream: web::Payload, server: &web::Dat
     let peer = server.config.trusted_proxies.peer(request);
     let permit = server.connections.admit(ConnectionKind::Client, peer)?;
     let server = Arc::clone(server);
-    // Pages that don't ask for them would not understand them.
+    // Pages that do not request announcements would not understand them.
     let wants_announcements = request.query_string().split('&').any(|one| one == "announcements=1");
     Ok(websocket::open(request, stream, WebClient::new(server, peer, wants_announcements, permit)))
 }
@@ -120,7 +120,7 @@ async fn metrics_text(server: web::Data<AppState>) -> Result<HttpResponse> {
     Ok(HttpResponse::Ok().content_type(CONTENT_TYPE).body(text))
 }
 
-/// Replaces the announcement, with the administrator's password; without a text it ends.
+/// Replaces the announcement, which requires the administrator's password; an empty text removes it.
 async fn announcement(request: HttpRequest, payload: web::Payload, server: web::Data<AppState>) -> HttpResponse {
     let peer = server.config.trusted_proxies.peer(&request);
     if let Some(refusal) = refuse_action(server.admin_auth.as_ref(), &request, peer) {

@@ -8,7 +8,7 @@ use crate::session::fleet::{FleetStatus, ServerStatus};
 use crate::session::state::AppState;
 use crate::shared::domain::ClientUrls;
 
-/// The page `/status`. Loads are in percent, times in seconds; `null` is what is not known.
+/// The page `/status`. Loads are in percent, times in seconds; unknown values are `null`.
 pub fn status_page(server: &AppState, status: &FleetStatus) -> Value {
     json!({
         "version": env!("CARGO_PKG_VERSION"),

@@ -1,8 +1,7 @@
 //! Actor: the WebSocket of one web client, which receives the fleet's availability and requests simulation servers.
 //!
-//! Created by the route for each connection; ends with it. It follows the registry's availability, of which only the
-//! latest value counts, and never sends the same value twice in a row. A text from the client requests a simulation
-//! server.
+//! Created by the route for each connection; ends with it. It sends the fleet's availability when it changes: only the
+//! latest value, and never the same twice in a row. A text from the client requests a simulation server.
 
 use std::sync::Arc;
 
@@ -113,7 +112,7 @@ fn announcements(mut all: watch::Receiver<String>) -> impl Stream<Item = Option<
     })
 }
 
-/// Texts to the web client that are no answers; `None` closes the connection.
+/// Texts to the web client that are not answers; `None` closes the connection.
 impl StreamHandler<Option<ByteString>> for WebClient {
     fn handle(&mut self, text: Option<ByteString>, ctx: &mut Context) {
         match text {
