@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
 # Starts and stops the servers of a configuration NAME: simulation/NAME and session/NAME.
 #
-# It needs Linux, bash, coreutils, util-linux (flock, setsid), git, and cargo where the programs are to be built.
-# A server KIND/NAME has config/KIND/NAME.json, log/KIND/NAME.pid, which it keeps locked while it runs, and
-# log/KIND/NAME.out with what it prints.
-# FLEET_BIN, an absolute path, names a folder with programs to use in place of building them. A release has them in bin.
+# It needs Linux, bash, coreutils, util-linux (flock, setsid), git, and cargo if it builds the programs.
+# A server KIND/NAME reads config/KIND/NAME.json, keeps log/KIND/NAME.pid locked while it runs, and prints to
+# log/KIND/NAME.out.
+# FLEET_BIN is the absolute path of a folder with programs to use instead of building them. A release has them in bin.
 set -u
 
 readonly USAGE='usage: ./server.sh start|stop|restart|status [NAME]
@@ -32,7 +32,7 @@ pid_of() { # SERVER
     [[ -f log/$1.pid ]] && ! flock --nonblock "log/$1.pid" true && cat "log/$1.pid"
 }
 
-# The names of which a server runs.
+# The names that have a running server.
 running() {
     local file
     for file in log/*/*.pid; do
@@ -51,7 +51,7 @@ setting() { # SERVER KEY
     "$BIN/${1%/*}-server" --check "config/$1.json" 2>/dev/null | sed -n "s/^ *\"$2\": \"\{0,1\}\([^\",]*\).*/\1/p"
 }
 
-# Whether a program was built after all that it is built from was changed; cargo takes longer to tell.
+# Whether a program is newer than its sources; cargo takes longer to find out.
 is_current() { # PROGRAM
     [[ -x $BIN/$1 && -e $BIN/.$1.began ]] &&
         [[ -z $(find src templates config/simulation/docker Cargo.toml Cargo.lock rust-toolchain.toml -newer "$BIN/.$1.began" -print -quit) ]]
@@ -76,7 +76,7 @@ build() { # NAME
     for program in "${programs[@]}"; do touch --reference="$BIN/.began" "$BIN/.$program.began"; done
 }
 
-# Builds the programs, and finds what is wrong with a configuration before anything is started or stopped.
+# Builds the programs and checks the configurations before anything is started or stopped.
 prepare() { # NAME
     local server remarks
     [[ -n ${FLEET_BIN-} ]] || build "$1"
@@ -85,15 +85,15 @@ prepare() { # NAME
         # The demo simulator needs no display, and listens on the loopback only.
         [[ $(setting "$server" webots) != */demo-simulator ]] || remarks=$(grep -vE '^warning: (display|streams): ' <<<"$remarks")
         grep '^warning: ' <<<"$remarks" >&2 || true
-        # What worlds may do here, which depends on the packages of the machine.
+        # The isolation of worlds depends on the packages of the machine.
         grep -E '^(isolation|network): ' <<<"$remarks" || true
     done
 }
 
-# Makes a project that lies in config/NAME a git repository, cache/NAME.git, as a forge would have it.
+# Publishes a project in config/NAME as a git repository, cache/NAME.git, as a Git host does.
 publish() ( # NAME
     [[ -d config/$1 ]] || exit 0
-    # The user's own settings don't count here.
+    # Ignores the user's git settings.
     export GIT_CONFIG_NOSYSTEM=1 GIT_CONFIG_GLOBAL=/dev/null
     git init --quiet --bare "cache/$1.git" || exit
     export GIT_DIR=$PWD/cache/$1.git GIT_WORK_TREE=$PWD/config/$1
@@ -102,11 +102,11 @@ publish() ( # NAME
         git -c user.name='Webots fleet' -c user.email=fleet@localhost commit --quiet --message="The project in config/$1"
 )
 
-# Starts a server and waits until it says where it is.
+# Starts a server and waits until it prints its URLs.
 launch() { # SERVER
     local kind=${1%/*} deadline=$((SECONDS + 30)) bind
     mkdir -p "log/$kind"
-    # The demo simulator is to be reached from where its server is.
+    # The demo simulator listens on the same address as its server.
     bind=$(setting "$1" bind)
     : >"log/$1.out"
     DEMO_SIMULATOR_BIND=${DEMO_SIMULATOR_BIND-$bind} setsid "$BIN/$kind-server" --pid-file "log/$1.pid" \
@@ -150,7 +150,7 @@ stop() { # NAME [SERVER...]; without SERVER, all of NAME
         if pid=$(pid_of "$server"); then
             limit=$(setting "$server" stop) outcome=stopped nothing=false
             kill -TERM "$pid"
-            # A server ends soon after its limit, timing.stop.
+            # A server ends at the latest shortly after timing.stop.
             if ! flock --timeout $((${limit%.*} + 10)) "log/$server.pid" true; then
                 kill -KILL "$pid"
                 flock --timeout 10 "log/$server.pid" true
@@ -177,7 +177,7 @@ status() { # NAME
     return "$code"
 }
 
-# Does something with each name, whatever comes of the others.
+# Runs ACTION for each name, even if it fails for others.
 for_each() { # ACTION
     local name code=0
     for name in "${names[@]}"; do ("$1" "$name") || code=$?; done
@@ -198,7 +198,7 @@ else
 fi
 ((${#names[@]} > 0)) || { echo 'nothing runs'; [[ $1 != status ]] || exit 3; exit; }
 [[ $1 != *start ]] || for_each prepare || exit
-# One at a time. The lock ends with this process, and is kept from those that it starts.
+# One server.sh at a time. The lock ends with this process; the servers do not inherit it.
 exec 9<server.sh
 flock --nonblock 9 || echo 'waiting for another ./server.sh that is at work'
 flock --timeout 120 9 || fail 1 'another ./server.sh is still at work'
