@@ -1,8 +1,8 @@
 """Runs participant/participant.py, beside this file, as the controller of a robot of Webots.
 
-It connects to Webots itself, before anything of the participant's runs: from then on libController sends to Webots'
-console what this process prints, also why the participant's program can't be read. When that program has ended, in
-whatever way, the connection stays and the simulation goes on without it: there is no new try before the next reset.
+It connects to Webots before it runs the participant's program: from then on libController sends the output of this
+process to Webots' console, also the error if the program can't be read. After the program has ended, with or without
+an error, the connection stays and the simulation continues without it. The next reset starts it again.
 """
 
 import ctypes
@@ -11,13 +11,13 @@ import runpy
 import sys
 import traceback
 
-# What Webots has not taken yet must fit into a pipe.
+# Output that Webots has not read yet must fit into a pipe.
 LONGEST_COMPLAINT = 8000
 PROGRAM = os.path.join(os.path.dirname(os.path.abspath(__file__)), 'participant', 'participant.py')
 
 
 def connect():
-    """Connects to Webots, which ends this process where it can't be reached. A program's own Robot shares the connection."""
+    """Connects to Webots; libController ends this process if that fails. A program's own Robot shares the connection."""
     # libController asks for these when it connects.
     os.environ.update(WEBOTS_STDOUT_REDIRECT='1', WEBOTS_STDERR_REDIRECT='1')
     home = os.environ.get('WEBOTS_HOME', '/usr/local/webots')
@@ -33,7 +33,7 @@ def complain(text):
 
 
 def run(program):
-    """Runs a program as if it had been started itself, and says how it has ended unless that was in order."""
+    """Runs a program as if it had been started directly, and prints why it failed, if it did."""
     folder = os.path.dirname(program)
     os.chdir(folder)
     sys.argv = [program]
@@ -52,7 +52,7 @@ def run(program):
 
 
 def main():
-    """Runs the participant's program, and then stays until Webots ends the connection."""
+    """Runs the participant's program, and then keeps the connection until Webots ends it."""
     library = connect()
     step = max(1, int(library.wb_robot_get_basic_time_step()))
     if os.path.isfile(PROGRAM):
