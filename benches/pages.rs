@@ -1,5 +1,5 @@
-//! What pages cost: rendering the session server's monitor with 1,000 simulation servers, and a hundred open pages of
-//! either server, at the demo's size and with 1,000 simulation servers.
+//! Measures the cost of pages: rendering the session server's monitor with 1,000 simulation servers, and a hundred open
+//! pages of either server, at the demo's size and with 1,000 simulation servers.
 //!
 //! `cargo bench --bench pages [-- --seconds N]`
 
@@ -36,7 +36,7 @@ use webots_fleet::shared::domain::ClientUrls;
 
 const SERVERS: u16 = 1000;
 const PAGES: usize = 100;
-/// How many simulations run on the simulation server whose pages are open.
+/// Number of simulations on the simulation server whose pages are open.
 const SIMULATIONS: u16 = 4;
 
 fn main() {
@@ -102,7 +102,7 @@ fn fleet() -> FleetStatus {
     FleetStatus { available: true, mean_load: Some(42.5), servers: servers.collect(), names: Vec::new(), changes }
 }
 
-/// The demo's size: three simulation servers, one of which runs simulations that somebody watches.
+/// The demo's size: three simulation servers, one of which runs simulations that clients watch.
 async fn open_pages(time: Duration) {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     let mut fleet = Vec::new();
@@ -126,7 +126,7 @@ async fn open_pages(time: Duration) {
     compare("simulation server", &fleet[0], time).await;
 }
 
-/// A session server with many simulation servers, all of whose loads change all the time.
+/// A session server with many simulation servers whose loads change all the time.
 async fn open_pages_of_a_large_fleet(time: Duration) {
     let (_, most) = getrlimit(Resource::RLIMIT_NOFILE).unwrap();
     setrlimit(Resource::RLIMIT_NOFILE, most, most).unwrap();
@@ -140,11 +140,11 @@ async fn open_pages_of_a_large_fleet(time: Duration) {
     compare(&format!("session server with {SERVERS} servers"), &session, time).await;
 }
 
-/// A stand-in for a simulation server, which tells another load each time.
+/// A stand-in for a simulation server, which reports a different load each time.
 async fn answer(listener: tokio::net::TcpListener, number: u16) {
     let (mut stream, _) = listener.accept().await.unwrap();
     let mut request = [0; 2048];
-    // A request is small enough to come in one piece.
+    // A request is small enough to arrive in one piece.
     for turn in 0.. {
         if stream.read(&mut request).await.unwrap_or_default() == 0 {
             return;
@@ -160,11 +160,11 @@ async fn answer(listener: tokio::net::TcpListener, number: u16) {
     }
 }
 
-/// What a server takes without and with open pages.
+/// Compares the processor time of a server without and with open pages.
 async fn compare(name: &str, server: &Server, time: Duration) {
     let alone = used(server, time).await;
     let pages: Vec<Listener> = (0..PAGES).map(|_| Listener::open(server.port)).collect();
-    // Each is sent everything first.
+    // Each page first receives everything.
     actix_rt::time::sleep(Duration::from_secs(5)).await;
     let with_pages = used(server, time).await;
     let heard: Vec<Received> = pages.into_iter().map(Listener::heard).collect();
@@ -178,7 +178,7 @@ async fn compare(name: &str, server: &Server, time: Duration) {
     );
 }
 
-/// The CPU that a server takes in a time, in percent of one core.
+/// The processor time of a server during `time`, in percent of one core.
 async fn used(server: &Server, time: Duration) -> f64 {
     let ticks = || {
         let stat = procfs::process::Process::new(server.pid()).unwrap().stat().unwrap();
@@ -189,13 +189,13 @@ async fn used(server: &Server, time: Duration) -> f64 {
     100.0 * (ticks() - before) / begun.elapsed().as_secs_f64()
 }
 
-/// A page that listens: a thread reads all that comes.
+/// An open page: a thread reads everything that arrives.
 struct Listener {
     socket: TcpStream,
     reader: std::thread::JoinHandle<Received>,
 }
 
-/// What came to a page.
+/// What a page has received.
 #[derive(Default)]
 struct Received {
     events: usize,
@@ -211,7 +211,7 @@ impl Listener {
             let (mut received, mut buffer) = (Received::default(), [0; 64 * 1024]);
             while let Ok(count @ 1..) = stream.read(&mut buffer) {
                 received.bytes += count;
-                // An event is one chunk: where it ends, a reading ends, if not just then the next one comes.
+                // An event is one chunk. A read ends with it, unless the next event arrives at the same moment.
                 received.events += usize::from(buffer[..count].ends_with(b"\n\n\r\n"));
             }
             received

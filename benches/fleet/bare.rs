@@ -1,5 +1,5 @@
-//! What actix does without a session server: a handler that only answers, and an actor for each WebSocket that only waits.
-//! It runs as a child process, as the session server does.
+//! A baseline of actix without a session server: a handler that only answers, and an actor per WebSocket that only
+//! waits. It runs as a child process, like the session server.
 
 use std::io::{BufRead, BufReader};
 use std::process::{Child, Command, Stdio};
@@ -7,10 +7,10 @@ use std::process::{Child, Command, Stdio};
 use actix_web::{App, Error, HttpRequest, HttpResponse, HttpServer, web};
 use actix_web_actors::ws::{self, Message, ProtocolError, WebsocketContext};
 
-/// Makes this program the server.
+/// The argument that makes this program the bare server.
 pub(crate) const ARGUMENT: &str = "bare-server";
 
-/// The running server. It is killed with this value.
+/// The running server, killed on drop.
 pub(crate) struct Bare {
     child: Child,
     pub(crate) port: u16,
@@ -55,7 +55,7 @@ async fn idle(request: HttpRequest, stream: web::Payload) -> Result<HttpResponse
     ws::start(Idle, &request, stream)
 }
 
-/// Serves until it is killed, after a line that tells its port.
+/// Prints its port, and serves until it is killed.
 pub(crate) fn serve() -> std::io::Result<()> {
     actix_web::rt::System::new().block_on(async {
         let answer = || async { "ws://localhost:2000" };

@@ -1,4 +1,4 @@
-//! How long a request for a simulation server takes.
+//! Measures how long a request for a simulation server takes.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -8,10 +8,10 @@ use super::Verdict;
 use super::server::Server;
 use super::stand_ins::StandIns;
 
-/// Each fleet is asked in turns, so that what else the machine does meets all of them.
+/// The fleets take turns, so that other load of the machine affects all of them.
 const ROUNDS: usize = 40;
 const REQUESTS: usize = 250;
-/// Between two requests: a busy door, not one that is stormed.
+/// Pause between two requests: a busy session server that is not saturated.
 const PAUSE: Duration = Duration::from_micros(500);
 
 /// A fleet, its session server, and how long its requests took.
@@ -34,7 +34,7 @@ impl Door {
         Self { name, path: "/session", status: "200", _fleet: fleet, server, took: Vec::new() }
     }
 
-    /// A fleet that is asked for a world that nobody accepts.
+    /// A fleet whose servers do not accept the requested world.
     fn open_for_strangers(name: &'static str, servers: usize, repositories: usize) -> Self {
         let fleet = StandIns::with_repositories(servers, repositories);
         let server = Server::start(&fleet.addresses);

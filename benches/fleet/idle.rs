@@ -1,4 +1,4 @@
-//! How much memory a WebSocket client costs that only waits for news.
+//! Measures the memory of a WebSocket client that only waits for messages.
 
 use std::net::TcpStream;
 use std::time::Duration;
@@ -9,18 +9,18 @@ use super::push::connect;
 use super::server::Server;
 use super::stand_ins::StandIns;
 
-/// What the first ones cost is the server's, not theirs.
+/// Clients before the measurement: part of their memory is allocated once for the server.
 const FIRST: usize = 1000;
 const CLIENTS: usize = 8000;
 
-/// Kibibytes that a process has to itself.
+/// The anonymous memory of a process, in KiB.
 fn memory(process: u32) -> f64 {
     let process = procfs::process::Process::new(i32::try_from(process).expect("a process id"));
     let status = process.and_then(|process| process.status()).expect("the server runs");
     status.rssanon.expect("Linux 4.5 or newer") as f64
 }
 
-/// Kibibytes for each client.
+/// The memory per client, in KiB.
 fn each(process: u32, port: u16) -> f64 {
     let come = |count| -> Vec<TcpStream> { (0..count).map(|_| connect(port)).collect() };
     let _first = come(FIRST);

@@ -2,14 +2,14 @@
 //!
 //! It starts the built program with stand-ins for simulation servers in this process, and measures
 //! 1. how long `/session` takes with 10 servers, with one of ten hung, and with 1,000 servers, in turns;
-//! 2. how much processor time the server needs to watch 10 and 1,000 servers each second;
-//! 3. how long it takes until 10,000 connected clients know of a change;
-//! 4. how many requests it answers under 64 connections, beside a bare handler of actix, in turns (by `wrk`);
-//! 5. how much memory an idle WebSocket client costs, beside one actor for each client and nothing else.
+//! 2. how much processor time the server needs to probe 10 and 1,000 servers each second;
+//! 3. how long a change takes to reach 10,000 connected clients;
+//! 4. how many requests it answers on 64 connections, compared with a bare handler of actix, in turns (by `wrk`);
+//! 5. how much memory an idle WebSocket client costs, compared with one bare actor per client.
 //!
-//! `cargo bench --bench fleet -- door`, `watch`, `push`, `storm` or `idle` measures one of them. It fails if a bound is not
-//! kept; a goal that is missed is only told.
-//! What else runs on the machine counts too: each part prints a yardstick that was measured beside it.
+//! `cargo bench --bench fleet -- door`, `watch`, `push`, `storm` or `idle` measures one of them. It fails if a bound is
+//! exceeded; a missed goal is only reported.
+//! Other load of the machine affects the results: each part also prints a reference measurement.
 
 #![expect(
     clippy::cast_possible_truncation,
@@ -45,7 +45,7 @@ impl Verdict {
     }
 }
 
-/// Tells whether what was aimed at is reached.
+/// Prints whether a goal is reached.
 fn goal(what: &str, is_reached: bool, found: &str) {
     println!("  {} {what}: {found}", if is_reached { "reached" } else { "MISSED " });
 }

@@ -1,7 +1,7 @@
-//! How long it takes until 10,000 connected clients know of a change.
+//! Measures how long a change takes to reach 10,000 connected clients.
 //!
-//! The decision is the registry's log line, which is written before anybody is told. The system notes when each client's
-//! message arrives at its socket, so that the clients need no processor time of their own while they are told.
+//! The time begins with the registry's log line, which is written before the first message is sent. The kernel
+//! timestamps each message at the client's socket, so that the clients need no processor time meanwhile.
 
 use std::io::{IoSliceMut, Read, Write};
 use std::net::{TcpListener, TcpStream};
@@ -16,14 +16,14 @@ use super::stand_ins::StandIns;
 
 const CLIENTS: usize = 10_000;
 const CHANGES: usize = 10;
-/// For how long the clients leave the processor to the server.
+/// Time for which the clients leave the processor to the server.
 const PAUSE: Duration = Duration::from_millis(600);
 const HANDSHAKE: &[u8] = b"GET /session HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
     Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n";
-/// The begin of an unmasked text message of one letter.
+/// The header of an unmasked text message of one letter.
 const TEXT: [u8; 2] = [0x81, 1];
 
-/// A client that was told the first value.
+/// Connects a client, and waits until it has received the first value.
 pub(crate) fn connect(port: u16) -> TcpStream {
     let mut stream = TcpStream::connect(("127.0.0.1", port)).expect("a client connects");
     stream.write_all(HANDSHAKE).expect("a client asks");
@@ -62,7 +62,7 @@ fn arrival(stream: &TcpStream, value: u8) -> Duration {
     }
 }
 
-/// When the registry decided the last change, as its log says, to the millisecond.
+/// When the registry logged the last change, to the millisecond, as the time since 1970.
 fn decision(server: &Server) -> Duration {
     let log = server.log();
     let line = log.lines().rfind(|line| line.contains("simulation server is available")).expect("a decision");
@@ -71,8 +71,8 @@ fn decision(server: &Server) -> Duration {
     at.duration_since(SystemTime::UNIX_EPOCH).expect("it is later than 1970")
 }
 
-/// The same without a server: in how many milliseconds so many plain sends arrive, on all cores. Half of them are made,
-/// and counted twice: both ends of each are files of this program.
+/// The reference without a server: the milliseconds until as many plain sends arrive, on all cores. Only half of them
+/// are sent, and the time is doubled, because this program has both ends of each connection open.
 fn yardstick() -> f64 {
     let listener = TcpListener::bind("127.0.0.1:0").expect("a free port");
     let port = listener.local_addr().expect("it is bound").port();

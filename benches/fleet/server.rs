@@ -9,22 +9,22 @@ use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
-/// A session server. It is killed with this value.
+/// A session server, killed on drop.
 pub(crate) struct Server {
     child: Child,
-    /// Its port on the loopback.
+    /// Its port on the loopback interface.
     pub(crate) port: u16,
     folder: tempfile::TempDir,
 }
 
-/// As many open files as the system allows.
+/// Raises the limit of open files as far as the system allows.
 pub(crate) fn raise_file_limit() {
     let (_, hard) = getrlimit(Resource::RLIMIT_NOFILE).expect("the limit of open files");
     setrlimit(Resource::RLIMIT_NOFILE, hard, hard).expect("the limit of open files can be raised");
 }
 
 impl Server {
-    /// Starts one that watches these simulation servers each second, and waits until all have reported.
+    /// Starts a session server that probes these simulation servers each second, and waits until all have reported.
     pub(crate) fn start(simulation_servers: &[String]) -> Self {
         let folder = tempfile::tempdir().expect("a folder");
         let port = free_port();
@@ -46,7 +46,7 @@ impl Server {
         server
     }
 
-    /// Waits until something holds.
+    /// Waits until a condition holds.
     pub(crate) fn wait_until(&self, condition: impl Fn(&Self) -> bool) {
         let deadline = Instant::now() + Duration::from_mins(1);
         while !condition(self) {
@@ -55,7 +55,7 @@ impl Server {
         }
     }
 
-    /// Has it read its configuration again, with this threshold.
+    /// Makes it reload its configuration, with this threshold.
     pub(crate) fn reread(&self, threshold: u8) {
         let file = self.folder.path().join("config.json");
         let text = std::fs::read_to_string(&file).expect("the configuration can be read");
@@ -78,7 +78,7 @@ impl Server {
         std::fs::read_to_string(self.folder.path().join("log/session/output.log")).unwrap_or_default()
     }
 
-    /// A page as a whole, headers included.
+    /// A whole response, including the headers.
     pub(crate) fn page(&self, path: &str) -> Option<String> {
         let mut stream = TcpStream::connect(("127.0.0.1", self.port)).ok()?;
         write!(stream, "GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n").ok()?;

@@ -7,7 +7,7 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Notify;
 
-/// So many stand-ins.
+/// The running stand-ins.
 pub(crate) struct StandIns {
     /// `HOST:PORT` of each.
     pub(crate) addresses: Vec<String>,
@@ -16,12 +16,12 @@ pub(crate) struct StandIns {
 }
 
 impl StandIns {
-    /// Starts them; the first one can be made to hang.
+    /// Starts `count` stand-ins; the first one can be made to hang.
     pub(crate) fn start(count: usize) -> Self {
         Self::with_repositories(count, 1)
     }
 
-    /// Starts stand-ins that allow so many owners' repositories each.
+    /// Starts stand-ins that each accept the repositories of this many owners.
     pub(crate) fn with_repositories(count: usize, repositories: usize) -> Self {
         let allowed: Vec<String> = (0..repositories).map(|owner| format!("https://github.com/lab{owner}")).collect();
         let body = serde_json::json!({
@@ -49,14 +49,14 @@ impl StandIns {
         Self { addresses, hung, end }
     }
 
-    /// Makes the first one accept and say nothing.
+    /// Makes the first one accept connections and answer nothing.
     pub(crate) fn hang_first(&self) {
         self.hung.store(true, Ordering::SeqCst);
     }
 }
 
 impl Drop for StandIns {
-    /// All of them die in the same moment.
+    /// Stops all of them at once.
     fn drop(&mut self) {
         self.end.notify_one();
     }
@@ -71,7 +71,7 @@ async fn serve(listener: TcpListener, answer: Arc<str>, hung: Option<Arc<AtomicB
 async fn converse(mut stream: TcpStream, answer: Arc<str>, hung: Option<Arc<AtomicBool>>) -> std::io::Result<()> {
     stream.set_nodelay(true)?;
     let mut request = [0; 2048];
-    // A request is small enough to come in one piece.
+    // A request is small enough to arrive in one piece.
     while stream.read(&mut request).await? > 0 {
         if hung.as_ref().is_some_and(|hung| hung.load(Ordering::SeqCst)) {
             std::future::pending::<()>().await;

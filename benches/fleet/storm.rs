@@ -1,4 +1,4 @@
-//! How many requests the session server answers when it is stormed, beside a bare handler of actix.
+//! Measures how many requests per second the session server answers, compared with a bare handler of actix.
 
 use std::process::Command;
 
@@ -7,11 +7,11 @@ use super::goal;
 use super::server::Server;
 use super::stand_ins::StandIns;
 
-/// Each is stormed in turns, so that what else the machine does meets all of them.
+/// The targets take turns, so that other load of the machine affects all of them.
 const ROUNDS: usize = 7;
 const REFUSED: &str = "/session?url=https://github.com/stranger/arm/blob/main/worlds/arm.wbt";
 
-/// Requests that `wrk` gets answered in a second.
+/// Requests per second, measured by `wrk`.
 fn storm(port: u16, path: &str) -> f64 {
     let done = Command::new("wrk")
         .args(["-t1", "-c64", "-d2s", &format!("http://127.0.0.1:{port}{path}")])

@@ -1,4 +1,4 @@
-//! How much processor time the session server needs to watch a fleet.
+//! Measures the processor time that the session server needs to probe a fleet.
 
 use std::time::{Duration, Instant};
 
@@ -12,7 +12,7 @@ const TIME: Duration = Duration::from_secs(15);
 fn needs(servers: usize) -> (f64, f64) {
     let fleet = StandIns::start(servers);
     let server = Server::start(&fleet.addresses);
-    // The first looks make connections.
+    // The first probes open connections.
     std::thread::sleep(Duration::from_secs(3));
     let (begin, before) = (Instant::now(), server.processor_time());
     std::thread::sleep(TIME);
@@ -21,7 +21,7 @@ fn needs(servers: usize) -> (f64, f64) {
     (percent(after.0.saturating_sub(before.0)), percent(after.1.saturating_sub(before.1)))
 }
 
-/// The same number of exchanges per second without a server: one thread that asks stand-ins by plain blocking calls.
+/// The same number of exchanges per second without a server: one thread that requests them by plain blocking calls.
 fn yardstick(servers: usize) -> f64 {
     use std::io::{Read, Write};
     let fleet = StandIns::start(servers);

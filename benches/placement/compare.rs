@@ -1,22 +1,22 @@
-//! Which scenarios are run, and who wins.
+//! The scenarios, and which policy wins in each.
 
 use super::dispatch::{Own, Rival, Rule};
 use super::scenario::{Arrivals, Foreign, Outcome, Scenario, Sessions, Sizes};
 use super::world::run;
 
-/// The policies in the order of an outcome's row. The first is the one that has to win.
+/// The policies in the order of a [`Row`]. The first one must win.
 pub(crate) const POLICIES: [&str; 6] =
     ["ours", "ours, load only", "least reported", "random", "two choices", "round robin"];
-/// The first rival in a row: what stands before it is the project's own.
+/// Index of the first rival in a row; those before it are the project's own policy.
 pub(crate) const FIRST_RIVAL: usize = 2;
-/// Highest loads that differ by no more are tied: two clients, in percent.
+/// Highest loads that differ by no more than this are tied: two clients, in percent.
 pub(crate) const HIGHEST_TIE: f64 = 4.0;
-/// Overload shares that differ by no more are tied, in percent.
+/// Overload shares that differ by no more than this are tied, in percent.
 pub(crate) const OVERLOAD_TIE: f64 = 0.25;
-/// Refused shares that differ by no more are tied, in percent.
+/// Refused shares that differ by no more than this are tied, in percent.
 pub(crate) const REFUSED_TIE: f64 = 1.0;
 
-/// What each policy made of a scenario, as means over the seeds.
+/// The outcome of each policy in a scenario, as means over the seeds.
 pub(crate) type Row = [Outcome; POLICIES.len()];
 
 /// All scenarios of fleets of these sizes at these refresh intervals.
@@ -72,7 +72,7 @@ pub(crate) fn share_that_fails(scenario: &Scenario) -> [f64; 2] {
     [with.failed, without.failed]
 }
 
-/// The mean outcome of a scenario over its seeds; a small fleet is left more to chance and needs more of them.
+/// The mean outcome of a scenario over its seeds; a small fleet depends more on chance and needs more seeds.
 pub(crate) fn mean(scenario: &Scenario, run: impl Fn(u64) -> Outcome) -> Outcome {
     let seeds = match scenario.servers {
         ..50 => 20,
@@ -104,10 +104,10 @@ pub(crate) fn compare(scenario: &Scenario) -> Row {
     ]
 }
 
-/// The rivals that are better than the policy at this place of the row, and in what.
+/// The rivals that are better than the policy at this index of the row, and in which respect.
 ///
-/// A rival is not better for loading its servers less if it refused more clients for that, nor for refusing fewer clients
-/// if it overloaded its servers with them.
+/// A rival that loaded its servers less is not better if it refused more clients, and one that refused fewer clients is
+/// not better if it loaded its servers more.
 pub(crate) fn better_rivals(row: &Row, policy: usize) -> Vec<String> {
     let own = row[policy];
     let mut better = Vec::new();

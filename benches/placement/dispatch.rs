@@ -18,19 +18,19 @@ pub(crate) struct Seen {
 
 /// A policy at work.
 pub(crate) trait Dispatcher {
-    /// A report of a server has come; `now` is in seconds.
+    /// Records a report of a server; `now` is in seconds.
     fn report(&mut self, server: usize, now: f64, seen: Seen);
     /// Chooses a server for a client, or refuses it.
     fn place(&mut self, now: f64) -> Option<usize>;
 }
 
-/// The project's own policy: the real code, on a clock that starts at some moment.
+/// The project's own policy: the real code, with simulated time.
 pub(crate) struct Own {
     fleet: LoadBalancer<usize>,
     start: Instant,
-    /// Whether the servers tell of their instances, or of their load only.
+    /// Whether the servers report their instances, or only their load.
     instances: bool,
-    /// Whether it is told of failed starts.
+    /// Whether it receives the number of failed starts.
     hears_of_failures: bool,
 }
 
@@ -87,7 +87,7 @@ pub(crate) enum Rule {
     RoundRobin,
 }
 
-/// A policy that goes by the last reports alone.
+/// A policy that decides by the last reports alone.
 pub(crate) struct Rival {
     rule: Rule,
     loads: Vec<f64>,

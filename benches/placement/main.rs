@@ -1,6 +1,6 @@
 //! Compares the placement policy with others in a simulated fleet.
 //!
-//! `cargo bench --bench placement` runs all scenarios, prints what came of each, and fails if a rival is better anywhere;
+//! `cargo bench --bench placement` runs all scenarios, prints their outcomes, and fails if a rival is better anywhere;
 //! `-- --quick` runs a few in a second or two.
 
 #![expect(
@@ -57,7 +57,7 @@ fn main() -> ExitCode {
     if lost == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE }
 }
 
-/// Runs scenarios and prints what came of them; returns in how many a rival is better that should not be.
+/// Runs scenarios and prints their outcomes; returns the number of those in which a rival must not be better, but is.
 fn measure(scenarios: &[Scenario]) -> usize {
     let rows = compare_all(scenarios);
     for (scenario, row) in scenarios.iter().zip(&rows) {
@@ -72,7 +72,7 @@ fn measure(scenarios: &[Scenario]) -> usize {
     verdict(scenarios, &rows)
 }
 
-/// Prints which share of the clients fails where one server is a black hole.
+/// Prints which share of the clients fails if one server is a black hole.
 fn black_hole(fleets: &[usize]) {
     println!("\nOne server fails each start after half a second. Clients whose starts fail, in %:\n");
     println!("| servers | arrivals | with ejection | without |\n|---|---|---|---|");
@@ -82,7 +82,7 @@ fn black_hole(fleets: &[usize]) {
     }
 }
 
-/// Spreads the scenarios over the cores; each is the same wherever it runs.
+/// Spreads the scenarios over the cores, which does not change their outcomes.
 fn compare_all(scenarios: &[Scenario]) -> Vec<Row> {
     let threads = std::thread::available_parallelism().map_or(1, usize::from);
     let mut rows = vec![Row::default(); scenarios.len()];
@@ -104,7 +104,7 @@ fn compare_all(scenarios: &[Scenario]) -> Vec<Row> {
     rows
 }
 
-/// The table of the documentation: for each kind of arrivals, sizes and refresh the worst highest load and the mean shares.
+/// The table of the documentation: worst highest load and mean shares, for each kind of arrivals, sizes and refresh.
 fn summary(scenarios: &[Scenario], rows: &[Row]) {
     println!("\nWorst highest load, and mean shares of overload and refusal, in %:\n");
     println!("| arrivals | machines | {} |", POLICIES.join(" | "));
@@ -138,7 +138,7 @@ fn cells(rows: &[&Row]) -> String {
     (0..POLICIES.len()).map(cell).collect::<Vec<_>>().join(" | ")
 }
 
-/// How long one placement and one report take among 1,000 servers.
+/// Measures how long one placement and one report take among 1,000 servers.
 fn speed() {
     const SERVERS: u32 = 1000;
     const ROUNDS: u32 = 2000;
@@ -163,8 +163,8 @@ fn speed() {
     println!("\n1,000 servers: a placement takes {place:?}, a report {:?}", begin.elapsed() / SERVERS);
 }
 
-/// Says where rivals are better, and returns in how many scenarios one is better that should not be: in any for servers
-/// that report their instances, on equal machines for those that report only a load.
+/// Prints where rivals are better, and returns the number of scenarios in which they must not be, but are: of all
+/// scenarios if servers report their instances, of those with equal machines if they report only a load.
 fn verdict(scenarios: &[Scenario], rows: &[Row]) -> usize {
     println!(
         "\nTied means within {HIGHEST_TIE} % of highest load, {OVERLOAD_TIE} % of overload share, {REFUSED_TIE} % of refusals."

@@ -12,11 +12,11 @@ use rand::{RngExt, SeedableRng};
 enum Among {
     /// Among all: what the project does.
     All,
-    /// Among any two, as long as one of them has room: so that session servers which know the same choose different ones.
+    /// Among two random ones if one has room, so that session servers with the same reports choose different ones.
     Two,
 }
 
-/// So many of the project's own policies; each client asks any one of them.
+/// Several session servers with the project's own policy; each client asks a random one.
 struct Replicas {
     policies: Vec<Own>,
     servers: usize,
@@ -51,7 +51,7 @@ fn outcome(scenario: &Scenario, count: usize, among: Among) -> Outcome {
     })
 }
 
-/// Prints what becomes of the scenarios of these fleets at these refresh intervals with 1, 2, 4 and 8 session servers.
+/// Prints the outcomes for these fleets at these refresh intervals with 1, 2, 4 and 8 session servers.
 pub(crate) fn measure(fleets: &[usize], refreshes: &[f64]) {
     println!("\nWorst highest load, and mean shares of overload and refusal, in %, by the number of session servers:");
     table("the least loaded of all servers", Among::All, fleets, refreshes);

@@ -1,31 +1,31 @@
-//! What is simulated: how many machines and clients there are, and what the clients are like.
+//! The simulated scenarios: the machines, the number of clients, and their behaviour.
 
 use rand::RngExt;
 use rand::rngs::StdRng;
 
-/// The load at which a server's own rule stops taking clients, in percent.
+/// The load from which a server gets no clients, in percent.
 pub(crate) const THRESHOLD: f64 = 95.0;
 /// Seconds that a run lasts.
 pub(crate) const HORIZON: f64 = 300.0;
-/// When a class comes.
+/// When a class arrives, in seconds.
 const BURST_AT: f64 = 150.0;
-/// The mean length of a session, in seconds: short, so that what a report says is soon wrong.
+/// The mean length of a session, in seconds: short, so that reports are soon outdated.
 const MEAN_SESSION: f64 = 100.0;
-/// The share of clients that are given a server and never go there.
+/// The share of clients that are sent to a server and never connect.
 const NO_SHOW: f64 = 0.02;
 
-/// How the clients come.
+/// How the clients arrive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Arrivals {
-    /// One by one, for 65 % of what the fleet can hold.
+    /// One by one, up to 65 % of the fleet's capacity.
     Steady,
     /// A class in one moment, on top of some others: 200 for up to 5 servers, else 1,000.
     Moment,
     /// The same class in a minute.
     Minute,
-    /// One by one, for 130 % of what the fleet can hold.
+    /// One by one, up to 130 % of the fleet's capacity.
     TooMany,
-    /// On top of 50 %, in one moment one and a half times as many as the whole fleet can hold.
+    /// One and a half times the fleet's capacity in one moment, on top of 50 %.
     Crowd,
 }
 
@@ -42,7 +42,7 @@ pub(crate) enum Sizes {
     Mixed,
 }
 
-/// How the lengths of the sessions are spread.
+/// How the lengths of the sessions are distributed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Sessions {
     /// Exponential.
@@ -73,10 +73,10 @@ pub(crate) struct Scenario {
     pub(crate) hole: bool,
 }
 
-/// What came of a run.
+/// The outcome of a run.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Outcome {
-    /// The highest load that the clients on any server asked for, in percent; over 100 they did not get it.
+    /// The highest load that the clients on any server demanded, in percent; above 100, the server is overloaded.
     pub(crate) highest: f64,
     /// The share of all servers' time that was spent over 100 %, in percent.
     pub(crate) overload: f64,
@@ -86,10 +86,10 @@ pub(crate) struct Outcome {
     pub(crate) failed: f64,
 }
 
-/// One client, drawn before the run, so that every policy meets the same ones.
+/// One client, drawn before the run, so that every policy gets the same clients.
 pub(crate) struct Client {
     pub(crate) at: f64,
-    /// Seconds until it connects to the server it was given.
+    /// Seconds until it connects to the server that it was sent to.
     pub(crate) travel: f64,
     pub(crate) comes: bool,
     /// Its cost, relative to the mean one.
@@ -97,10 +97,10 @@ pub(crate) struct Client {
     pub(crate) session: f64,
 }
 
-/// Draws the clients of a run. `capacity` is how many the fleet can hold.
+/// Draws the clients of a run. `capacity` is the number of clients that the fleet can hold.
 pub(crate) fn clients(scenario: &Scenario, capacity: f64, random: &mut StdRng) -> Vec<Client> {
     let class = if scenario.servers <= 5 { 200.0 } else { 1000.0 };
-    // How much of the fleet the steady stream fills, how many come besides, and in how many seconds.
+    // The share of the fleet that steady arrivals fill, the number of clients in the burst, and its length in seconds.
     let (steady, besides, within) = match scenario.arrivals {
         Arrivals::Steady => (0.65, 0.0, 0.0),
         Arrivals::Moment => ((0.85 - class / capacity).clamp(0.05, 0.65), class, 0.0),
@@ -142,7 +142,7 @@ fn exponential(random: &mut StdRng) -> f64 {
 fn bounded_pareto(random: &mut StdRng) -> f64 {
     let (alpha, span) = (1.5, 100.0_f64);
     let tail = span.powf(-alpha);
-    // The mean of one that starts at 1.
+    // The mean of the distribution whose least value is 1.
     let mean = alpha / (alpha - 1.0) * (1.0 - span.powf(1.0 - alpha)) / (1.0 - tail);
     (1.0 - random.random::<f64>() * (1.0 - tail)).powf(-1.0 / alpha) / mean
 }

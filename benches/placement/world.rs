@@ -7,9 +7,9 @@ use rand::{RngExt, SeedableRng};
 use std::cmp::Reverse;
 use std::collections::{BinaryHeap, VecDeque};
 
-/// What a client costs on the middle one of machines, in percent.
+/// What a client costs on a machine of medium size, in percent.
 const UNIT_COST: f64 = 2.0;
-/// Seconds until a new simulation needs all that it is going to need.
+/// Seconds until a new simulation reaches its full load.
 const RAMP: f64 = 3.0;
 /// Seconds until a start in a black hole fails.
 const FAILS_AFTER: f64 = 0.5;
@@ -23,7 +23,7 @@ struct Machine {
     overload: f64,
     present: u32,
     arrivals: u64,
-    /// Who is still starting: since when, and the cost.
+    /// The clients that are starting: since when, and their cost.
     starting: VecDeque<(f64, f64)>,
     samples: VecDeque<f64>,
     /// The load of other programs.
@@ -53,7 +53,7 @@ impl Machine {
         self.samples.push_back((self.demand - not_yet + noise).clamp(0.0, 100.0));
     }
 
-    /// Begins or ends other programs once in a while; to be called each second.
+    /// Starts or ends other programs at random; called each second.
     fn run_others(&mut self, now: f64, random: &mut StdRng) {
         let switches = random.random_range(0.0..1.0) < if self.foreign > 0.0 { 1.0 / 30.0 } else { 1.0 / 60.0 };
         if switches {
@@ -93,7 +93,7 @@ pub(crate) fn run(scenario: &Scenario, seed: u64, dispatcher: &mut impl Dispatch
     let room = |machine: &Machine| (THRESHOLD - machine.base) / machine.client_cost;
     let capacity = machines.iter().filter(|machine| !machine.is_hole).map(room).sum();
     let clients = clients(scenario, capacity, &mut random);
-    // The servers are asked in turn, each once per refresh.
+    // The servers are probed in turn, each once per refresh.
     let mut asked = 0_usize;
     let mut order: Vec<usize> = (0..machines.len()).collect();
     for i in (1..order.len()).rev() {

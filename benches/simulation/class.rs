@@ -1,9 +1,9 @@
-//! How long a class takes that starts at once, beside a bare loop that does the same without a server.
+//! Measures how long a class takes that starts at once, compared with a bare loop that does the same without a server.
 //!
-//! The bare loop runs what the server has run for one simulation: `git checkout` of the cached commit, then the command line of
-//! that simulation (pasta, bubblewrap and the demo simulator) in folders of its own, until it listens on its port, or answers
-//! there where pasta forwards it. Beside a single
-//! start it also runs the two commands of git that find the commit, which a class runs once for all.
+//! The bare loop runs what the server has run for one simulation: `git checkout` of the cached commit, then the command
+//! line of that simulation (pasta, bubblewrap and the demo simulator) in its own folders, until the simulator listens
+//! on its port, or answers there if pasta forwards the port. For a single start it also runs the two git commands that
+//! find the commit, which the server runs only once for a class.
 
 use std::ffi::{OsStr, OsString};
 use std::io::{Read, Write};
@@ -21,11 +21,11 @@ use crate::support::git::{Forge, arm};
 use crate::support::program::{Builder, Server, simulation_server};
 use crate::support::{SOON, http, until};
 
-/// How many times as long as the bare loop a class of 200 may take.
+/// Limit of the time of a class of 200, as a multiple of that of the bare loop.
 const MOST: f64 = 1.5;
-/// How much longer than the bare loop one start may take.
+/// Limit of the time of one start beyond that of the bare loop.
 const ONE: Duration = Duration::from_millis(8);
-/// Time between two looks whether a port is open.
+/// Interval between two checks whether a port is open.
 const BETWEEN_LOOKS: Duration = Duration::from_millis(1);
 
 /// Prints how long classes take, in turns with the bare loop.
@@ -54,13 +54,13 @@ pub async fn measure(verdict: &mut Verdict, levels: &[String], sizes: &[u16], ro
     }
 }
 
-/// A server with 200 places at a level; `own` is a sandbox with a network of its own.
+/// A server with 200 slots at an isolation level; `own` is a sandbox with its own network.
 pub async fn server(forge: &Forge, level: &str) -> Server {
     let demo = std::path::Path::new(env!("CARGO_BIN_EXE_demo-simulator"));
     at_level(simulation_server(demo, forge.path(), 200), level).start().await
 }
 
-/// A server at a level.
+/// A server at an isolation level.
 pub fn at_level(builder: Builder, level: &str) -> Builder {
     match level {
         "own" => builder.set("isolation", "sandbox").set("sandbox.network", "own"),
@@ -69,7 +69,7 @@ pub fn at_level(builder: Builder, level: &str) -> Builder {
     }
 }
 
-/// So many clients that are ready.
+/// Starts this many clients, and waits until all are ready.
 pub async fn ready(server: &Server, size: u16) -> Vec<Client> {
     let one = async |_| {
         let mut client = Client::start(server, &arm()).await;
@@ -79,7 +79,7 @@ pub async fn ready(server: &Server, size: u16) -> Vec<Client> {
     futures_util::future::join_all((0..size).map(one)).await
 }
 
-/// Has clients leave, and waits until nothing is left of their simulations.
+/// Makes clients leave, and waits until their simulations have ended.
 pub async fn leave(server: &Server, clients: Vec<Client>) {
     futures_util::future::join_all(clients.into_iter().map(Client::leave)).await;
     until("all are gone", async || {
@@ -105,14 +105,14 @@ struct Bare {
     port: u16,
     /// The files in that folder: a packet filter, a filter of system calls, and so on.
     files: Vec<(OsString, Vec<u8>)>,
-    /// The repository of the forge, the cached one, and the reference of the commit in it.
+    /// The repository of the Git host, the cached one, and the reference of the commit in the latter.
     remote: PathBuf,
     repository: PathBuf,
     reference: String,
 }
 
 impl Bare {
-    /// Starts a simulation, and reads what it runs.
+    /// Starts a simulation, and records what the server runs for it.
     async fn observe(server: &Server, remote: PathBuf) -> Self {
         let clients = ready(server, 1).await;
         let shown = http::get(&server.url("/status")).await.json()["simulations"][0].clone();
@@ -129,7 +129,7 @@ impl Bare {
         let mut command: Vec<OsString> = words.map(|word| OsStr::from_bytes(word).to_owned()).collect();
         let instance = PathBuf::from(mark);
         if command[0].to_string_lossy().ends_with("/bwrap") {
-            // The shell that has opened this file has become bubblewrap.
+            // bubblewrap reads this file from descriptor 3, which a shell opens.
             let filter = instance.join("system-calls").into();
             let words = ["/bin/sh", "-c", "exec \"$@\" 3<\"$0\""].map(OsString::from);
             command = words.into_iter().chain([filter]).chain(command).collect();
@@ -150,7 +150,7 @@ impl Bare {
         bare
     }
 
-    /// How long so many take at once.
+    /// How long this many starts at once take.
     fn class(&self, size: u16) -> Duration {
         let (sender, started) = std::sync::mpsc::channel();
         let end = std::sync::Barrier::new(usize::from(size) + 1);
@@ -164,7 +164,7 @@ impl Bare {
                     }
                     let mut child = self.start(number);
                     sender.send(number).unwrap();
-                    // bubblewrap ends with the thread that has started it.
+                    // bubblewrap ends with the thread that started it.
                     end.wait();
                     child.kill().unwrap();
                     child.wait().unwrap();
@@ -232,7 +232,7 @@ impl Bare {
             .stderr(Stdio::null())
             .status();
         assert!(git.unwrap().success());
-        // Of the program, and of pasta.
+        // In the arguments of the program, and of pasta.
         let ports = ["--port=", "127.0.0.1/"]
             .map(|word| (format!("{word}{}", self.port), format!("{word}{}", self.port + number)));
         let own = |word: &OsString| {
@@ -256,7 +256,7 @@ impl Bare {
     }
 }
 
-/// A process and all that descends from it.
+/// A process and its descendants.
 fn tree(root: i32) -> Vec<i32> {
     let children = |pid: i32| std::fs::read_to_string(format!("/proc/{pid}/task/{pid}/children")).unwrap_or_default();
     let mut found = vec![root];

@@ -1,4 +1,4 @@
-//! What starts in containers take beside `docker compose up` of the same project, done by hand: one, and thirty at once.
+//! Measures starts in containers, one and thirty at once, compared with `docker compose up` by hand.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -15,12 +15,12 @@ mod daemon;
 #[path = "../../tests/containers/image.rs"]
 mod image;
 
-/// A start may take this share of what it takes by hand.
+/// Limit of the time of a start, as a multiple of the time by hand.
 const SHARE: f64 = 1.2;
-/// How long a start may take at most.
+/// Timeout of a start.
 const PATIENCE: Duration = Duration::from_secs(300);
 
-/// Compares so many starts at once, in turns, of which the medians count.
+/// Compares the median times of these numbers of starts at once, in turns.
 pub async fn measure(verdict: &mut Verdict, sizes: &[u16], rounds: usize) {
     let Some(_docker) = daemon::docker().await else { return };
     let most = *sizes.iter().max().unwrap();
@@ -75,7 +75,7 @@ async fn gone(server: &Server) {
     }
 }
 
-/// The compose project of a simulation, copied from what the server has written.
+/// The compose project of a simulation, copied from the server's files.
 struct ByHand {
     folder: tempfile::TempDir,
     image: String,
@@ -83,7 +83,7 @@ struct ByHand {
 }
 
 impl ByHand {
-    /// That of the one simulation which runs.
+    /// The project of the only running simulation.
     fn of(server: &Server, most: u16) -> Self {
         let runs = std::fs::read_dir(server.cache().join("runs")).unwrap().flatten().map(|run| run.path());
         let instances = runs.flat_map(|run| std::fs::read_dir(run).unwrap().flatten().map(|file| file.path()));
@@ -101,7 +101,7 @@ impl ByHand {
         self.folder.path().join("instance")
     }
 
-    /// Starts so many, each on a port of its own, and removes them. Returns the time until the last of them answers.
+    /// Starts `count` projects, each on its own port, and removes them. Returns the time until the last one answers.
     fn up(&self, count: u16) -> Duration {
         let begin = Instant::now();
         let ports = self.ports.iter().take(count.into());
@@ -141,7 +141,7 @@ impl ByHand {
     }
 }
 
-/// `docker compose` or `docker-compose`, whichever the server takes, for the daemon.
+/// `docker compose` or `docker-compose`, whichever the server uses, for the daemon.
 fn compose() -> Command {
     let plugin = Command::new("docker").args(["compose", "version"]).output().unwrap().status.success();
     let mut command = Command::new(if plugin { "docker" } else { "docker-compose" });

@@ -1,4 +1,4 @@
-//! What simulations that stand idle cost the server: processor time and memory.
+//! Measures what idle simulations cost the server: processor time and memory.
 
 use std::time::{Duration, Instant};
 
@@ -11,16 +11,16 @@ use crate::support::git::Forge;
 use crate::support::http;
 use crate::support::program::Server;
 
-/// How many stand idle.
+/// Numbers of idle simulations.
 const SIZES: [u16; 4] = [0, 10, 100, 200];
-/// The most processor time of the server for 200, in percent of one core.
+/// Limit of the server's processor time for 200, in percent of one core.
 const MOST: f64 = 2.0;
-/// The most memory of the server for each simulation, in KiB.
+/// Limit of the server's memory per simulation, in KiB.
 const MEMORY: f64 = 150.0;
-/// How long the server is left alone before it is measured: what the starts have begun comes to its end.
+/// Pause before a measurement, in which the server completes the work of the starts.
 const SETTLE: Duration = Duration::from_secs(3);
 
-/// Prints what idle simulations cost, each measured for so long.
+/// Prints what idle simulations cost, each number of them measured for `time`.
 pub async fn measure(verdict: &mut Verdict, levels: &[String], time: Duration) {
     println!("idle simulations, the server's part, {time:?} each:");
     for level in levels {
@@ -31,7 +31,7 @@ pub async fn measure(verdict: &mut Verdict, levels: &[String], time: Duration) {
         let mut before = 0;
         for size in SIZES {
             let mut clients = ready(&server, size).await;
-            // Each is read, as a page reads it: it answers pings.
+            // A page reads its connection all the time, and answers pings.
             let reading: Vec<_> = clients
                 .drain(..)
                 .map(|mut client| {
@@ -64,7 +64,7 @@ pub async fn measure(verdict: &mut Verdict, levels: &[String], time: Duration) {
     }
 }
 
-/// How many simulations there are.
+/// Number of simulations.
 async fn standing(server: &Server) -> usize {
     http::get(&server.url("/status")).await.json()["simulations"].as_array().unwrap().len()
 }
@@ -85,7 +85,7 @@ async fn processor(server: &Server, time: Duration) -> f64 {
     100.0 * (taken(server) - before) / begin.elapsed().as_secs_f64()
 }
 
-/// The processor time that a server has taken, in seconds.
+/// The processor time that a server has used, in seconds.
 fn taken(server: &Server) -> f64 {
     let stat = Process::new(server.pid()).unwrap().stat().unwrap();
     (stat.utime + stat.stime) as f64 / procfs::ticks_per_second() as f64

@@ -1,4 +1,4 @@
-//! How late a limit is noticed that the server keeps itself: a simulation's folder is filled beyond `limits.disk`.
+//! Measures how late the server enforces a limit that it checks itself: a simulation's folder exceeds `limits.disk`.
 
 use std::path::PathBuf;
 use std::time::Instant;
@@ -12,16 +12,16 @@ use crate::support::git::Forge;
 use crate::support::http;
 use crate::support::program::{Server, simulation_server};
 
-/// How many simulations run, if nothing else is asked for.
+/// Default numbers of running simulations.
 const SIZES: [u16; 2] = [10, 100];
-/// How many of them are filled, one after another.
+/// Number of them whose folders are filled, one after another.
 const FILLED: usize = 7;
-/// How many start at once.
+/// Number of simulations that start at once.
 const AT_ONCE: u16 = 100;
 /// `limits.disk`, in MiB.
 const DISK: usize = 5;
 
-/// Prints how long it takes until the client of a simulation hears that it has written too much.
+/// Prints how long it takes until the client of a simulation receives the error that it has written too much.
 pub async fn measure(levels: &[String], sizes: &[u16]) {
     println!("limits.disk, until the client of a simulation that exceeds it is told (median, longest of {FILLED}):");
     let sizes = if sizes.is_empty() { &SIZES } else { sizes };
@@ -30,7 +30,7 @@ pub async fn measure(levels: &[String], sizes: &[u16]) {
             let forge = Forge::with_arm();
             let demo = std::path::Path::new(env!("CARGO_BIN_EXE_demo-simulator"));
             let builder = simulation_server(demo, forge.path(), size).set("isolation", level.as_str());
-            // Clients whose turn has not come answer nothing.
+            // Clients that wait for their turn answer no pings.
             let server = builder.set("limits.disk", DISK).set("timing.silence", 3600).start().await;
             let mut clients = Vec::new();
             while clients.len() < usize::from(size) {

@@ -1,4 +1,4 @@
-//! How fast `/load` answers while ten checkouts run, one remote hangs, and a simulator floods its output.
+//! Measures how fast `/load` answers while ten checkouts run, one remote hangs, and a simulator floods its output.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -10,7 +10,7 @@ use crate::support::git::{Forge, world};
 use crate::support::program::simulation_server;
 use crate::support::webots::Webots;
 
-/// So long may an answer take, whatever else the server does.
+/// Limit of the time of an answer, whatever else the server does.
 const BOUND: Duration = Duration::from_millis(1);
 
 pub async fn measure(verdict: &mut Verdict, requests: usize) {
@@ -53,7 +53,7 @@ pub async fn measure(verdict: &mut Verdict, requests: usize) {
     report(verdict, "a flood of output", &ask(flooded.port, requests).await);
 }
 
-/// Times of requests on one open connection, as a session server asks.
+/// Times of requests on one open connection, as a session server sends them.
 async fn ask(port: u16, requests: usize) -> Vec<Duration> {
     actix_rt::task::spawn_blocking(move || {
         let mut socket = TcpStream::connect(("127.0.0.1", port)).unwrap();

@@ -1,20 +1,21 @@
 //! Measures the simulation server: `cargo bench --bench simulation [-- PART ...]`.
 //!
-//! It starts the built program, with a stand-in for the forge and the demo simulator for Webots:
+//! It starts the built program, with a stand-in for the Git host, and the demo simulator instead of Webots:
 //! - `load`: how fast `/load` answers while ten checkouts run, one remote hangs, and a simulator floods its output;
-//! - `class`: how long 1, 10, 100 and 200 clients take that start at once, in turns with a bare loop that does the same;
-//! - `idle`: what simulations that stand idle cost the server;
-//! - `late`: how long it takes until a limit is noticed that the server keeps itself;
+//! - `class`: how long 1, 10, 100 and 200 clients that start at once take, compared with a bare loop;
+//! - `idle`: what idle simulations cost the server;
+//! - `late`: how late the server enforces a limit that it checks itself;
 //! - `start`: what a cached start costs over the git commands that it runs, and what a sandbox adds to it;
-//! - `stream`: how fast a stream is through a network of its own, beside the machine's, one and a hundred at once, and what
-//!   memory pasta takes; needs an ordinary user, as level `own` does anywhere;
-//! - `containers`: what a start in containers takes beside `docker compose up` by hand, one and thirty at once; needs root
-//!   and dockerd;
-//! - `relay`: what 100 streams of 50 messages a second take through the server, through nginx, and without both; needs nginx;
+//! - `stream`: how fast streams are, one and a hundred at once, through a simulation's own network and the machine's,
+//!   and how much memory pasta takes; needs an ordinary user, as level `own` always does;
+//! - `containers`: how long starts in containers take, one and thirty at once, compared with `docker compose up` by
+//!   hand; needs root and dockerd;
+//! - `relay`: what 100 streams of 50 messages a second cost through the server, through nginx, and directly; needs
+//!   nginx;
 //! - `soak`: whether a thousand starts and stops in a row leave anything: processes, file descriptors, ports, folders,
 //!   threads, memory.
 //!
-//! It fails if a bound is not kept. What else runs on the machine counts too.
+//! It fails if a bound is exceeded. Other load of the machine affects the results.
 
 #![allow(
     missing_docs,

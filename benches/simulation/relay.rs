@@ -1,7 +1,7 @@
-//! What streams take through the server, beside nginx and a direct connection.
+//! Measures what streams cost through the server, compared with nginx and a direct connection.
 //!
-//! This program is also the Webots: it sends each client the time on a message of 1 KiB, so many times a second. All processes
-//! of a machine have the same monotonic clock.
+//! This program also runs in place of Webots: it sends each client messages of 1 KiB that contain the time. All
+//! processes of a machine share the monotonic clock.
 
 use std::net::{Ipv4Addr, TcpStream};
 use std::time::Duration;
@@ -20,17 +20,17 @@ use crate::support::webots::Webots;
 use crate::support::{SOON, ports};
 use crate::web_server::{Kind, WebServer};
 
-/// How many watch at once, and how many messages each gets in a second.
+/// Number of streams at once, and of messages per second on each.
 const STREAMS: usize = 100;
 const MESSAGES: u32 = 50;
 /// The size of a message, in bytes.
 const SIZE: usize = 1024;
-/// How much later than directly 99 % of messages may come.
+/// Limit of the latency of 99 % of the messages beyond that of a direct connection.
 const LATER: Duration = Duration::from_millis(2);
-/// Says to this program that it is the Webots.
+/// The environment variable that makes this program run in place of Webots.
 const SENDER: &str = "RELAY_SENDER";
 
-/// Whether this process is the Webots.
+/// Whether this process runs in place of Webots.
 pub fn is_sender() -> bool {
     std::env::var_os(SENDER).is_some()
 }
@@ -40,7 +40,7 @@ fn now() -> u64 {
     u64::try_from(time.as_nanos()).unwrap()
 }
 
-/// Sends messages on the port that Webots is given, without end.
+/// Sends messages to each client on Webots' port; never returns.
 pub async fn send() {
     let port = std::env::args().find_map(|word| word.strip_prefix("--port=")?.parse().ok()).unwrap();
     let listener = tokio::net::TcpListener::bind((Ipv4Addr::LOCALHOST, port)).await.unwrap();
@@ -49,7 +49,7 @@ pub async fn send() {
         socket.set_nodelay(true).unwrap();
         actix_rt::spawn(async move {
             let Ok(mut client) = tokio_tungstenite::accept_async(socket).await else { return };
-            // Not all at the same moment.
+            // Spreads the messages of the clients over time.
             actix_rt::time::sleep(Duration::from_micros(now() % 20_000)).await;
             let mut ticks = actix_rt::time::interval(Duration::from_secs(1) / MESSAGES);
             let mut message = vec![0; SIZE];
@@ -64,7 +64,7 @@ pub async fn send() {
     }
 }
 
-/// Prints what each way takes, in turns.
+/// Measures each way in turns, and prints the medians.
 pub async fn measure(verdict: &mut Verdict, time: Duration, rounds: usize) {
     println!("{STREAMS} streams of {MESSAGES} messages of {SIZE} bytes a second, {time:?} each:");
     let forge = Forge::with_arm();
@@ -84,7 +84,7 @@ pub async fn measure(verdict: &mut Verdict, time: Duration, rounds: usize) {
     let nginx = WebServer::start(Kind::Nginx, (listen, listen), &site, SOON).await;
     drop(TcpStream::connect(("127.0.0.1", listen)).unwrap());
     let ways = [
-        // What the simulation server takes anyway.
+        // The processor time of the simulation server without relayed streams.
         ("direct", format!("ws://127.0.0.1:{port}/"), server.pid()),
         ("nginx", format!("ws://127.0.0.1:{listen}/"), nginx.pid().as_raw()),
         ("relay", relayed, server.pid()),
@@ -110,7 +110,7 @@ pub async fn measure(verdict: &mut Verdict, time: Duration, rounds: usize) {
     verdict.ratio("processor time beside nginx", relay.1 / nginx.1, 1.0);
 }
 
-/// What one way takes: the latency of 99 % of the messages, and the processor time of this process and its children, in
+/// Measures one way: the latency of 99 % of the messages, and the processor time of `process` and its children, in
 /// percent of a core.
 async fn one(url: &str, process: i32, time: Duration) -> Taken {
     let connecting = (0..STREAMS).map(|_| tokio_tungstenite::connect_async(url));
@@ -121,7 +121,7 @@ async fn one(url: &str, process: i32, time: Duration) -> Taken {
         let reading = async {
             while let Some(Ok(message)) = socket.next().await {
                 let sent = u64::from_be_bytes(message.into_data()[..8].try_into().unwrap());
-                // What waited while the others were connecting does not count.
+                // Messages from before all were connected do not count.
                 if sent > begin {
                     latencies.push(now().saturating_sub(sent));
                 }

@@ -1,4 +1,4 @@
-//! What a cached start costs over the git commands that it runs, and what a sandbox adds to it.
+//! Measures what a cached start costs beyond its git commands, and what a sandbox adds to it.
 
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -10,12 +10,12 @@ use crate::support::git::{Forge, world};
 use crate::support::program::simulation_server;
 use crate::support::webots::Webots;
 
-/// So much more than git may it take.
+/// Limit of the time beyond that of git, and of that for a sandbox.
 const BOUND: Duration = Duration::from_millis(10);
 
 pub async fn measure(verdict: &mut Verdict, starts: usize) {
     let forge = Forge::with_arm();
-    // Never launched: the program is not there.
+    // Ends at once: only the time until the end of the checkout counts.
     let webots = Webots::script("exit 0");
     let server = simulation_server(&webots.path(), forge.path(), 4).start().await;
     let url = world("lab/arm", "main", "worlds/a.wbt");
@@ -33,7 +33,7 @@ pub async fn measure(verdict: &mut Verdict, starts: usize) {
     verdict.bound("over git", over, BOUND);
 }
 
-/// How much longer a program takes from its start to its end in a sandbox.
+/// Measures how much longer a program takes from its launch to its end in a sandbox.
 pub async fn compare_levels(verdict: &mut Verdict, starts: usize) {
     let forge = Forge::with_arm();
     let at = |level: &str| simulation_server(Path::new("/bin/true"), forge.path(), 4).set("isolation", level).start();

@@ -1,6 +1,7 @@
-//! How fast a stream is through a network of its own, beside the machine's, and what memory pasta takes.
+//! Measures how fast a stream is through a simulation's own network, compared with the machine's, and how much memory
+//! pasta takes.
 //!
-//! In place of Webots runs a program that answers requests, and sends back what it gets, or zeros.
+//! The program that runs in place of Webots sends back what it receives, or zeros.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -29,11 +30,11 @@ class Handler(socketserver.StreamRequestHandler):
 socketserver.ThreadingTCPServer.allow_reuse_address = True
 socketserver.ThreadingTCPServer(('127.0.0.1', $port), Handler).serve_forever()"
 "#;
-/// The size of a message that is sent back, in bytes, and the time between two of them.
+/// The size of a message that is sent back, in bytes, and the interval between two of them.
 const MESSAGE: usize = 300;
 const PERIOD: Duration = Duration::from_millis(20);
 
-/// Prints latency of so many streams at once, and what one stream carries.
+/// Prints the latency of these numbers of streams at once, and the throughput of one stream.
 pub async fn measure(sizes: &[u16], time: Duration) {
     let sizes = if sizes.is_empty() { &[1, 100] } else { sizes };
     println!("streams of 50 messages a second, {MESSAGE} bytes there and back:");
