@@ -40,7 +40,7 @@ fn main() -> ExitCode {
     start::serve(log, &arguments.options, &loaded.warnings, server)
 }
 
-/// Sends one mail to the administrator, and a test to the webhook if there is one, and says how that went.
+/// Sends one mail to the administrator and a test to the webhook, if they are configured, and prints the outcomes.
 fn test_mail(config: &SessionConfig) -> ExitCode {
     let system = actix_rt::System::new();
     let webhook = Channel::webhook(config).map(Ok);
@@ -49,7 +49,7 @@ fn test_mail(config: &SessionConfig) -> ExitCode {
     let mut code = ExitCode::SUCCESS;
     for channel in [mail, webhook].into_iter().flatten() {
         match channel.and_then(|channel| system.block_on(channel.test(config))) {
-            // The reader may have gone.
+            // The reader may have closed the pipe.
             Ok(how) => drop(writeln!(std::io::stdout(), "{how}")),
             Err(error) => {
                 eprintln!("error: {error}");

@@ -1,8 +1,7 @@
-//! The actor of one WebSocket, created for each connection. It sends the simulation the peer's messages, as events, and
-//! the peer the simulation's messages. The simulation reaches it through a `ClientHandle`.
+//! The actor of one WebSocket, created for each connection. It sends the peer's messages to the simulation, as events,
+//! and the simulation's messages to the peer. The simulation reaches it through a `ClientHandle`.
 //! Queues are bounded. A peer that sends faster than the simulation handles its messages is disconnected. The actor of
-//! a peer that does not read is not polled, so that its mailbox fills up; if the peer continues to read, it is
-//! disconnected.
+//! a peer that does not read is not polled, so that its mailbox fills up; the peer is disconnected once it reads again.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -61,12 +60,12 @@ impl ClientHandle {
         permit.is_ok_and(|permit| self.client.try_send(Outgoing::Text(text, Some(permit))).is_ok())
     }
 
-    /// Starts the closing handshake, after what is queued.
+    /// Starts the closing handshake, after the queued texts.
     pub(crate) fn close(&self) {
         self.client.do_send(Outgoing::Close);
     }
 
-    /// Disconnects the client before it sends any of what is queued.
+    /// Disconnects the client without sending the queued texts.
     pub(crate) fn disconnect(&self) {
         self.updates.close();
     }

@@ -1,6 +1,6 @@
 //! A stand-in for Webots: takes its command line and implements its standard output and its streaming protocol, so that
-//! a fleet can be tried, tested and measured on a machine without Webots. The servers do not know it; a configuration
-//! names it as the Webots to start.
+//! a fleet can be tried, tested and measured on a machine without Webots. The servers contain no code for it; a
+//! configuration names it as the Webots to start.
 //!
 //! It does not read world files beyond their first line: the scene and the motion come from two files beside the world
 //! (`scene`), or from a small built-in scene. It simulates no physics, runs no controllers and renders no pictures.

@@ -2,7 +2,7 @@
 //!
 //! | client sends | meaning |
 //! |---|---|
-//! | `x3d`, `w3d`, both also with `;broadcast` | send the scene and then what moves; without `;broadcast` the simulation pauses at its next step unless the client runs it |
+//! | `x3d`, `w3d`, both also with `;broadcast` | send the scene and then updates; without `;broadcast` the simulation pauses at its next step unless the client runs it |
 //! | `mjpeg: WxH` | send pictures (an error: nothing is rendered here) |
 //! | `pause`, `step`, `reset`, `reload` (`revert`), `load:WORLD` | the command of that name |
 //! | `real-time:MS`, `fast:MS` | run, and pause by itself after this much simulation time; never if negative |

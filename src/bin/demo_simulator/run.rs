@@ -29,8 +29,8 @@ const CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Runs a simulation until a signal ends it, and returns the exit code.
 ///
-/// The process must exit then without waiting for any thread: one may still be reading the world. No thread with actors
-/// ends before, because actix's thread-local values panic when they are dropped on two threads at once.
+/// The process must then exit without waiting for any thread: one may still be reading the world. No thread with actors
+/// ends before that, because actix's thread-local values panic if they are dropped on two threads at once.
 pub(crate) fn run(args: Args) -> i32 {
     let (sender, code) = mpsc::channel();
     let thread = thread::Builder::new().spawn(move || {

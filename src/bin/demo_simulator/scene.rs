@@ -109,7 +109,7 @@ impl Scene {
 
     /// Returns, as JSON, the poses of the robots at `time`, in milliseconds.
     pub(crate) fn update(&self, time: f64) -> String {
-        // by way of text, so that a whole number of milliseconds has no decimal point, as in Webots
+        // via text, so that a whole number of milliseconds has no decimal point, as in Webots
         let number = time.to_string().parse().unwrap_or_else(|_| 0.into());
         let updates = self.motion.robots.values().map(|robot| robot.pose(time)).collect();
         serde_json::to_string(&Update { time: number, updates }).unwrap_or_default()

@@ -59,7 +59,7 @@ fn names() -> String {
     NAMES.map(|(name, _)| name).join(", ")
 }
 
-/// Draws behaviours by their shares, in each rehearsal the same.
+/// Draws behaviours by their shares; the sequence is the same in each rehearsal.
 pub(crate) struct Draw {
     mix: Mix,
     random: SmallRng,

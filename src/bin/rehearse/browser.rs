@@ -54,8 +54,8 @@ impl From<Ended> for StartError {
 }
 
 impl<'class> Browser<'class> {
-    /// A client that requests a simulation now. Its visit is added to `visits` when this is dropped, also if that
-    /// interrupts it.
+    /// A client that requests a simulation now. Its visit is added to `visits` on drop, even if that interrupts the
+    /// visit.
     pub(crate) fn new(
         arguments: &'class Arguments,
         board: &'class Board,
@@ -239,7 +239,7 @@ impl<'class> Browser<'class> {
         let mut period = actix_rt::time::interval(PACE_PERIOD);
         loop {
             tokio::select! {
-                // What has arrived is read before the second is over, also after this program was held up.
+                // Messages that have arrived are read before the second ends, even if this program was delayed.
                 biased;
                 text = running.stream.receive() => match text {
                     Ok(text) => if let Some(time) = simulated_time(&text) {

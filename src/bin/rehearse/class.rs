@@ -41,7 +41,7 @@ pub(crate) async fn play(arguments: &Arguments) -> Played {
     let clients = join_all((0..arguments.clients).map(|client| class.come(client)));
     let aside = futures_util::future::join(class.board.show(), class.servers.watch());
     let mut interrupted = false;
-    // Clients that are dropped record their visits until then.
+    // Clients that are dropped record their visits so far.
     tokio::select! {
         _ = clients => {}
         _ = aside => {}

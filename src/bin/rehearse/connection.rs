@@ -15,7 +15,7 @@ use crate::session::encryption;
 const CONNECT: Duration = Duration::from_secs(20);
 /// The largest message of a server, in bytes.
 const LARGEST_MESSAGE: usize = 1 << 20;
-/// The same of Webots: the scene of a large world comes in one message.
+/// The largest message of Webots, in bytes: the scene of a large world is one message.
 const LARGEST_SCENE: usize = 64 << 20;
 
 /// An open WebSocket.
@@ -90,7 +90,7 @@ impl Connection {
     /// Connects to a WebSocket URL of a Webots.
     ///
     /// # Errors
-    /// When nobody takes the connection in time.
+    /// When the connection is not established in time.
     pub(crate) async fn open_scene(url: &str) -> Result<Self, Ended> {
         Self::open_for(url, LARGEST_SCENE).await
     }
@@ -118,7 +118,7 @@ impl Connection {
     /// The next text.
     ///
     /// # Errors
-    /// When the connection is over.
+    /// When the connection has ended.
     pub(crate) async fn receive(&mut self) -> Result<String, Ended> {
         loop {
             match self.socket.next().await {
@@ -136,10 +136,10 @@ impl Connection {
         }
     }
 
-    /// The next text, if it arrives before the deadline, also while other texts arrive all the time.
+    /// The next text, if it arrives before the deadline, which a steady flow of texts does not extend.
     ///
     /// # Errors
-    /// When the connection is over, or the time is.
+    /// When the connection has ended, or the deadline has passed.
     pub(crate) async fn receive_by(&mut self, deadline: Deadline) -> Result<String, Ended> {
         let late = Ended::Late(deadline.limit);
         if Instant::now() >= deadline.end {
@@ -148,7 +148,7 @@ impl Connection {
         tokio::time::timeout_at(deadline.end.into(), self.receive()).await.unwrap_or(Err(late))
     }
 
-    /// Closes the connection as a page does that is left, with a short timeout.
+    /// Closes the connection as a page does when its user leaves, with a short timeout.
     pub(crate) async fn close(mut self) {
         let closing = async {
             if self.socket.close(None).await.is_ok() {

@@ -172,8 +172,8 @@ fn seats(visits: &[Visit], real_time: f64) -> Seats {
     seats
 }
 
-/// The reason that a client was told, without what its simulation has printed, and the simulation server that it came from,
-/// which some reasons name themselves.
+/// The reason that a client received, without its simulation's output, and with the simulation server unless the reason
+/// already names it.
 fn reason(why: &str, visit: &Visit) -> String {
     let why = why.split(" Its last output:").next().unwrap_or(why).trim_end_matches('.');
     let server = visit.server.as_deref().filter(|server| !why.contains(server));

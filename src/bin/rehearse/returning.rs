@@ -18,7 +18,7 @@ impl WayBack {
     /// Waits for the token, which is sent once Webots is ready. `server` and `webots` are their URLs.
     ///
     /// # Errors
-    /// When none is received: the server does not support resuming, or it is turned off there.
+    /// When no token is received: the server does not support resuming, or has turned it off.
     pub(crate) async fn find(lease: &mut Connection, server: &str, webots: &str) -> Result<Self, Ended> {
         let deadline = Deadline::within(STEP);
         loop {
@@ -47,7 +47,7 @@ impl WayBack {
             }
         }
         let mut stream = Connection::open_scene(&format!("{}/", self.webots.trim_end_matches('/'))).await?;
-        // Any other first word would make it pause.
+        // Without `;broadcast` the simulation would pause.
         stream.say(&format!("{viewer};broadcast")).await?;
         let mut first = None;
         loop {

@@ -6,9 +6,9 @@ use crate::connection::Ended;
 
 /// Longest excerpt of a text, in characters.
 const EXCERPT: usize = 90;
-/// The longest line that a server's text is shown in, in characters: a simulation's last output is part of a reason.
+/// Longest line of a server's text, in characters: a simulation's last output is part of a reason.
 const LONGEST_LINE: usize = 2000;
-/// So many texts are told of those that are out of place.
+/// Limit of unexpected texts that are listed.
 const LONGEST_LIST: usize = 8;
 
 /// The received text, or why there is none.
@@ -39,7 +39,7 @@ pub(crate) fn excerpt(text: &str) -> String {
     format!("`{}`", text::excerpt(text, EXCERPT).replace('`', "'"))
 }
 
-/// What a server said, on one line that is not too long.
+/// A server's text, on one line of limited length.
 pub(crate) fn line(text: &str) -> String {
     text::excerpt(text, LONGEST_LINE)
 }
