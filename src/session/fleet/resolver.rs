@@ -21,7 +21,7 @@ const TIMEOUT: Duration = Duration::from_secs(1);
 /// Resolves a name to its current addresses, at least one.
 ///
 /// Each lookup creates its own resolver, without a cache: orchestrators publish TTLs of minutes, and dnsmasq answers on
-/// a kept connection with what it knew when the connection began.
+/// a kept connection with the records from when the connection began.
 ///
 /// # Errors
 /// As text, when there is no answer or no address in it.

@@ -144,7 +144,7 @@ async fn get(client: &awc::Client, url: &str) -> Result<Option<(Bytes, Option<us
     Ok(Some((bytes.map_err(bad_answer)?, length)))
 }
 
-/// Whether a connection broke, as opposed to one that could not be made.
+/// Whether an established connection broke.
 fn is_broken(error: &SendRequestError) -> bool {
     !matches!(error, SendRequestError::Connect(reason) if !matches!(reason, ConnectError::Disconnected))
 }

@@ -189,7 +189,7 @@ pub struct NameStatus {
     pub name: String,
     /// Number of servers that it resolves to.
     pub servers: usize,
-    /// Why the last lookup failed, if it did: the servers are those that were found before.
+    /// Why the last lookup failed, if it did; then the servers found before stay.
     pub error: Option<String>,
 }
 

@@ -162,7 +162,7 @@ impl Backend {
 
     /// The load, in percent, from which this server gets no clients.
     pub(super) fn limit(&self, policy: &PlacementPolicy) -> f64 {
-        // A server whose clients cost much is full earlier, because the next one would need more than the machine has.
+        // A server with expensive clients is full earlier, because the next one would need more than the machine has.
         // A threshold above 100 means that the load never makes a server full.
         if policy.threshold > 100.0 { policy.threshold } else { policy.threshold.min(100.0 - self.cost) }
     }

@@ -1,4 +1,4 @@
-//! Ejects a server whose starts fail for reasons of its own: it comes last for a while.
+//! Ejects a server whose starts fail for reasons of its own: for a while, it is chosen last.
 //!
 //! The rule is that of Envoy's outlier detection (`consecutive_5xx` with panic routing): once a server reports
 //! [`FAILURES`] failed starts in a row, it is ejected for [`EJECTION`], and again with each further one. A successful
