@@ -51,7 +51,7 @@ exec "$@"
 "#;
 
 impl Display {
-    /// A virtual display; its authority file is in the instance's folder.
+    /// A virtual display; its authority file is in the instance's directory.
     ///
     /// # Errors
     /// When there is no Xvfb, or the file can't be written.

@@ -34,7 +34,7 @@ const AGE: Duration = Duration::from_millis(1800);
 
 impl UsageMonitor {
     /// The usage of all simulations, never much older than two seconds. `measure` is called if the last reading is too
-    /// old; where it leaves `cpu` at `None`, the mean is computed.
+    /// old; if it leaves `cpu` at `None`, the mean is computed.
     pub fn read(&self, measure: impl FnOnce() -> Usages) -> Usages {
         let mut last = self.0.lock();
         if let Some((at, usages)) = &*last
