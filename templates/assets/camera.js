@@ -24,7 +24,7 @@ export class Camera {
     canvas.addEventListener('contextmenu', (event) => event.preventDefault());
   }
 
-  /** Goes to a viewpoint, and circles around what is in its middle. */
+  /** Goes to a viewpoint, and circles around the point of the ground in the middle of the view. */
   home(viewpoint = this.#start) {
     this.#start = viewpoint;
     const forward = turned(pose([0, 0, 0], viewpoint.orientation), [1, 0, 0]);

@@ -36,7 +36,7 @@ export class Chart {
   #values = [];
   #moment;
   #samples = [];
-  /** The time that is pointed at; the newest where nothing is. */
+  /** The time under the pointer; `undefined` for the newest. */
   #pointed;
 
   constructor(root, group, hidden, switched, pointed) {
@@ -102,7 +102,7 @@ export class Chart {
     this.#tell();
   }
 
-  /** Puts the values into words, which a screen reader reads out; not with each second, which nobody could listen to. */
+  /** Puts the values into text for screen readers; not every second, which would be too much to listen to. */
   #tell() {
     const values = this.#group.series.map(([name], index) => `${name} ${this.#values[index].textContent}`);
     this.#root.setAttribute('aria-valuenow', Math.round((this.#pointed ?? this.#end) - this.#end));
@@ -138,10 +138,10 @@ export class Chart {
   }
 
   #area = [0, 0];
-  /** What the axes were drawn for. */
+  /** The width and the maximum that the axes were drawn for. */
   #drawn;
 
-  /** The axes stay as they are while nothing about them changes: the newest sample is always at their end. */
+  /** Draws the axes if they have changed: the newest sample is always at their end. */
   #drawAxes(width, most, y) {
     const drawn = `${width} ${most}`;
     if (this.#drawn === drawn)

@@ -2,7 +2,7 @@
 
 import { Chart } from './chart.js';
 
-/** The charts: each has the columns whose headings begin with its word, the first one those that are left. */
+/** The charts: each has the columns whose names begin with `begin`, the first one all others. */
 const GROUPS = [
   { title: 'Load and memory', unit: '%', most: 100 },
   { title: 'Simulations', begin: 'Webots ', unit: '', whole: true, least: 4 },
@@ -39,7 +39,7 @@ export class Charts {
     try {
       localStorage.setItem(STORE, JSON.stringify([...this.#hidden]));
     } catch {
-      // A browser that keeps nothing forgets the choice.
+      // Without the browser's store, the choice is forgotten.
     }
     this.#draw();
   }

@@ -43,7 +43,7 @@ export class Drawing {
   #places = {};
   #buffers = new WeakMap();
 
-  /** Prepares a canvas; an exception tells that this browser can't draw in three dimensions. */
+  /** Prepares a canvas. Throws if this browser has no WebGL. */
   constructor(canvas) {
     this.#canvas = canvas;
     this.#gl = canvas.getContext('webgl', { antialias: true, alpha: false });
@@ -95,7 +95,7 @@ export class Drawing {
     if (canvas.width !== size[0] || canvas.height !== size[1])
       [canvas.width, canvas.height] = size;
     const aspect = size[0] / Math.max(1, size[1]);
-    // Webots' angle is that of the wider side.
+    // Webots' field of view is that of the wider side.
     const angle = aspect > 1 ? 2 * Math.atan(Math.tan(scene.viewpoint.angle / 2) / aspect) : scene.viewpoint.angle;
     gl.viewport(0, 0, ...size);
     gl.clearColor(...scene.sky, 1);

@@ -1,8 +1,8 @@
-// What a tab keeps of its simulation while it runs: with it a page that is loaded again, or was left, finds it again. It
-// ends with the tab, and no other page gets it.
+// Stores the simulation of a tab while it runs, so that the page can resume it after a reload or a return. The store
+// ends with the tab, and no other page can read it.
 
 const NAME = 'simulation';
-/** What the page itself keeps, where the browser keeps nothing. */
+/** The page's own copy, if the browser stores nothing. */
 let own;
 
 /** The simulation of this tab, if it has one: server, world, token, absence. */
@@ -14,22 +14,22 @@ export function kept() {
   }
 }
 
-/** Keeps the simulation of this tab. A browser that keeps nothing can't come back to it after a reload. */
+/** Stores the simulation of this tab. Without the browser's store, it can't be resumed after a reload. */
 export function keep(simulation) {
   own = simulation;
   try {
     sessionStorage.setItem(NAME, JSON.stringify(simulation));
   } catch {
-    // There is nothing to be done about that.
+    // The page's own copy remains.
   }
 }
 
-/** The simulation has ended, or is somebody else's. */
+/** Removes the simulation: it has ended, was left, or belongs to another tab. */
 export function forget() {
   own = undefined;
   try {
     sessionStorage.removeItem(NAME);
   } catch {
-    // Nothing was kept.
+    // Nothing was stored.
   }
 }

@@ -1,20 +1,20 @@
-// Watches the connection to a simulation that waits for its client, and says when to try to come back.
+// Monitors the connection to a simulation that waits for its client, and decides when to try to return.
 
-/** No sign of life for so long means that the connection is lost, in seconds; Webots gives one every five. */
+/** Time without a sign of life after which the connection is lost, in seconds; Webots gives one every five. */
 const SILENCE = 8;
-/** A shorter one is not worth a word. */
+/** A shorter interruption is not shown. In seconds. */
 const WORTH_A_WORD = 2;
-/** How long a try may take: a second one would take its token away. In milliseconds. */
+/** Timeout of a try, in milliseconds: a second try would invalidate the token of the first. */
 const TRY = 15_000;
-/** A server that refuses all tries for so long, while the session server answers, is gone with its simulations; in milliseconds. */
+/** A server that refuses all tries for this many milliseconds, while the session server answers, counts as gone. */
 const GONE = 2500;
-/** Before the second try, doubled each time up to the longest, in milliseconds. */
+/** Pause before the second try, in milliseconds; it doubles each time up to the longest. */
 const FIRST_PAUSE = 1000;
 const LONGEST_PAUSE = 10_000;
 
 /**
- * Events: `lost` ({ since, left }, in seconds; each second while there is no connection), `try` (come back now), `refused` (a
- * try has failed), `found` (there is a sign of life again), `over` (nobody can still be waiting).
+ * Events: `lost` ({ since, left }, in seconds; each second while there is no connection), `try` (return now), `refused`
+ * (a try has failed), `found` (there is a sign of life again), `over` (the simulation can't be waiting any more).
  */
 export class Lifeline extends EventTarget {
   #heard = Date.now();
@@ -27,7 +27,7 @@ export class Lifeline extends EventTarget {
     this.#next = 0;
   };
 
-  /** The simulation waits for so many seconds once its server has noticed that its client is away. */
+  /** `absence`: how many seconds the simulation waits once its server has noticed that the client is away. */
   constructor(absence) {
     super();
     this.absence = absence;
@@ -35,7 +35,7 @@ export class Lifeline extends EventTarget {
     addEventListener('online', this.#online);
   }
 
-  /** For how long there has been no sign of life, in seconds. */
+  /** Time since the last sign of life, in seconds. */
   get silence() {
     return (Date.now() - this.#heard) / 1000;
   }
@@ -60,7 +60,7 @@ export class Lifeline extends EventTarget {
   broken() {
     this.#isLost = true;
     if (this.#tries > 0) {
-      // Those who were lost together don't come back together.
+      // Random, so that clients that were disconnected together do not return together.
       const pause = Math.min(LONGEST_PAUSE, FIRST_PAUSE * 2 ** (this.#tries - 1)) * (0.5 + Math.random());
       this.#next = Math.min(this.#next, Date.now() + pause);
       this.#tell('refused');
@@ -68,7 +68,7 @@ export class Lifeline extends EventTarget {
     this.#look();
   }
 
-  /** A try has failed although this page's own server answers: the network is there. */
+  /** A try has failed although this page's own server answers: the network works. */
   refused() {
     this.#refused ??= Date.now();
     if (this.#isLost && Date.now() - this.#refused >= GONE)
@@ -82,7 +82,7 @@ export class Lifeline extends EventTarget {
     this.#isLost = true;
     if (since >= WORTH_A_WORD)
       this.#tell('lost', { since, left: this.absence - since });
-    // The server may notice it later, by as long as it takes a connection to be silent.
+    // The server may notice the loss later, by its timeout of silent connections.
     if (this.#tries > 0 && since > 2 * this.absence) {
       this.#end();
     } else if (Date.now() >= this.#next) {

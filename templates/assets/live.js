@@ -1,6 +1,5 @@
-// Keeps a monitor page true: takes the server's events and puts what has changed into the page.
-// An event has parts (the contents of elements) and tables (their rows); all of it is HTML that the server has made from
-// the same templates as the page, so that nothing is written twice.
+// Keeps a monitor page up to date: receives the server's events and updates what has changed. An event has parts (the
+// contents of elements) and tables (their rows), as HTML that the server renders from the same templates as the page.
 
 import { showTimes } from './times.js';
 
@@ -9,17 +8,17 @@ const lamp = document.getElementById('live');
 /** The HTML that each part and each row of a table was last filled with, and the cells of rows. */
 const known = new WeakMap();
 const cells = new WeakMap();
-/** Compares as people do: 2 comes before 10. */
+/** Natural order: 2 comes before 10. */
 const alphabet = new Intl.Collator(undefined, { numeric: true });
 let source;
-/** When the server was heard last; it says something every 15 seconds. */
+/** Time of the last message from the server; it sends one every 15 seconds. */
 let heard;
 /** Whether events may have been missed before the next one. */
 let fresh;
 let lastSample;
 const SILENCE = 40_000;
 
-/** Calls a function with the numbers of each event that has some; `fresh` tells that events may have been missed. */
+/** Calls a function with the numbers of each event that has some; `fresh`: events may have been missed before. */
 export function onSample(listener) {
   listeners.push(listener);
 }
@@ -29,7 +28,7 @@ function say(text, lost) {
   lamp.classList.toggle('lost', lost);
 }
 
-/** The cells of a row of HTML; a template understands them outside of a table. */
+/** The cells of a row of HTML. */
 function parsed(html) {
   const template = document.createElement('template');
   template.innerHTML = `<table><tbody><tr>${html}</tr></tbody></table>`;
@@ -90,7 +89,7 @@ function cellValue(row, column, kind) {
   return kind === 'number' ? Number(value) : value;
 }
 
-/** Sorts the rows as the headline says; rows are moved only where they are not in place already. */
+/** Sorts the rows by the column that the header marks, and moves only those that are out of place. */
 function sort(body) {
   const heads = [...body.closest('table').tHead.rows[0].cells];
   const column = heads.findIndex((head) => head.hasAttribute('aria-sort'));
@@ -169,7 +168,7 @@ function take(event) {
   }
 }
 
-/** A tab that nobody sees doesn't listen: browsers allow few connections to one server. */
+/** A hidden tab does not listen: browsers allow few connections to one server. */
 function listen() {
   if (document.hidden || source)
     return;
@@ -196,7 +195,7 @@ function lose() {
     say(`No connection since ${since}: what you see is old. Trying again …`, true);
 }
 
-/** A server that hangs and a network that swallows everything close no connection. */
+/** A server that hangs, or a network that drops everything, does not close the connection. */
 setInterval(() => {
   if (source && Date.now() - heard > SILENCE) {
     lose();
@@ -214,7 +213,7 @@ document.querySelectorAll('table:has(th[data-sort])').forEach(makeSortable);
 for (const field of document.querySelectorAll('[data-filter]')) {
   field.addEventListener('input', () => {
     filter(document.getElementById(field.dataset.filter));
-    // A list that has become short would end above what is seen.
+    // A list that has become shorter could end above the visible part.
     const section = field.closest('section');
     if (section.getBoundingClientRect().top < 0)
       section.scrollIntoView();

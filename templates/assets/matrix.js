@@ -1,4 +1,4 @@
-// Vectors of three numbers and matrices of four by four, in columns as WebGL wants them.
+// Vectors of three numbers and matrices of four by four, in column-major order as WebGL expects.
 
 export const add = (a, b) => [a[0] + b[0], a[1] + b[1], a[2] + b[2]];
 export const scale = (a, factor) => [a[0] * factor, a[1] * factor, a[2] * factor];
@@ -12,7 +12,7 @@ export function unit(a) {
 
 export const identity = () => [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
 
-/** a after b. */
+/** The product: applies b, then a. */
 export function times(a, b) {
   const product = new Array(16);
   for (let column = 0; column < 4; ++column) {
@@ -39,7 +39,7 @@ export function pose(translation, rotation, factors = [1, 1, 1]) {
   return [...columns.flatMap((column, index) => [...scale(column, factors[index]), 0]), ...translation, 1];
 }
 
-/** What an eye at a point sees that looks at another. */
+/** The view matrix of an eye that looks at a target. */
 export function lookAt(eye, target, up) {
   const back = unit(add(eye, scale(target, -1)));
   const right = unit(cross(up, back));
@@ -52,7 +52,7 @@ export function lookAt(eye, target, up) {
   ];
 }
 
-/** A perspective: the angle is that of the height. */
+/** A perspective projection; `angle` is the vertical field of view. */
 export function perspective(angle, aspect, near, far) {
   const f = 1 / Math.tan(angle / 2);
   return [f / aspect, 0, 0, 0, 0, f, 0, 0, 0, 0, (far + near) / (near - far), -1, 0, 0, 2 * far * near / (near - far), 0];

@@ -1,4 +1,4 @@
-// A scene as a simulator tells it: the nodes of its model, and where they are now.
+// A scene as a simulator sends it: the nodes of its model, and their current poses.
 
 import { identity, pose, times } from './matrix.js';
 import { shape } from './shapes.js';
@@ -16,7 +16,7 @@ export class Scene {
   #nodes = new Map();
   #root = { children: [], shapes: [] };
 
-  /** Reads a model; an exception tells that it is none. */
+  /** Reads a model. Throws if it is not one. */
   constructor(xml) {
     const document = new DOMParser().parseFromString(xml, 'text/xml');
     const scene = document.querySelector('Scene');
@@ -80,7 +80,7 @@ export class Scene {
     this.shapes.push(drawn);
   }
 
-  /** Takes an update: poses of nodes by their numbers. */
+  /** Applies an update: poses of nodes by their numbers. */
   update({ updates = [] }) {
     for (const { id, translation, rotation } of updates) {
       const node = this.#nodes.get(id);

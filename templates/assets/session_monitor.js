@@ -1,4 +1,4 @@
-// What the session server's page has beside its live tables: an announcement for everybody, which needs the password.
+// The session server's page besides its live tables: announcements, which need the password.
 
 import './live.js';
 

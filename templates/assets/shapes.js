@@ -43,7 +43,7 @@ function box([x, y, z]) {
   return mesh.finish();
 }
 
-/** A body of revolution: rings as [radius, height, outward, upward], from below to above. */
+/** A body of revolution: rings as [radius, height, outward, upward], from bottom to top. */
 function turnedBody(rings, sides) {
   const mesh = new Mesh();
   const at = ([radius, height], angle) => [radius * Math.cos(angle), radius * Math.sin(angle), height];
@@ -87,7 +87,7 @@ function plane([x, y]) {
   return mesh.finish();
 }
 
-/** Faces as lists of corners; each is flat and has no hollows. */
+/** Faces as lists of corners; each is flat and convex. */
 function faces(points, indices) {
   const mesh = new Mesh();
   const minus = (a, b) => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
@@ -108,7 +108,7 @@ function faces(points, indices) {
   return mesh.finish();
 }
 
-/** The triangles of a geometry's element; nothing for one that is not known. */
+/** The triangles of a geometry's element; `undefined` if it is not known. */
 export function shape(element) {
   const number = (name, standard) => Number(element.getAttribute(name) ?? standard);
   const numbers = (name, standard) => (element.getAttribute(name) ?? standard).trim().split(/[\s,]+/).map(Number);

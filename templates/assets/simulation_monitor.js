@@ -1,4 +1,4 @@
-// What the simulation server's page has beside its live tables: charts, the time left, the output on demand, and for
+// The simulation server's page besides its live tables: charts, the time left, the output on demand, and for
 // administrators a way to stop a simulation.
 
 import { Charts } from './charts.js';
@@ -14,7 +14,7 @@ async function loadHistory() {
   charts.begin(await answer.json());
 }
 
-/** The page may have missed samples: it asks for all of them again. */
+/** If the page may have missed samples, it requests all of them again. */
 onSample((sample, fresh) => {
   if (fresh)
     loadHistory().catch(() => charts.add(sample));
@@ -45,7 +45,7 @@ async function showOutput(link) {
   text.scrollTop = text.scrollHeight;
 }
 
-/* Only administrators have this. */
+/* Only administrators have this dialog. */
 const stopping = document.getElementById('stop');
 const problem = document.getElementById('stop-problem');
 const reason = document.getElementById('stop-reason');

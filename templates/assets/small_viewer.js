@@ -5,7 +5,7 @@ import { Drawing } from './draw.js';
 import { Scene } from './scene.js';
 import { Stream } from './stream.js';
 
-/** How many lines of the simulation's console are kept. */
+/** Number of lines of the simulation's console that are kept. */
 const LINES = 200;
 
 function make(name, properties, ...children) {
@@ -29,13 +29,12 @@ export class SmallViewer extends EventTarget {
   #parts;
   #watch = new ResizeObserver(() => this.#redraw());
 
-  /** Whether its user only looks on. */
+  /** Whether its user only watches. */
   #watches;
 
   /**
-   * Shows the simulation at an address in an element. For who comes back (`true`), and for who only looks on (`'watches'`),
-   * its time goes on. Events: `ready`, `loading`
-   * (text), `heard`, `lost`.
+   * Shows the simulation at an address in an element. Its time goes on for a client that returns (`true`) or only
+   * watches (`'watches'`). Events: `ready`, `loading` (text), `heard`, `lost`.
    */
   constructor(stage, url, isBack = false) {
     super();
@@ -132,17 +131,17 @@ export class SmallViewer extends EventTarget {
     this.#parts.mode.textContent = mode === 'pause' ? 'paused' : mode.replace('-', ' ');
   }
 
-  /** Whether the time of the simulation goes on, whoever lets it. */
+  /** Whether the time of the simulation goes on, also if another client has started it. */
   get runs() {
     return !this.#isFrozen && this.#mode !== 'pause';
   }
 
-  /** What is shown is old. */
+  /** Marks what is shown as out of date. */
   stale() {
     this.#parts.mode.textContent = 'no connection';
   }
 
-  /** What is shown stays, and nothing more is heard. */
+  /** Keeps what is shown, and closes the connection. */
   freeze() {
     this.#isFrozen = true;
     this.stale();
@@ -171,7 +170,7 @@ export class SmallViewer extends EventTarget {
     this.#parts.output.hidden = false;
   }
 
-  /** Draws with the next picture of the screen. */
+  /** Draws in the next animation frame. */
   #redraw() {
     if (this.#drawn || !this.#scene)
       return;

@@ -1,14 +1,14 @@
-// The way from a world's URL to a running simulation: the simulation server's WebSocket, whose life is the lease.
+// The way from a world's URL to a running simulation: the simulation server's WebSocket, which holds the lease.
 
-/** What comes before a step for the sake of the bar on Webots' page. */
+/** Prefix of a step, for the progress bar of Webots' page. */
 const STEP_FOR_WEBOTS = /^Step \d\/\d : /;
 const CHECKOUT_IS_OVER = /^webots\b/i;
-/** How a simulation server closes a connection whose client another one may take: going away, try again later. */
+/** Close codes after which another simulation server may accept the client: going away, try again later. */
 const TRY_ANOTHER = [1001, 1013];
-/** How long the close of a connection may take after the reason for it was told, in milliseconds. */
+/** Time to wait for the close of a connection after the reason for it was received, in milliseconds. */
 const CLOSING = 1000;
 
-/** What somebody can do about a failure, in words. */
+/** What the user can do about a failure, as text. */
 export function advice(text) {
   const table = [
     [/Docker not enabled|not one of the repositories|no simulation server accepts|blocked repository|does not allow/i,
@@ -31,10 +31,10 @@ export function advice(text) {
 }
 
 /**
- * The connection of one simulation. Events: `step` ({step, state, text}), `left` (seconds until it is closed), `ready` (the
- * simulator's address), `token` (one can come back with it within `absence` seconds), `idle` (seconds until it
- * ends because it is paused, or null: it does not), `heard` (a sign of life), `failed` (text: it is over), `elsewhere` (text:
- * this server can't take the client, another may), `broken` (one may come back).
+ * The connection of one simulation. Events: `step` ({step, state, text}), `left` (seconds until it is closed), `ready`
+ * (the simulator's address), `token` (it resumes the simulation within `absence` seconds), `idle` (seconds until it
+ * ends because it is paused, or null: it does not), `heard` (a sign of life), `failed` (text: it is over), `elsewhere`
+ * (text: this server can't accept the client, another may), `broken` (the client may return).
  */
 export class Simulation extends EventTarget {
   #socket;
@@ -42,12 +42,12 @@ export class Simulation extends EventTarget {
   #launched = false;
   #ended = false;
   #why;
-  /** What one can come back with, once there is something. */
+  /** The token that resumes the simulation, once there is one. */
   #token;
-  /** How long the simulation waits then, in seconds. */
+  /** Time for which the simulation then waits, in seconds. */
   absence = 0;
 
-  /** Asks a simulation server (a WebSocket address) for a world in some name, or for the simulation of a token. */
+  /** Requests a world under a name, or the simulation of a token, from a simulation server (a WebSocket address). */
   constructor(server, { world, name, token }) {
     super();
     this.#token = token;
@@ -61,7 +61,7 @@ export class Simulation extends EventTarget {
     this.#socket.addEventListener('message', ({ data }) => {
       if (this.#ended)
         return;
-      // Who is refused has found nothing.
+      // A refusal is not a sign of life.
       if (!/^(loading: Error|error):/.test(data))
         this.#tell('heard');
       this.#understand(data);
@@ -126,7 +126,7 @@ export class Simulation extends EventTarget {
       this.#step('checkout', 'doing', text);
   }
 
-  /** The reason is told first; how the connection is closed says whether another server may take the client. */
+  /** The reason comes first; the close code then shows whether another server may accept the client. */
   #refused(text) {
     this.#why = text;
     setTimeout(() => this.#closed(), CLOSING);
@@ -148,12 +148,12 @@ export class Simulation extends EventTarget {
       this.#tell('elsewhere', 'The simulation server could not be reached, or has closed the connection.');
   }
 
-  /** It is not to end because it is paused. */
+  /** Asks the server not to end the simulation although it is paused. */
   keep() {
     this.#socket.send(JSON.stringify({ keep: true }));
   }
 
-  /** Hears nothing more, and lets the simulation wait if it can. */
+  /** Closes the connection, and lets the simulation wait if it can. */
   detach() {
     this.#ended = true;
     this.#socket.close();

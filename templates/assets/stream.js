@@ -1,6 +1,6 @@
 // The streaming protocol of Webots, as a viewer speaks it: texts over a WebSocket.
 
-/** How long a simulator may be silent until it is asked in the newer way, in milliseconds. */
+/** Time without an answer after which the stream is requested by its newer name, in milliseconds. */
 const SILENCE = 2000;
 /** Newer versions of Webots call their 3D stream `w3d`. */
 const KINDS = ['x3d', 'w3d'];
@@ -14,7 +14,7 @@ export class Stream extends EventTarget {
   #timer;
   #heard = false;
 
-  /** Opens the connection; for an onlooker, and for who comes back, time goes on: any other makes the simulator pause. */
+  /** Opens the connection. A new client makes the simulator pause; an onlooker, or a client that returns, does not. */
   constructor(url, onlooker = false) {
     super();
     this.#socket = new WebSocket(`${url}/`);
@@ -54,7 +54,7 @@ export class Stream extends EventTarget {
     const rest = (prefix) => text.slice(prefix.length);
     if (text.startsWith('application/json:')) {
       const update = JSON.parse(rest('application/json:'));
-      // Up to R2022b the key was another.
+      // Up to R2022b the key was `poses`.
       this.#tell('update', { ...update, updates: update.updates ?? update.poses });
     } else if (text.startsWith('model:'))
       this.#tell('model', rest('model:'));
@@ -77,7 +77,7 @@ export class Stream extends EventTarget {
   }
 }
 
-/** Whether the simulator at this address is the demonstration's; it tells so in its scene. */
+/** Whether the simulator at this address is the demonstration's, as its scene says. */
 export function isDemonstration(url) {
   return new Promise((resolve) => {
     const stream = new Stream(url, true);

@@ -4,7 +4,7 @@ const clock = new Intl.DateTimeFormat(undefined, { hour: '2-digit', minute: '2-d
 const day = new Intl.DateTimeFormat(undefined, { day: 'numeric', month: 'short', hour: '2-digit', minute: '2-digit' });
 const whole = new Intl.DateTimeFormat(undefined, { dateStyle: 'medium', timeStyle: 'long' });
 
-/** Shows all times below an element as the reader's clock has them. */
+/** Shows all times below an element in the reader's time zone. */
 export function showTimes(root) {
   const today = new Date().toDateString();
   for (const element of root.querySelectorAll('time[datetime]')) {
@@ -21,7 +21,7 @@ export function timeOfDay(seconds) {
   return clock.format(new Date(1000 * seconds));
 }
 
-/** A number of seconds in words. */
+/** A number of seconds as text. */
 export function duration(seconds) {
   const rest = Math.max(0, Math.round(seconds));
   const [hours, minutes] = [Math.floor(rest / 3600), Math.floor(rest / 60) % 60];

@@ -11,31 +11,31 @@ const find = (id) => document.getElementById(id);
 const form = find('start');
 let simulation;
 let viewer;
-/** Watches the connection of a simulation that one can come back to. */
+/** Monitors the connection to a simulation that can be resumed. */
 let lifeline;
 let countdown;
-/** Counts the time that a simulation has left which is paused. */
+/** The timer that shows how long a paused simulation has left. */
 let idling;
-/** What its visitor is called, as the link to this page says. */
+/** The visitor's name, from the link to this page. */
 const visitor = new URLSearchParams(location.search).get('name')?.trim() || undefined;
 let wanted;
 let patience;
-/** How often another simulation server was asked for since the form was sent; and the timer for the next time. */
+/** Number of requests for another simulation server since the form was sent, and the timer of the next one. */
 let askedAgain = 0;
 let asking;
 
-/** How often another simulation server is asked for at most; and before the first time, in milliseconds, doubled each time. */
+/** Maximum of these requests, and the pause before the first one in milliseconds; it doubles each time. */
 const ASK_AGAIN = 3;
 const FIRST_PAUSE = 1000;
 
 const ANNOUNCEMENT = 'announcement:';
 
-/** Who is told so is not out of luck: somebody leaves. */
+/** Refusals after which waiting helps: a slot becomes free when another client leaves. */
 const BUSY = /no simulation server available|places .* are taken|Clients of your address have|You have \d+ places/i;
-/** Before a server is asked for again although one is free, doubled each time up to the longest, in milliseconds. */
+/** Pause before the next request although a server is free, in milliseconds; it doubles up to the longest. */
 const FIRST_WAIT = 2000;
 const LONGEST_WAIT = 30_000;
-/** After a server has become free; not all who wait ask at once. In milliseconds. */
+/** Longest random pause after a server has become free, so that not all waiting pages ask at once, in milliseconds. */
 const JITTER = 3000;
 /** The world that waits for a server, and the timer of its next try. */
 let waiting;
@@ -44,9 +44,9 @@ let wait = FIRST_WAIT;
 /* the light */
 
 let door;
-/** How many answers nobody waits for any more are still to come. */
+/** Number of answers still to come to requests that were given up. */
 let stale = 0;
-/** The last word on whether a server is free. */
+/** The last report whether a server is free: `1` or `0`. */
 let word;
 
 function openDoor() {
@@ -73,7 +73,7 @@ function light(state, word, text) {
   find('light-text').textContent = text;
 }
 
-/** What the administrator tells everybody; nothing once it is over. */
+/** Shows the administrator's announcement; without a text, hides it. */
 function announce(text) {
   find('announcement').textContent = text;
   find('announcement').hidden = !text;
@@ -87,7 +87,7 @@ function hear(text) {
   if (text === '1' || text === '0') {
     word = text;
     showWord();
-    // What could not be reached is reached.
+    // The session server is reachable again.
     if (/session server/.test(find('problem-text').textContent))
       find('problem').hidden = true;
     if (waiting && text === '1')
@@ -105,7 +105,7 @@ function showWord() {
     light('off', 'Not available', 'All simulation servers are busy or do not answer.');
 }
 
-/** Something that is so for a while; nothing takes it away. */
+/** Shows a notice; without a text, hides it. */
 function notice(text, more) {
   find('notice-text').textContent = text ?? '';
   find('notice-advice').textContent = more ?? '';
@@ -140,7 +140,7 @@ function clearSteps() {
 function failed(text) {
   const current = document.querySelector('.steps .doing, .steps li:not(.done)') ?? document.querySelector('[data-step="simulation"]');
   step({ step: current.dataset.step, state: 'failed' });
-  // A sentence; but what begins with an address is left as it is.
+  // A sentence begins with a capital, but an address stays as it is.
   find('problem-text').textContent = text.replace(/^[a-z]+ /, (word) => word[0].toUpperCase() + word.slice(1));
   find('problem-advice').textContent = advice(text);
   find('problem').hidden = false;
@@ -163,7 +163,7 @@ function start(event) {
   ask(world);
 }
 
-/** All servers are busy: it is tried again as soon as one is free. */
+/** All servers are busy: the page tries again as soon as one is free. */
 function waitForServer(world) {
   leave();
   clearSteps();
@@ -225,7 +225,7 @@ function refused(world, why) {
     failed(why);
 }
 
-/** Follows a simulation; who is back finds the steps done, and the time as it went on. */
+/** Shows the progress of a simulation; `isBack` if its client returns to it. */
 function follow(current, server, world, isBack = false) {
   simulation = current;
   const on = (kind, handler) => current.addEventListener(kind, ({ detail }) => {
@@ -236,7 +236,7 @@ function follow(current, server, world, isBack = false) {
   on('left', countDown);
   on('idle', (seconds) => tellIdle(seconds, current));
   on('watched', (now) => { find('watched').hidden = !now; });
-  // Who comes back hears it again, if it is still so.
+  // The server sends it again if it still applies.
   find('watched').hidden = true;
   on('failed', (why) => {
     if (isBack)
@@ -255,7 +255,7 @@ function follow(current, server, world, isBack = false) {
   on('broken', () => lifeline?.broken());
 }
 
-/** Who comes back to what has ended hears why, unless nobody came back in time. */
+/** Why a simulation has ended, for a client that returns; if it returns too late, also how long it was away. */
 function ended(why) {
   const silence = lifeline?.silence ?? 0;
   return silence > lifeline?.absence && /has ended$/.test(why) ? `${why}: there was no connection for ${duration(silence)}` : why;
@@ -263,7 +263,7 @@ function ended(why) {
 
 /* coming back */
 
-/** Tells that there is no connection while that is so, and comes back. */
+/** Shows that there is no connection as long as there is none, and tries to return. */
 function watch(absence) {
   const watched = new Lifeline(absence);
   const on = (kind, handler) => watched.addEventListener(kind, ({ detail }) => handler(detail));
@@ -299,14 +299,14 @@ function comeBack() {
   if (!left)
     return;
   simulation?.detach();
-  // Who is back is told again.
+  // The server sends it again if it still applies.
   tellIdle();
-  // What its stream still says is no sign of life of this simulation's server.
+  // Messages of the old stream are not a sign of life of the simulation's server.
   viewer?.freeze?.();
   follow(new Simulation(left.server, { token: left.token }), left.server, left.world, true);
 }
 
-/** A page that is loaded again, or that one has come back to, goes on with the simulation of its tab. */
+/** Resumes the simulation of this tab after a reload, or a return to the page. */
 function goOn() {
   const left = kept();
   const named = new URLSearchParams(location.search).get('url');
@@ -323,7 +323,7 @@ function goOn() {
   lifeline.broken();
 }
 
-/** The page is left, perhaps for a moment only: a simulation that can wait does so. */
+/** The page is left, perhaps only for a moment: the simulation waits if it can be resumed. */
 function pause() {
   if (!kept()) {
     leave();
@@ -337,7 +337,7 @@ function pause() {
   oldSimulation?.detach();
 }
 
-/** While a simulation runs, a link must not end it. */
+/** While a simulation runs, links open in a new tab, because leaving the page could end it. */
 function headerLinks(stay) {
   for (const link of document.querySelectorAll('header a')) {
     link.target = stay ? '_blank' : '';
@@ -346,7 +346,7 @@ function headerLinks(stay) {
 }
 
 /**
- * A simulation server is about to end, or gone, or can't start the simulation: the session server hears of that within
+ * A simulation server is stopping, unreachable, or can't start the simulation: the session server notices that within
  * seconds, and chooses another.
  */
 function askAgain(world, why) {
@@ -371,7 +371,7 @@ function countDown(seconds) {
   countdown = setInterval(tick, 1000);
 }
 
-/** A simulation that is paused ends, unless somebody keeps it. */
+/** Shows when a paused simulation ends, unless it is kept. */
 function tellIdle(seconds = null, current = undefined) {
   clearInterval(idling);
   find('idle').hidden = seconds === null;
@@ -381,7 +381,7 @@ function tellIdle(seconds = null, current = undefined) {
   const tick = () => {
     const left = duration((end - Date.now()) / 1000);
     find('idle-text').textContent = `The simulation is paused, and ends in ${left}.`;
-    // One that a controller has started is paused only for its server.
+    // If a controller has started the simulation, only its server still takes it for paused.
     if (viewer?.runs)
       current.keep();
   };
@@ -391,7 +391,7 @@ function tellIdle(seconds = null, current = undefined) {
   idling = setInterval(tick, 1000);
 }
 
-/** Where Webots' own viewer can be had: from the simulation server, or from the configured address. */
+/** The URL of Webots' own viewer: on the simulation server, or the configured one. */
 async function webotsViewer(server) {
   const base = server.replace(/^ws/, 'http');
   try {
@@ -399,7 +399,7 @@ async function webotsViewer(server) {
     if (status.viewer)
       return `${base}/${status.viewer}`;
   } catch {
-    // Another kind of server, which has none.
+    // Another kind of server, without a viewer.
   }
   return form.dataset.script;
 }
@@ -433,7 +433,7 @@ function showSmall(address, isBack) {
   viewer.addEventListener('ready', ({ detail }) => {
     seen = true;
     step({ step: 'simulation', state: 'done', text: detail || 'is shown' });
-    // On a phone the scene would lie below the steps.
+    // On a phone the scene would be out of sight, below the steps.
     find('stage').scrollIntoView({ block: 'nearest' });
   });
   viewer.addEventListener('heard', () => lifeline?.alive());
@@ -449,7 +449,7 @@ function showSmall(address, isBack) {
   });
 }
 
-/** The simulator has ended, of which the simulation server tells in a moment, or the connection to it alone is lost. */
+/** Either the simulator has ended, which the simulation server reports in a moment, or only the stream is lost. */
 function rejoin(lost) {
   step({ step: 'simulation', state: 'failed', text: 'the simulator has closed its connection' });
   setTimeout(() => {
@@ -528,7 +528,7 @@ if (visitor) {
   find('visitor').hidden = false;
 }
 addEventListener('pagehide', pause);
-// One that the browser had put aside as it was.
+// The browser shows the page from its back/forward cache.
 addEventListener('pageshow', ({ persisted }) => persisted && goOn());
 openDoor();
 goOn();

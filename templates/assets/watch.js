@@ -1,4 +1,4 @@
-// The page on which an administrator watches a simulation: a viewer that only looks on.
+// The page on which an administrator watches a simulation: a read-only viewer.
 
 import { SmallViewer } from './small_viewer.js';
 

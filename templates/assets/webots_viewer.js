@@ -1,8 +1,8 @@
 // Loads Webots' own viewer, the component `webots-view`, and connects it to a simulator.
 //
-// That component comes with Webots and names some of its own files by the address of another site, and it makes a
-// script in the page to say where its data is. Both are turned here to where the component itself comes from: a
-// simulation server that has Webots has all of these files, and this page runs nothing that stands in a page.
+// The component comes with Webots. It loads some of its own files from another site, and adds an inline script to the
+// page to locate its data. Both are redirected to where the component itself comes from: a simulation server that has
+// Webots has all of these files, and this page runs no inline scripts.
 
 const HOME = /^https:\/\/cyberbotics\.com\/wwi\/[^/]+\//;
 const wanted = new URLSearchParams(location.hash.slice(1));
@@ -21,7 +21,7 @@ function redirected(node) {
   return node;
 }
 
-/** This page keeps nothing: a component that wants to keep something may think that it does. */
+/** This page can't store anything: the component gets a store that lasts as long as the page. */
 function forgetful() {
   const kept = new Map();
   return {
@@ -45,7 +45,7 @@ document.head.appendChild = (node) => {
 };
 
 try {
-  // Anybody could send a link with a script to a page that is not embedded.
+  // A page that is not embedded could be opened by a link that names any script.
   if (window === top || !script)
     throw new Error('no viewer is named');
   await import(script);

@@ -32,7 +32,7 @@ impl Session {
         }
     }
 
-    /// Sends to this connection from now on, and obeys no earlier one any more.
+    /// Switches the session to this connection: an earlier one is closed, and its actions are ignored.
     pub(super) fn attach(&mut self, Connection { peer, client, mut actions }: Connection, ctx: &mut Context<Self>) {
         self.peer = peer;
         if let Some(before) = self.client.replace(client) {
@@ -46,7 +46,7 @@ impl Session {
         }
     }
 
-    /// Sends the client the URL of Webots, and what it can come back with.
+    /// Sends the client the URL of Webots and, if the session is resumable, a token to return with.
     pub(super) fn offer(&mut self, ctx: &mut Context<Self>) {
         let Some(url) = &self.url else { return };
         self.text(protocol::webots(url));

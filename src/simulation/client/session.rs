@@ -1,8 +1,8 @@
 //! Actor: the session of one simulation, from the request for it to its end, as one state machine.
 //!
 //! Created by a web client that requests a simulation. Dropping it releases what it holds in its state: a position in
-//! the queue, a checkout in progress, a running Webots. It ends with its client, or some time after the connection of a
-//! client that may return. `start` is its way to a running Webots, `resume` the wait for its client.
+//! the queue, a checkout in progress, a running Webots. It ends with its client's connection, or some time later if the
+//! client may return. `start` contains the way to a running Webots, `resume` the wait for the client.
 
 use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
@@ -30,9 +30,9 @@ pub struct Session {
     pub(super) peer: Peer,
     /// The id of the simulation, once there is one.
     pub(super) id: Option<SimulationId>,
-    /// The connection of its client, until it has ended.
+    /// The connection of its client; `None` once it has ended.
     pub(super) client: Option<Recipient<ToClient>>,
-    /// Ends the attachment of that connection, at once.
+    /// Detaches that connection at once.
     pub(super) attachment: Option<AbortHandle>,
     pub(super) state: State,
     /// The project that was checked out, as long as its Webots holds it.
@@ -45,14 +45,14 @@ pub struct Session {
     pub(super) token: Option<Token>,
     /// When Webots was started: the time limit starts then.
     pub(super) launched: Option<Instant>,
-    /// The texts that its project requests.
+    /// The texts that its project requests, kept for a client that returns.
     pub(super) texts: Vec<String>,
     /// The URL of Webots, once it is ready.
     pub(super) url: Option<String>,
-    /// When the simulation ends because it is paused, if it does.
+    /// When the simulation ends because it is paused; `None` if it does not.
     pub(super) idle_end: Option<Instant>,
     pub(super) is_watched: bool,
-    /// The timer that ends the wait for the client, if there is one.
+    /// The timer that ends the wait for the client, while it waits.
     pub(super) deadline: Option<SpawnHandle>,
     /// Why the simulation has ended, if it has.
     pub(super) ended: Option<String>,
@@ -68,7 +68,7 @@ pub(super) enum State {
     CheckingOut(Slot),
     /// Webots was started.
     Launched(WebotsHandle),
-    /// It holds nothing: it was not admitted yet, or its client got the last text.
+    /// Nothing is held: the simulation was not admitted yet, or its client got the last text.
     Over,
 }
 
@@ -84,7 +84,7 @@ impl Drop for WebotsHandle {
 /// Interval of `absence` messages to a client that may return, which show that the connection works.
 const SIGN_OF_LIFE: Duration = Duration::from_secs(4);
 
-/// How many seconds are left until then, rounded up.
+/// Seconds until then, rounded up.
 pub(super) fn seconds_until(then: Instant) -> u64 {
     (then.saturating_duration_since(Instant::now()) + Duration::from_millis(999)).as_secs()
 }
@@ -138,7 +138,7 @@ impl Session {
         }
     }
 
-    /// Releases everything, and sends its client the last text. A client that has not received it can return for `why`.
+    /// Releases everything, and sends the client the last text. A client that missed it receives `why` when it returns.
     pub(super) fn finish(&mut self, last_words: String, why: &str, code: CloseCode, ctx: &mut Context<Self>) {
         self.state = State::Over;
         if let Some(client) = self.client.take() {
@@ -269,7 +269,7 @@ impl Handler<WebotsEvent> for Session {
                 self.offer(ctx);
                 if self.resumable {
                     let absence = self.server.config.timing.absence.as_secs();
-                    // A busy Webots sends nothing for a while, and its client would assume a lost connection.
+                    // While Webots is busy it sends nothing, and its client would assume a lost connection.
                     ctx.run_interval(SIGN_OF_LIFE, move |this, _| this.hint(protocol::absence(absence)));
                 }
             }

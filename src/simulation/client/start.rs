@@ -29,13 +29,13 @@ impl Session {
         self.finish(protocol::error(why), why, CloseCode::Normal, ctx);
     }
 
-    /// The same for a client that another server may accept: the close code shows that to programs.
+    /// Like `give_up`, for a client that another server may accept: the close code tells programs so.
     pub(super) fn refer(&mut self, why: &str, ctx: &mut Context<Self>) {
         log::info!("{}: {why}", self.name());
         self.finish(protocol::elsewhere(why), why, CloseCode::Again, ctx);
     }
 
-    /// The same for a start that fails for a reason of this server's own, which is reported to session servers.
+    /// Like `refer`, for a start that fails because of this server, which is reported to session servers.
     pub(super) fn fail_own(&mut self, why: &str, ctx: &mut Context<Self>) {
         self.server.failed_starts.add(&format!("{}: {why}", self.name()));
         self.end(EndReason::Fault, why);
@@ -122,7 +122,7 @@ impl Session {
         self.state = State::Launched(WebotsHandle(webots));
     }
 
-    /// Takes a GPU for a simulation, where they are spread over several and one answers.
+    /// Assigns a GPU to a simulation, if simulations are spread over GPUs and one answers.
     fn take_gpu(&self, lease: &SlotLease) -> Option<Gpu> {
         let spread = self.server.spread.as_ref()?;
         let gpu = spread.take(&self.server.readings.borrow().gpus, Instant::now())?;

@@ -1,8 +1,8 @@
-//! Actor: one WebSocket on `/client`. It parses its client's messages, and sends it the messages of the simulation's
+//! Actor: one WebSocket on `/client`. It parses its client's messages, and sends the client the messages of its
 //! session.
 //!
-//! Created by the route for each connection; ends with it. The simulation depends on the connection: the [`Session`]
-//! that it is attached to is notified of its end, also after a panic.
+//! Created by the route for each connection; ends with it. The [`Session`] to which it is attached is notified of its
+//! end, also after a panic.
 
 use std::sync::Arc;
 
@@ -26,13 +26,13 @@ pub struct WebClient {
     peer: Peer,
     /// The user name that a trusted reverse proxy sends.
     user: Option<String>,
-    /// What its session obeys, once it has requested one.
+    /// Sends the client's actions to its session, once it has one.
     session: Option<UnboundedSender<ClientAction>>,
     liveness: Liveness,
     _permit: ConnectionPermit,
 }
 
-/// Limit of texts that wait for a slow client, from which on optional texts are dropped.
+/// Number of texts queued for a slow client above which optional texts are dropped.
 const MAILBOX: usize = 64;
 
 type Context = WebsocketContext<WebClient>;
@@ -49,14 +49,14 @@ impl WebClient {
         ctx.stop();
     }
 
-    /// Ends the connection and its simulation for what the client has sent.
+    /// Ends the connection and its simulation because of what the client has sent.
     fn reject(&self, problem: &str, code: CloseCode, ctx: &mut Context) {
         log::info!("client {}: {problem}", self.peer);
         self.send(ClientAction::Leave);
         Self::finish(protocol::error(problem), code, ctx);
     }
 
-    /// Has the client's session do this, if there is one.
+    /// Sends an action to the client's session, if there is one.
     fn send(&self, action: ClientAction) {
         if let Some(session) = &self.session {
             // A session that has ended has notified its client.
@@ -64,20 +64,20 @@ impl WebClient {
         }
     }
 
-    /// The connection, for a session that this client requests. `last` is for a session that drops it without a last text.
+    /// Attaches this connection to a session. `last` is sent if the session drops the connection without a last text.
     fn attach(&mut self, last: ToClient, ctx: &mut Context) -> Connection {
         let (session, actions) = unbounded_channel();
         let attached = session.clone();
-        // What the session has sent before comes first, and after its last text the client is gone.
+        // The session's earlier texts come first; after a last text from the session, this actor has stopped.
         let gone = async move { attached.closed().await };
         gone.into_actor(self).map(move |(), _, ctx| ctx.address().do_send(last)).spawn(ctx);
         self.session = Some(session);
         Connection { peer: self.peer, client: ctx.address().recipient(), actions }
     }
 
-    /// Requests from the session of a token to continue with this connection.
+    /// Asks the session of a token to continue with this connection.
     fn resume(&mut self, token: &str, ctx: &mut Context) {
-        // Also for a session that ends before it reads this.
+        // Also sent if the session ends before it reads the request.
         let ended = ToClient::End(protocol::ended(None), CloseCode::Normal);
         let found = Token::parse(token).and_then(|token| Some((token, self.server.sessions.find(token)?)));
         let Some((token, session)) = found else {
@@ -101,7 +101,7 @@ impl WebClient {
             (ClientRequest { keep: true, .. }, Some(_)) => self.send(ClientAction::Keep),
             (ClientRequest { start: Some(start), .. }, None) => {
                 let identity = ClientIdentity::new(self.user.as_deref(), start.name.as_deref());
-                // Only a session that has panicked says nothing.
+                // Sent only if the session panics: otherwise it sends a last text itself.
                 let lost = ToClient::End(protocol::error("The server has lost this simulation"), CloseCode::Error);
                 Session::open(Arc::clone(&self.server), identity, self.attach(lost, ctx), &start);
             }

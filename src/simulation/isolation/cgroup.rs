@@ -1,6 +1,6 @@
 //! A control group (cgroup v2) for each simulation, if systemd delegates them to this server (`Delegate=yes`).
 //!
-//! They limit memory, CPU time and processes, and all processes in a group end with it, however they hide. A server
+//! They limit memory, CPU time and processes, and all processes in a group end with it, even if they detach. A server
 //! that was started in a terminal gets none: it shares its group with other processes, which it must not move.
 
 use std::ffi::OsString;
@@ -19,24 +19,23 @@ pub struct Cgroups(PathBuf);
 /// The control group of one simulation: its directory. Dropping it kills all processes inside, and removes it.
 pub struct Cgroup(pub PathBuf);
 
-/// The group of the server itself: in a group with subgroups, the kernel's limits do not apply to processes beside
-/// these.
+/// The group of the server itself: cgroup v2 allows no processes in a group that enables controllers for subgroups.
 const OWN: &str = "server";
 /// The controllers that are used.
 const CONTROLLERS: [&str; 3] = ["cpu", "memory", "pids"];
 /// The kernel's period of CPU limits, in microseconds.
 const PERIOD: u64 = 100_000;
-/// How many processes run a simulation, and do not count for its limit, at most: bubblewrap has one outside of the sandbox
-/// and one inside, and pasta is one.
+/// Maximum number of processes that run a simulation and do not count towards its limit: bubblewrap has one outside the
+/// sandbox and one inside, and pasta is one.
 const RUNNERS: u64 = 3;
-/// Timeout of killed processes until they have exited.
+/// Time for killed processes to exit.
 const VANISH: Duration = Duration::from_secs(2);
-/// Interval between two checks whether they have.
+/// Interval between two checks whether they have exited.
 const PAUSE: Duration = Duration::from_millis(5);
 
 impl Cgroups {
-    /// The control groups that are delegated to this server, if they are. Nothing may have been started before: what is
-    /// just exiting would be taken for another owner of the server's group.
+    /// The control groups that are delegated to this server, if any. No process may have been started before: one that
+    /// is just exiting would be taken for another owner of the server's group.
     pub fn delegated() -> Option<Self> {
         let folder = own_folder()?;
         let divided = Self::divide(&folder).inspect_err(|error| {
@@ -58,12 +57,12 @@ impl Cgroups {
         Ok(())
     }
 
-    /// The controllers that the control groups of simulations have on a server that starts now, by the kernel's names.
+    /// The kernel's names of the controllers that simulations' groups would have if the server started now.
     pub fn controllers() -> Vec<&'static str> {
         own_folder().and_then(|folder| offered(&folder).ok()).unwrap_or_default()
     }
 
-    /// Creates a group with these limits for a simulation; `None` if that fails, and it runs without one.
+    /// Creates a group with these limits for a simulation; `None` if that fails: the simulation then runs without one.
     pub fn make(&self, limits: &ResourceLimits) -> Option<Cgroup> {
         let made = tempfile::Builder::new().prefix("simulation-").tempdir_in(&self.0);
         let made = made.inspect_err(|error| log::warn!("no control group can be made: {error}"));
@@ -75,7 +74,7 @@ impl Cgroups {
         settings.extend(limits.cores.map(|cores| ("cpu.max", format!("{} {PERIOD}", cores * PERIOD))));
         for (file, value) in settings {
             let file = cgroup.0.join(file);
-            // A controller that this server does not have can't limit anything.
+            // Without the controller, there is no such file.
             if file.exists()
                 && let Err(error) = std::fs::write(&file, &value)
             {
@@ -93,13 +92,13 @@ impl Cgroup {
         words.into_iter().chain(std::iter::once(self.0.join("cgroup.procs").into())).collect()
     }
 
-    /// Kills all processes inside, and returns whether the kernel had killed one because of the memory limit, and what has
-    /// been taken. Blocks until they have exited, for two seconds at most.
+    /// Kills all processes inside. Returns whether the kernel had killed one because of the memory limit, and the
+    /// resources that they have used. Blocks until they have exited, for two seconds at most.
     pub fn end(&self) -> (bool, Taken) {
         kill(&self.0);
         let events = std::fs::read_to_string(self.0.join("memory.events")).unwrap_or_default();
         let kills = events.lines().find_map(|line| line.strip_prefix("oom_kill "));
-        // The kernel knows the peak of memory since Linux 5.19.
+        // `memory.peak` exists since Linux 5.19.
         let taken = Taken { memory: number_in(&self.0.join("memory.peak")), time: cgroup_time(&self.0) };
         (kills.is_some_and(|count| count.trim() != "0"), taken)
     }
@@ -117,7 +116,7 @@ fn number_in(file: &Path) -> Option<u64> {
     std::fs::read_to_string(file).ok()?.trim().parse().ok()
 }
 
-/// Ends all that is in a group. What is forked meanwhile is ended too.
+/// Kills all processes in a group, including those that are forked meanwhile.
 fn kill(folder: &Path) {
     let deadline = Instant::now() + VANISH;
     let events = || std::fs::read_to_string(folder.join("cgroup.events"));
@@ -136,7 +135,7 @@ impl Drop for Cgroup {
                 log::warn!("{} can't be removed: {error}", folder.display());
             }
         };
-        // Without a thread, systemd removes the group with the unit.
+        // If no thread can be started, systemd removes the group with the unit.
         drop(std::thread::Builder::new().spawn(remove));
     }
 }

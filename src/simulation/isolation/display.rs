@@ -1,8 +1,8 @@
 //! The display on which a simulation opens its window: an existing one, or a virtual one (Xvfb) of its own.
 //!
-//! Xvfb is a child of the program that it is for, with its limits and its view of the files, and the kernel kills it as
-//! soon as that has ended. It chooses a free number by itself and prints it (`-displayfd`). In this mode it writes no lock
-//! file, and reuses the socket that a killed one has left.
+//! Xvfb is a child of the program that uses it, with the same limits and view of the files, and the kernel kills it as
+//! soon as that program has ended. It chooses a free number by itself and prints it (`-displayfd`). In this mode it
+//! writes no lock file, and reuses the socket of an Xvfb that was killed.
 
 use std::ffi::OsString;
 use std::fs::{File, Permissions};
@@ -14,7 +14,7 @@ use which::which;
 
 /// The only authorization method that all programs and displays know.
 const COOKIE: &str = "MIT-MAGIC-COOKIE-1";
-/// In an authority file: the entry counts for every host. `FamilyWild` of X11/Xauth.h.
+/// In an authority file: the entry applies to every host. `FamilyWild` of X11/Xauth.h.
 const EVERY_HOST: u16 = 0xffff;
 
 /// The display of a simulation.
@@ -30,10 +30,10 @@ pub enum Display {
     },
 }
 
-/// Starts Xvfb, waits until it reports its number, and then becomes the program that follows its own three arguments: Xvfb,
-/// the authority file, and options. At level `none` its pipe is in the folder of the instance, which goes with it. Xvfb
-/// has a session of its own, so that the SIGTERM for the program does not reach it. Its only screen has the width, height
-/// and bits of a pixel that `xvfb-run` has.
+/// Starts Xvfb, waits until it reports its number, and executes the program that follows the script's own three
+/// arguments: Xvfb, the authority file, and options. At level `none` the pipe is in the instance's directory, and is
+/// removed with it. Xvfb has a session of its own, so that the SIGTERM for the program does not reach it. Its screen
+/// has the size and depth of that of `xvfb-run`.
 const LAUNCHER: &str = r#"
 folder=$(mktemp -d -p "${1%/*}" 2>/dev/null || mktemp -d) && mkfifo "$folder/ready" || exit
 setpriv --pdeathsig KILL setsid "$0" -screen 0 1280x1024x24 -nolisten tcp $2 -fp built-ins -auth "$1" -displayfd 3 \
@@ -51,7 +51,7 @@ exec "$@"
 "#;
 
 impl Display {
-    /// A virtual display; its authority file is in the instance's folder.
+    /// A virtual display; its authority file is in the instance's directory.
     ///
     /// # Errors
     /// When there is no Xvfb, or the file can't be written.
@@ -69,7 +69,7 @@ impl Display {
         Ok(Self::Virtual { xvfb, authority })
     }
 
-    /// The variable by which programs find it: a virtual one is named by its launcher.
+    /// The variable by which programs find it. The launcher of a virtual one sets `DISPLAY`.
     pub fn variable(&self) -> (OsString, OsString) {
         match self {
             Self::Outside(name) => ("DISPLAY".into(), name.into()),
@@ -77,8 +77,8 @@ impl Display {
         }
     }
 
-    /// The command that precedes a program to start its virtual display. In a sandbox it has no abstract socket, and a
-    /// number that no display of the machine should have; beside others it finds a free number by its abstract socket.
+    /// The command that precedes a program to start its virtual display. In a sandbox Xvfb has no abstract socket, and
+    /// a number that no display of the machine should have; outside, it finds a free number by its abstract socket.
     pub fn launcher(&self, in_sandbox: bool) -> Vec<OsString> {
         let Self::Virtual { xvfb, authority } = self else { return Vec::new() };
         let words = ["/bin/sh", "-c", LAUNCHER].map(OsString::from);
@@ -86,7 +86,7 @@ impl Display {
         words.into_iter().chain([xvfb.into(), authority.into(), options.into()]).collect()
     }
 
-    /// Makes the folder of its socket in the sandbox's `/tmp`, because Xvfb of an ordinary user does not.
+    /// Creates the directory of its socket in the sandbox's `/tmp`, because Xvfb of an ordinary user does not.
     pub fn prepare(&self, tmp: &Path) -> io::Result<()> {
         let folder = tmp.join(".X11-unix");
         if matches!(self, Self::Outside(_)) {

@@ -1,6 +1,6 @@
 //! The launcher of simulations on this server: its isolation level is decided once at start, the same for all.
 //!
-//! A level of isolation turns a program into a command that runs it at that level ([`SpawnSpec`]).
+//! It turns a program into a command that runs it at that level ([`SpawnSpec`]).
 
 use std::ffi::OsString;
 use std::io;
@@ -27,17 +27,17 @@ const NEEDED: &str = "PATH HOME USER LOGNAME SHELL TERM TZ LANG LANGUAGE LC_* TM
 
 /// Launches simulations at one level.
 pub struct Launcher {
-    /// The isolation level of all simulations, which is not `Auto`. Containers are not started here.
+    /// The isolation level of all simulations, never `Auto`. At level `container` they are not started here.
     pub level: IsolationSetting,
     /// Their sandbox at level `sandbox`.
     sandbox: Option<Sandbox>,
     /// Why they run at level `none` although the configuration does not say so, if they do.
     pub shortcoming: Option<String>,
-    /// Why sandboxes have no networks of their own, where the configuration leaves it to the machine.
+    /// Why sandboxes have no networks of their own, if the configuration leaves that to the machine.
     why_shared: Option<String>,
     cgroups: Option<Cgroups>,
     controllers: Vec<&'static str>,
-    /// The whole path: a program that is looked for after the fork makes the start of each slower by a millisecond.
+    /// Its absolute path: a search after the fork would delay each start by a millisecond.
     prlimit: PathBuf,
     variables: Vec<VariableName>,
     limits: ResourceLimits,
@@ -53,7 +53,7 @@ impl Launcher {
         if config.isolation != IsolationSetting::Container && prlimit.as_os_str().is_empty() {
             return Err("prlimit is not there; on Debian, Ubuntu and Fedora the package util-linux has it".to_owned());
         }
-        // Before a sandbox is tried: what that has started may still be in this server's group.
+        // Before a sandbox is tried, because its processes may still be in this server's group afterwards.
         let controllers = Cgroups::controllers();
         let wants_sandbox = matches!(config.isolation, IsolationSetting::Sandbox | IsolationSetting::Auto);
         let (level, mut sandbox, shortcoming) =
@@ -89,8 +89,8 @@ impl Launcher {
         })
     }
 
-    /// The same for a server that is starting: it logs the level, and each simulation gets a control group of its own
-    /// if these are delegated to this server.
+    /// Like [`Self::new`], for a server that is starting: logs the level, and gives each simulation a control group of
+    /// its own if these are delegated to this server.
     ///
     /// # Errors
     /// As for [`Self::new`].
@@ -142,7 +142,7 @@ impl Launcher {
         self.sandbox.as_ref()?.network.as_ref()
     }
 
-    /// Which network the programs of worlds have, which is not `Auto`; at level `container` that is Docker's.
+    /// The network of worlds' programs, never `Auto`; `None` at level `container`, where it is Docker's.
     pub fn network(&self) -> Option<SandboxNetwork> {
         match self.own_network() {
             None => (self.level != IsolationSetting::Container).then_some(SandboxNetwork::Shared),
@@ -150,7 +150,7 @@ impl Launcher {
         }
     }
 
-    /// The same for an administrator: what can be reached, and why no less.
+    /// The same as text for an administrator: what programs can reach, and why the network is shared.
     pub fn network_in_words(&self) -> Option<String> {
         Some(match (self.network()?, &self.why_shared) {
             (SandboxNetwork::Shared, None) => "shared with this machine".to_owned(),
@@ -184,7 +184,7 @@ impl Launcher {
         }
     }
 
-    /// The same process at the level of this server, with this display and port of its stream; and its control group.
+    /// The process at the isolation level of this server, with this display and stream port; and its control group.
     ///
     /// # Errors
     /// When a directory can't be created.
@@ -200,7 +200,7 @@ impl Launcher {
         environment.push(display.variable());
         environment.append(&mut spec.environment);
         if let Some(sandbox) = &self.sandbox {
-            // Symlinks are not followed out of a sandbox.
+            // In a sandbox, a symlink may point to a path that does not exist there.
             if let Some(file) = spec.command.first_mut()
                 && let Ok(real) = Path::new(&*file).canonicalize()
             {

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use crate::simulation::config::SimulationConfig;
 
-/// A path at which a sandbox shows something else than the system.
+/// A path at which a sandbox shows something other than the system.
 #[derive(Debug, Clone)]
 pub struct Mount {
     /// The absolute path.
@@ -16,7 +16,7 @@ pub struct Mount {
     pub source: Option<PathBuf>,
 }
 
-/// The administrator's directory, in which a package of this server has its configuration.
+/// The directory with the configuration of this server's package.
 const ETC: &str = "/etc/webots-fleet";
 
 impl Mount {
@@ -31,12 +31,12 @@ impl Mount {
         Self { option: "--ro-bind-try", source: Some(at.clone()), at }
     }
 
-    /// A file at another path, only to be read.
+    /// A file from another path, read-only.
     pub fn file(at: PathBuf, source: PathBuf) -> Self {
         Self { at, option: "--ro-bind", source: Some(source) }
     }
 
-    /// What is at this path, which may be another one, to be read and written.
+    /// What is at `source`, which may be another path, read-write.
     pub fn writable(at: PathBuf, source: &Path) -> Self {
         Self { at, option: "--bind", source: Some(source.to_owned()) }
     }

@@ -1,10 +1,10 @@
-//! A network of its own for each sandbox, by pasta (package passt): a network namespace whose packets pasta sends on as an
-//! ordinary program of this user. The machine's loopback, its abstract sockets and the ports of other simulations are out
-//! of reach; one port of the machine is forwarded into it.
+//! A network of its own for each sandbox, by pasta (package passt): a network namespace whose packets pasta forwards as
+//! an ordinary program of this user. The machine's loopback, its abstract sockets and the ports of other simulations
+//! are out of reach; one port of the machine is forwarded into the namespace.
 //!
-//! pasta starts bubblewrap and ends with it; bubblewrap ends with pasta, and pasta with the server (`PR_SET_PDEATHSIG`).
-//! In the namespace bubblewrap begins as its root. Before it gives that up, nft loads a packet filter there, which no
-//! program in the sandbox can change.
+//! pasta starts bubblewrap and ends with it; bubblewrap ends with pasta, and pasta with the server
+//! (`PR_SET_PDEATHSIG`). Both nft and bubblewrap start as root of the namespace: nft loads a packet filter, then
+//! bubblewrap drops the privileges, so that no program in the sandbox can change the filter.
 
 use std::ffi::OsString;
 use std::io;
@@ -24,27 +24,27 @@ pub struct OwnNetwork {
     /// Whether programs reach nothing at all.
     pub closed: bool,
     loopback: IpAddr,
-    /// The address of the machine on which the port of each simulation is forwarded: the one on which the server listens,
-    /// or the loopback where only this server is to reach simulations.
+    /// The address of the machine on which the port of each simulation is forwarded: the one on which the server
+    /// listens, or the loopback if only this server may reach simulations.
     forwarded: IpAddr,
 }
 
-/// Where programs in a sandbox ask for names, and pasta asks the machine's own name server; on a machine without IPv4 the
-/// second one.
+/// Address of the name server in a sandbox: pasta forwards queries to the machine's own one. The second address is for
+/// a machine without IPv4.
 const RESOLVER: &str = "169.254.1.1";
 const RESOLVER_6: &str = "fd53::1:1";
-/// Addresses of the internet (for documentation), to which nothing is sent.
+/// Internet addresses (reserved for documentation) to look up a route; nothing is sent to them.
 const INTERNET: IpAddr = IpAddr::V4(Ipv4Addr::new(203, 0, 113, 7));
 const INTERNET_6: IpAddr = IpAddr::V6(Ipv6Addr::new(0x2001, 0xdb8, 0, 0, 0, 0, 0, 7));
-/// The file that names it, and that of a simulation in the folder of its instance.
+/// The system's resolver configuration, and its replacement in the instance's directory.
 const RESOLV_CONF: &str = "/etc/resolv.conf";
 const OWN_RESOLV_CONF: &str = "resolv.conf";
 /// The socket of the system's log.
 const SYSTEM_LOG: &str = "/dev/log";
 /// Path of nft, which is not in the `PATH` of ordinary users.
 const NFT: &str = "/usr/sbin/nft";
-/// Loads the packet filter of the file `$1`, if there is one, and becomes the program that follows. Versions of pasta until
-/// 2023 leave the socket on which they listen, which is one of the machine's network, to what they start.
+/// Loads the packet filter of the file `$1`, if there is one, and executes the program that follows. First closes the
+/// listening socket, which is one of the machine's network: versions of pasta until 2023 leak it to their child.
 const BEGIN: &str = r#"exec 3>&- 4>&- 5>&- 6>&- 7>&- 8>&- 9>&-
 [ -z "$1" ] || "$0" -f "$1" || exit
 shift
@@ -54,7 +54,7 @@ impl OwnNetwork {
     /// Prepares networks for a server with this configuration.
     ///
     /// # Errors
-    /// Why there can be none, as text for an administrator.
+    /// Why it can't prepare them, as text for an administrator.
     pub fn new(config: &SimulationConfig) -> Result<Self, String> {
         if nix::unistd::getuid().is_root() {
             return Err("pasta gives none to root, run the server as a user of its own".to_owned());
@@ -68,7 +68,7 @@ impl OwnNetwork {
         if closed && nft.is_none() {
             return Err(missing("nft", "nftables"));
         }
-        // pasta makes networks without IPv4 where the machine has no route for it, and then forwards nothing from 127.0.0.1.
+        // If the machine has no IPv4 route, pasta makes networks without IPv4, and forwards nothing from 127.0.0.1.
         let loopback = if has_route(INTERNET) { Ipv4Addr::LOCALHOST.into() } else { Ipv6Addr::LOCALHOST.into() };
         let forwarded = if config.ports_are_public() { config.bind } else { loopback };
         Ok(Self { pasta, nft, closed, loopback, forwarded })
@@ -84,25 +84,25 @@ impl OwnNetwork {
         if self.forwarded.is_unspecified() { self.loopback } else { self.forwarded }
     }
 
-    /// The words that run a program in a network of its own, into which this port is forwarded. Writes the files that it needs
-    /// into the instance's folder.
+    /// The prefix of a command that runs it in a network of its own, into which this port is forwarded. Writes the
+    /// files that it needs into the instance's directory.
     ///
     /// # Errors
-    /// When these can't be written.
+    /// When these files can't be written.
     pub fn command(&self, instance: &Path, port: u16) -> io::Result<Vec<OsString>> {
         let mut command: Vec<OsString> = ["setpriv", "--pdeathsig", "KILL", "--"].map(Into::into).into();
         command.push(self.pasta.clone().into());
-        // By default it maps its gateway to the machine's loopback, and opens ports to and from the machine.
+        // By default pasta maps its gateway to the machine's loopback, and forwards ports in both directions.
         let fixed = ["--config-net", "--no-map-gw", "-u", "none", "-T", "none", "-U", "none", "-t"];
         command.extend(fixed.map(Into::into));
-        // A port alone is one of all addresses, of either version of IP.
+        // A port without an address is forwarded from all addresses, IPv4 and IPv6.
         let is_any = self.forwarded == Ipv6Addr::UNSPECIFIED;
         command.push(if is_any { port.to_string() } else { format!("{}/{port}", self.forwarded) }.into());
-        // It prints a warning about a version of IP for which it finds no route.
+        // pasta prints a warning about a version of IP without a route.
         if self.loopback.is_ipv4() && !has_route(INTERNET_6) {
             command.push("--ipv4-only".into());
         }
-        // Without the system's log it prints errors. With it, AppArmor may allow no other file.
+        // Without the system's log pasta prints errors. If there is one, AppArmor may not allow a log file.
         if !Path::new(SYSTEM_LOG).exists() {
             command.extend(["--log-file".into(), instance.join("pasta.log").into()]);
         }
@@ -118,12 +118,12 @@ impl OwnNetwork {
             std::fs::write(&rules, if self.closed { include_str!("closed.nft") } else { include_str!("own.nft") })?;
         }
         command.extend([BEGIN.into(), loader.into(), rules.into()]);
-        // bubblewrap finds its own processes in `/proc`, and pasta has begun to count them anew.
+        // pasta starts a new PID namespace, and bubblewrap needs a `/proc` that matches it.
         command.extend(["unshare", "--mount-proc", "--"].map(Into::into));
         Ok(command)
     }
 
-    /// The mount by which programs in a sandbox resolve names.
+    /// The mount of the resolver configuration, if programs in the sandbox may resolve names.
     pub fn mounts(&self, instance: &Path) -> Option<Mount> {
         let at = Path::new(RESOLV_CONF).canonicalize().ok().filter(|_| !self.closed)?;
         Some(Mount::file(at, instance.join(OWN_RESOLV_CONF)))

@@ -27,7 +27,7 @@ pub struct Sandbox {
     bubblewrap: PathBuf,
     homes: Vec<PathBuf>,
     mounts: Vec<Mount>,
-    /// Whether programs inside are kept from creating user namespaces, which bubblewrap supports since 0.8.
+    /// Whether programs inside can't create user namespaces: bubblewrap can prevent that since 0.8.
     pub ends_namespaces: bool,
     /// Its own network, if it has one.
     pub network: Option<OwnNetwork>,
@@ -35,15 +35,15 @@ pub struct Sandbox {
     shared_memory: u64,
 }
 
-/// What programs need of `/run` to resolve names. Services there send queries to the internet.
+/// What programs need of `/run` to resolve names, except in closed networks: services there query the internet.
 const NAMES_RUN: [&str; 4] =
     ["/run/systemd/resolve", "/run/resolvconf", "/run/NetworkManager/resolv.conf", "/run/nscd"];
 /// What programs need of `/run` to find users and graphics cards. The rest are sockets of services, some of which start
 /// programs on request.
 const SYSTEM_RUN: [&str; 4] = ["/run/udev", "/run/nvidia-persistenced", "/run/opengl-driver", "/run/current-system"];
-/// Graphics cards; also all in `/dev` that begins with `nvidia`.
+/// Graphics cards, besides all in `/dev` whose name begins with `nvidia`.
 const DEVICES: [&str; 2] = ["/dev/dri", "/dev/kfd"];
-/// Timeout of the trial whether a sandbox works.
+/// Timeout of a trial run of a sandbox.
 const TRIAL: Duration = Duration::from_secs(5);
 /// What an administrator can do if bubblewrap does not work.
 const REMEDY: &str = "user namespaces must be allowed (sysctl user.max_user_namespaces, \
@@ -105,7 +105,7 @@ impl Sandbox {
             command.push("--disable-userns".into());
         }
         if self.network.is_some() {
-            // In pasta's namespace it is root.
+            // In pasta's namespace the user is root.
             let (user, group) = (nix::unistd::getuid().to_string(), nix::unistd::getgid().to_string());
             command.extend(["--uid".into(), user.into(), "--gid".into(), group.into()]);
         }
@@ -121,11 +121,11 @@ impl Sandbox {
         for mount in self.own(spec, display)?.into_iter().chain(self.mounts.iter().cloned()) {
             mounts.insert((mount.at.components().count(), mount.at.clone()), mount);
         }
-        // Empty directories are memory: they are made read-only, as is the rest of `/dev`.
+        // Empty directories are tmpfs, which takes memory: they are made read-only, as is the rest of `/dev`.
         let empty = mounts.values().filter(|mount| mount.source.is_none()).map(|mount| mount.at.clone());
         let closed: Vec<PathBuf> = empty.chain(["/dev".into()]).collect();
         command.extend(mounts.into_values().flat_map(Mount::into_arguments));
-        // bubblewrap can set its limit since 0.7.
+        // bubblewrap has `--size` since 0.7, and `--disable-userns` since 0.8.
         if self.ends_namespaces {
             command.extend(["--size".into(), self.shared_memory.to_string().into()]);
         }
@@ -136,7 +136,7 @@ impl Sandbox {
         Ok(command)
     }
 
-    /// What is different from one simulation to another.
+    /// The mounts that differ between simulations.
     fn own(&self, spec: &SpawnSpec, display: &Display) -> io::Result<Vec<Mount>> {
         let inside = |name: &str| {
             let folder = spec.mark.join(name);
@@ -149,7 +149,7 @@ impl Sandbox {
         own.extend(self.homes.iter().map(|at| Mount::writable(at.clone(), &home)));
         let project = spec.mark.join(InstanceDir::PROJECT);
         own.push(Mount::writable(project.clone(), &project));
-        // The sandbox resolves symlinks inside, where their targets may not exist.
+        // Symlinks would be resolved inside the sandbox, where their targets may not exist.
         let files = spec.command.first().map(PathBuf::from).into_iter().chain(self.display_files(display));
         own.extend(files.filter_map(|file| file.canonicalize().ok()).map(Mount::read_only));
         own.extend(self.network.as_ref().and_then(|network| network.mounts(&spec.mark)));
@@ -157,7 +157,7 @@ impl Sandbox {
         Ok(own)
     }
 
-    /// The socket of the display, and the file that authorizes its users; or the program of one that is started inside.
+    /// The socket and the authority file of the display; of a virtual one, Xvfb and the authority file.
     fn display_files(&self, display: &Display) -> Vec<PathBuf> {
         let name = match display {
             Display::Outside(name) => name,
@@ -201,7 +201,7 @@ impl Sandbox {
         let project = instance.path().join(InstanceDir::PROJECT);
         std::fs::create_dir(&project)?;
         let spec = SpawnSpec { folder: Some(project), ..SpawnSpec::new(Vec::new(), instance.path()) };
-        // One that was free a moment ago.
+        // A port that was free a moment ago.
         let port = TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?.local_addr()?.port();
         let mut command = self.command(&spec, port, &Display::Outside(String::new()))?;
         command.extend(["/bin/sh", "-c", "true"].map(Into::into));

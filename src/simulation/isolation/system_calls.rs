@@ -1,13 +1,13 @@
-//! The filter of system calls of each sandbox: all pass but those for keyrings.
+//! The system call filter of each sandbox: it allows all calls except those for keyrings.
 //!
-//! Keyrings belong to sessions and users, and no namespace isolates them: all simulations would share that of the session in
-//! which the server was started. A new one for each would count for the user's quota of 200 keys (`kernel.keys.maxkeys`).
-//! Docker's filter refuses these calls too.
+//! Keyrings belong to sessions and users, and no namespace isolates them: all simulations would share the keyring of
+//! the session in which the server was started. A new keyring for each would count towards the user's quota of 200 keys
+//! (`kernel.keys.maxkeys`). Docker's filter refuses these calls too.
 
-/// Each architecture that a program may use: its number, and that of `add_key`, which is followed by `request_key` and
-/// `keyctl`. They are x86 and ARM, of 64 and 32 bits.
+/// The architectures that a program may use (x86 and ARM, 64 and 32 bits): the kernel's number of each, and the number
+/// of `add_key`, which `request_key` and `keyctl` follow.
 const ARCHITECTURES: [(u32, u32); 4] = [(0xc000_003e, 248), (0x4000_0003, 286), (0xc000_00b7, 217), (0x4000_0028, 309)];
-/// A call by the ABI x32 has the number of x86 with 64 bits and this bit.
+/// Mask without the bit that distinguishes calls by the x32 ABI from those of 64-bit x86.
 const NUMBER: u32 = 0x3fff_ffff;
 /// Results of a filter: the call is made, or fails with `EPERM`.
 const ALLOW: u32 = 0x7fff_0000;
@@ -20,7 +20,7 @@ pub fn filter() -> Vec<u8> {
         [
             // In the call's data, the architecture is at 4 and the number at 0.
             (load, 0, 0, 4),
-            // Otherwise the next block begins after six more.
+            // If it differs, skip six instructions, to the next block.
             (if_equal, 0, 6, architecture),
             (load, 0, 0, 0),
             (and, 0, 0, NUMBER),

@@ -1,11 +1,11 @@
-//! Watches over what simulations write on the disk, which the kernel does not limit. One thread looks for all of them.
+//! Monitors what simulations write to the disk, because the kernel does not limit it. One thread monitors all of them.
 //!
-//! The free room of the disk is looked at each second, and more often as it comes close to the reserve (`diskReserve`). At the
-//! reserve the simulation ends that has grown most, then the next.
+//! The free room of the disk is read each second, and more often as it comes close to the reserve (`diskReserve`). At
+//! the reserve, the simulation that has grown most is ended, then the next.
 //!
-//! Folders, which have to be counted one by one for `limits.disk`, are counted only when the disk has lost as much room as the
-//! simulation may still write, and every ten seconds at most: in ticks that take 1 % of one core at most. As they take
-//! longer, the pause between them grows.
+//! For `limits.disk`, the directory of each simulation has to be counted. It is counted only when the disk has lost as
+//! much room as the simulation may still write, and at most every ten seconds. Counting takes about 1 % of one core:
+//! the longer a tick takes, the longer the pause after it.
 
 use std::io;
 use std::path::PathBuf;
@@ -23,14 +23,14 @@ pub struct Watcher(Sender<DiskUse>);
 
 /// The shortest time between two ticks.
 const SHORTEST: Duration = Duration::from_secs(1);
-/// The longest time between two ticks: a simulation that makes ticks slow gains no more than this.
+/// The longest time between two ticks: a simulation that makes ticks slow can't delay them further.
 const LONGEST: Duration = Duration::from_secs(10);
 /// The pause after a tick, as a multiple of its CPU time: 1 % of one core.
 const PAUSE: u32 = 99;
-/// Limit of processor time for folders in a tick. The remaining ones are counted in the next tick.
+/// Limit of CPU time for counting directories in a tick. The remaining ones are counted in the next tick.
 const FOLDERS: Duration = Duration::from_millis(100);
-/// Time limits: of counting a folder for `limits.disk`; of counting one when the reserve is reached, and of counting all
-/// folders then.
+/// Time limits: of counting a directory for `limits.disk`; of counting one when the reserve is reached, and of counting
+/// all directories then.
 const COUNT: Duration = Duration::from_secs(1);
 const COUNT_AT_RESERVE: Duration = Duration::from_millis(100);
 const COUNTS_AT_RESERVE: Duration = Duration::from_millis(300);
@@ -52,7 +52,7 @@ impl Watcher {
     pub async fn until_too_much(self, mut simulation: DiskUse) -> String {
         let (end, told) = oneshot::channel();
         simulation.end = Some(end);
-        // The thread lives as long as this.
+        // The thread runs as long as this sender exists.
         self.0.send(simulation).ok();
         match told.await {
             Ok(why) => why,
@@ -98,11 +98,11 @@ impl Table {
         }
     }
 
-    /// Ends the simulation that has grown most, and by so many bytes at least. Returns false if none has: then another program
-    /// fills the disk.
+    /// Ends the simulation that has grown most, if by at least `least` bytes. Returns false if none has: then another
+    /// program fills the disk.
     fn end_grown_most(&mut self, least: u64) -> bool {
         let (until, lost) = (Instant::now() + COUNTS_AT_RESERVE, self.disk.lost);
-        // Those whose count is oldest are counted first.
+        // The oldest counts are renewed first.
         self.all.sort_by_key(|one| one.counted);
         for one in &mut self.all {
             if Instant::now() >= until {
@@ -122,7 +122,7 @@ impl Table {
         }
     }
 
-    /// Counts what simulations have written, in a tick that began at this processor time.
+    /// Counts what simulations have written, in a tick that began at this CPU time of the thread.
     fn count_folders(&mut self, begin: Duration) {
         let (lost, time) = (self.disk.lost, self.disk.pause().min(COUNT));
         let mut due: Vec<&mut DiskUse> = self.all.iter_mut().filter(|one| one.is_due(lost)).collect();

@@ -9,7 +9,7 @@ use socket2::{SockAddr, Socket, Type};
 
 /// Timeout of a connection.
 const ANSWER: Duration = Duration::from_secs(2);
-/// Display N listens on this port + N, where it is reached by TCP.
+/// TCP port of display 0; display N has this port + N.
 const FIRST_PORT: u16 = 6000;
 
 /// The host of a display with this name, and its number.
@@ -31,7 +31,7 @@ pub fn effective(configured: Option<&String>) -> String {
     configured.cloned().or_else(of_environment).unwrap_or_else(|| ":0".to_owned())
 }
 
-/// Checks that a display answers. Whether it admits this user, only Webots finds out. Blocks for two seconds at most.
+/// Checks that a display answers, not whether it admits this user. Blocks for at most two seconds per address.
 ///
 /// # Errors
 /// Why Webots can't open its window there, and what to do about it.
@@ -39,7 +39,7 @@ pub fn check(display: &str) -> Result<(), String> {
     let (host, number) =
         parse(display).ok_or_else(|| format!("{display:?} is no display; allowed is HOST:NUMBER or :NUMBER"))?;
     let connected = match socket(display) {
-        // Not at the abstract address of that name, which anybody can take, and which a sandbox does not have.
+        // Not the abstract socket of that name: any user can create it, and a sandbox can't reach it.
         Some(path) => reach(SockAddr::unix(path)),
         None => (host, FIRST_PORT + number).to_socket_addrs().and_then(|mut all| {
             let any = all.find_map(|address| reach(Ok(address.into())).ok());

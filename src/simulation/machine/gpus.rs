@@ -26,11 +26,11 @@ pub(super) struct GpuReading {
     pub at: Instant,
     /// The GPUs that answer.
     pub gpus: Vec<Gpu>,
-    /// Number of GPUs, with those that don't answer: they may have fallen off their bus.
+    /// Number of GPUs, including those that don't answer: they may have fallen off their bus.
     pub known: usize,
 }
 
-/// Starts the thread, and returns its last reading. It ends when nobody receives that any more.
+/// Starts the thread, and returns the receiver of its last reading. The thread ends when the receiver is dropped.
 pub(super) fn follow() -> std::io::Result<watch::Receiver<Option<GpuReading>>> {
     let (sender, last) = watch::channel(None);
     std::thread::Builder::new().name("gpus".to_owned()).spawn(move || read(&sender))?;

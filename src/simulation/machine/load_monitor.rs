@@ -1,7 +1,7 @@
 //! Actor: takes a sample of the machine each second, keeps ten minutes of them, and writes them to a CSV file.
 //!
-//! One for the whole server, created at start; it never ends. It has a thread of its own, which a slow disk may block. All
-//! others read the newest [`Readings`] from a watch channel, without waiting.
+//! One for the whole server, created at start; it never ends. It has a thread of its own, because a slow disk may block
+//! it. All others read the newest [`Readings`] from a watch channel, without waiting.
 
 use std::collections::VecDeque;
 use std::io::Write;
@@ -25,7 +25,7 @@ const PERIOD: Duration = Duration::from_secs(1);
 const MEAN_OF: usize = 5;
 /// Number of samples that are kept: ten minutes.
 const KEPT: usize = 600;
-/// Size from which `monitor.csv` is rotated, in bytes: with the one before it covers most of a day.
+/// Size from which `monitor.csv` is rotated, in bytes: with the previous file it covers most of a day.
 const MAX_SIZE: u64 = 2_500_000;
 
 /// The first line of `monitor.csv`: the columns of the original.
@@ -49,7 +49,7 @@ pub struct Readings {
     loads: VecDeque<Load>,
     /// The newest line of `monitor.csv`: the values of its columns.
     pub sample: Vec<String>,
-    /// Those of the last ten minutes as numbers, the oldest first.
+    /// The samples of the last ten minutes as numbers, the oldest first.
     pub history: VecDeque<Vec<f64>>,
 }
 
@@ -71,8 +71,8 @@ pub struct LoadMonitor {
 }
 
 impl LoadMonitor {
-    /// Creates the actor. `disk` is a folder on the disk that is watched, `csv` the file that samples are written to; the
-    /// GPU that `spread` would give the next simulation counts for the load.
+    /// Creates the actor. `disk` is a directory on the monitored disk, `csv` the file for the samples. The load
+    /// includes the GPU that `spread` would assign to the next simulation.
     ///
     /// # Errors
     /// When the machine can't be read, or a thread can't be started.
@@ -134,7 +134,7 @@ fn append(path: &Path, sample: &[String]) -> std::io::Result<()> {
     file.write_all(format!("{}\n", sample.join(", ")).as_bytes())
 }
 
-/// Adds a value to the last ones, of which so many are kept.
+/// Appends a value, and keeps the last `kept` ones.
 fn push<T>(last: &mut VecDeque<T>, kept: usize, value: T) {
     if last.len() == kept {
         last.pop_front();

@@ -33,9 +33,9 @@ pub struct Machine {
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 #[serde(rename_all = "camelCase")]
 pub struct Gpu {
-    /// Its number, as NVIDIA's tools count it: by its place on the bus, from 0. Others that are lost leave a gap.
+    /// Its index in NVIDIA's tools: by its position on the bus, from 0. Lost GPUs leave a gap.
     pub index: u32,
-    /// What programs and Docker know it by, whatever they count by: its UUID, such as `GPU-1fa4...`.
+    /// Its UUID, such as `GPU-1fa4...`: programs and Docker may count GPUs in another order.
     #[serde(skip)]
     pub id: String,
     /// Its name.
@@ -57,8 +57,8 @@ impl Gpu {
     }
 }
 
-/// The load of a machine: `max(CPU, (swap + memory + GPU memory) / 3, GPU compute)`, all in percent, as the original
-/// has it. Of several GPUs that one counts which a new client could use; a machine without one has one that is idle.
+/// The load of a machine: `max(CPU, (swap + memory + GPU memory) / 3, GPU compute)`, all in percent, as in the
+/// original. Of several GPUs, the one that a new client would get counts; without GPUs, an idle one.
 pub fn load(machine: &Machine, gpu: &Gpu) -> Load {
     let memories = (machine.swap + machine.memory + gpu.memory) / 3.0;
     Load::try_from(machine.cpu.max(memories).max(gpu.compute)).unwrap_or(Load::ZERO)
@@ -97,7 +97,7 @@ impl MachineSensor {
     /// Prepares readings; `disk` is a directory on the disk that is monitored.
     ///
     /// # Errors
-    /// When the system does not give the readings.
+    /// When the system does not provide the readings.
     pub fn open(disk: &Path) -> Result<Self, sysinfo::Error> {
         let kinds = RefreshKind::nothing()
             .with_cpu(CpuRefreshKind::nothing().with_usage())
@@ -128,7 +128,7 @@ impl MachineSensor {
     pub fn read(&mut self) -> Machine {
         self.system.refresh_cpu_usage();
         self.system.refresh_memory();
-        // One file, where sysinfo reads several of each interface.
+        // This reads one file; sysinfo reads several per interface.
         let before = std::mem::replace(&mut self.interfaces, dev_status().unwrap_or_default());
         let seconds = std::mem::replace(&mut self.read, Instant::now()).elapsed().as_secs_f64().max(0.001);
         let passed = |bytes: fn(&DeviceStatus) -> u64| -> u64 {

@@ -7,9 +7,9 @@ use parking_lot::Mutex;
 
 use super::sensors::Gpu;
 
-/// How long a started simulation may be missing in the readings of its GPU: Webots loads its world first.
+/// Time in which a started simulation may not show in the readings of its GPU: Webots loads its world first.
 const UNSEEN: Duration = Duration::from_secs(10);
-/// Load that is added for each of those, in percent.
+/// Load that is added for each such simulation, in percent.
 const EXPECTED: f64 = 10.0;
 
 /// Spreads simulations over GPUs: the one with the least load gets the next. A simulation that was assigned to a GPU in

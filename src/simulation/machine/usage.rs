@@ -1,6 +1,6 @@
 //! CPU and memory of each simulation, from its process tree.
 //!
-//! One pass over `/proc` serves all simulations. Pages read at most once in 1.8 s, and only on demand.
+//! One pass over `/proc` serves all simulations. It is made only on demand, at most every 1.8 s.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::sync::Arc;
@@ -12,9 +12,9 @@ use procfs::process::{Stat, all_processes};
 /// The resource usage of a simulation's processes.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Usage {
-    /// Percent of one core: what Docker reports, or a mean since the last reading, `None` at the first.
+    /// Percent of one core: what Docker reports, or a mean since the last reading; `None` at the first reading.
     pub cpu: Option<f64>,
-    /// Memory in bytes: what Docker reports, or the resident memory, in which memory that processes share counts for each.
+    /// Memory in bytes: what Docker reports, or the sum of resident memory (shared memory counts for each process).
     pub memory: u64,
     /// Number of processes and threads.
     pub threads: u64,
@@ -33,8 +33,8 @@ pub struct UsageMonitor(Arc<Mutex<Option<(Instant, Usages)>>>);
 const AGE: Duration = Duration::from_millis(1800);
 
 impl UsageMonitor {
-    /// The usage of all simulations, never much older than two seconds. `measure` is called if the last reading is too old,
-    /// and leaves out the use of the CPU unless it knows it.
+    /// The usage of all simulations, never much older than two seconds. `measure` is called if the last reading is too
+    /// old; if it leaves `cpu` at `None`, the mean is computed.
     pub fn read(&self, measure: impl FnOnce() -> Usages) -> Usages {
         let mut last = self.0.lock();
         if let Some((at, usages)) = &*last

@@ -1,7 +1,7 @@
-//! Whether a Webots that starts is ready at its port.
+//! Checks whether a starting Webots is ready at its port.
 //!
-//! In the machine's network a connection tells. Docker's proxy and pasta accept connections from the start on, also those
-//! that nothing inside takes: behind them only the answer to a request tells.
+//! In the machine's network, Webots is ready when it accepts a connection. Docker's proxy and pasta accept connections
+//! from the start, even if nothing inside listens: behind them, only an answer to a request shows that Webots is ready.
 
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
@@ -13,14 +13,14 @@ use tokio::net::TcpStream;
 const REQUEST: &[u8] = b"GET /robots.txt HTTP/1.0\r\nHost: localhost\r\n\r\n";
 /// Bounds of the pause between two requests.
 const PAUSE: (Duration, Duration) = (Duration::from_millis(5), Duration::from_millis(500));
-/// The pause is such a part of the time since the start, so that many that start on a busy machine don't ask it all the time.
+/// The pause is 1/`PART` of the time since the start, so that many starts on a busy machine don't poll all the time.
 const PART: u32 = 20;
-/// Bounds of the timeout of a request, which is the time since the start: the proxy may accept the first one before anything
-/// inside listens, and Webots answers none while it reads a world.
+/// Bounds of the timeout of a request, which is the time since the start: the proxy may accept the first request before
+/// anything inside listens, and Webots answers none while it reads a world.
 const TIMEOUT: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(2));
 
-/// Waits until Webots is ready at this address. A container has to run: a request before it has its address holds all
-/// others up for a second, until the kernel asks for that address again.
+/// Waits until Webots is ready at this address. Its container must run already: a request before the container has its
+/// address delays all others by a second, until the kernel resolves the address again.
 pub async fn until_answering(address: SocketAddr, is_forwarded: bool) {
     let begin = Instant::now();
     loop {

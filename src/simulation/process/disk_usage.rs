@@ -1,4 +1,4 @@
-//! The room that a disk has left, and what the files below a directory take of it, also while programs change them.
+//! The free room of a disk, and the room that the files below a directory take, even while programs change them.
 
 use std::collections::HashSet;
 use std::fs::Metadata;
@@ -9,7 +9,7 @@ use std::time::Instant;
 
 use nix::sys::statvfs::statvfs;
 
-/// The room that a disk has left for ordinary users.
+/// The free room of a disk for ordinary users.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct DiskRoom {
     /// In bytes.
@@ -27,39 +27,39 @@ pub struct DiskUsage {
     enough: u64,
     /// When to stop counting.
     pub until: Option<Instant>,
-    /// What was added up until now.
+    /// The sum so far.
     pub total: u64,
-    /// Device and inode of the files without a name.
+    /// Device and inode of the unlinked files.
     nameless: HashSet<(u64, u64)>,
 }
 
 /// Least disk usage of a file or directory, in bytes.
 pub const SMALLEST: u64 = 4096;
-/// The least share of the disk's inodes that must be free: one in so many.
+/// At least 1/`FREE_INODES` of the disk's inodes must be free.
 const FREE_INODES: u64 = 50;
 
-/// What a file or folder takes of the disk. Holes take nothing.
+/// The disk space of a file or directory, without holes.
 pub fn room(about: &Metadata) -> u64 {
     (about.blocks() * 512).max(SMALLEST)
 }
 
-/// What is in a file.
+/// The length of a file; 0 for a directory.
 pub fn length(about: &Metadata) -> u64 {
     if about.is_dir() { 0 } else { about.len() }
 }
 
 impl DiskRoom {
-    /// The room of the disk that a folder is on.
+    /// The free room of the disk with this directory.
     ///
     /// # Errors
-    /// When the file system does not say.
+    /// When the file system does not report it.
     pub fn of(folder: &Path) -> std::io::Result<Self> {
         let disk = statvfs(folder)?;
         let bytes = disk.blocks_available().saturating_mul(disk.fragment_size());
         Ok(Self { bytes, inodes: disk.files_available(), all_inodes: disk.files() })
     }
 
-    /// What is less than the reserve (in MiB), in words. Without the numbers that change with each call.
+    /// What is below the reserve (in MiB), as text without numbers that change with each call; `None` if nothing is.
     pub fn shortage(&self, reserve: u64) -> Option<String> {
         if self.bytes >> 20 < reserve {
             return Some(format!("{reserve} MiB are left (diskReserve)"));
@@ -69,13 +69,13 @@ impl DiskRoom {
 }
 
 impl DiskUsage {
-    /// Adds up by this measure, to no more than `enough`.
+    /// Adds up files by this measure; stops above `enough`.
     pub fn new(measure: fn(&Metadata) -> u64, enough: u64) -> Self {
         Self { measure, enough, until: None, total: 0, nameless: HashSet::new() }
     }
 
-    /// Adds everything below a directory that there is time for. Symlinks are not followed. Returns whether no folder there was
-    /// closed to this server, or nested so deep that the system finds no path to it.
+    /// Adds everything below a directory until the time is up. Symlinks are not followed. Returns false if a directory
+    /// can't be read: it is closed to this server, or nested too deep for a path.
     pub fn add_folder(&mut self, folder: &Path) -> bool {
         let mut open: Vec<PathBuf> = vec![folder.to_owned()];
         let mut is_shown = true;
@@ -108,7 +108,7 @@ impl DiskUsage {
         is_shown
     }
 
-    /// Adds a file that has lost its names while processes have it open: once, however many these are.
+    /// Adds an unlinked file that processes have open: once, even if several have.
     pub fn add_nameless(&mut self, about: &Metadata) {
         if self.nameless.insert((about.dev(), about.ino())) {
             self.add(about);

@@ -29,7 +29,7 @@ pub struct Arguments {
     pub containers: Option<String>,
 }
 
-/// A running guardian. It acts when this is dropped.
+/// A running guardian. It acts when this handle is dropped.
 pub struct Guardian {
     _child: Child,
     _lifeline: PipeWriter,
@@ -50,8 +50,7 @@ impl Guardian {
     }
 }
 
-/// What the guardian process does, from its start to its end; `remove` removes what is not a process. Returns its exit
-/// code.
+/// The main function of the guardian process; `remove` removes what is not a process. Returns its exit code.
 pub fn guard(arguments: &Arguments, remove: impl Fn()) -> u8 {
     // A signal to the server's group, or Ctrl-C in its terminal, must not end the guardian before the server.
     let signals: SigSet = [Signal::SIGINT, Signal::SIGTERM, Signal::SIGHUP].into_iter().collect();

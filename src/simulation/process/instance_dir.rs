@@ -17,7 +17,7 @@ pub struct RunDir(PathBuf);
 #[derive(Debug)]
 pub struct InstanceDir(PathBuf);
 
-/// Attempts to remove a directory before that is left to the next start, and the pause between two attempts.
+/// Attempts to remove a directory before it is left to the next start, and the pause between two attempts.
 const TRIES: u32 = 60;
 const PAUSE: Duration = Duration::from_secs(1);
 /// Timeout of an attempt: a program that still runs may keep adding files.
@@ -58,7 +58,7 @@ impl RunDir {
         Ok(instance)
     }
 
-    /// The folder itself.
+    /// Its path.
     pub fn path(&self) -> &Path {
         &self.0
     }
@@ -73,7 +73,7 @@ impl InstanceDir {
     /// The name of the project's directory in that of an instance.
     pub const PROJECT: &str = "project";
 
-    /// The folder itself.
+    /// Its path.
     pub fn path(&self) -> &Path {
         &self.0
     }

@@ -6,7 +6,7 @@ use crate::shared::text::one_line;
 #[derive(Default)]
 pub struct Lines(Vec<u8>);
 
-/// So many bytes are kept of a line.
+/// Number of bytes that are kept of a line.
 const LONGEST: usize = 1000;
 
 impl Lines {
@@ -22,7 +22,7 @@ impl Lines {
         }
     }
 
-    /// Passes on the line in which the output ended, if there is one.
+    /// Passes on the incomplete last line, if there is one.
     pub fn end(&mut self, mut told: impl FnMut(String)) {
         let text = one_line(String::from_utf8_lossy(&self.0).trim_end());
         self.0.clear();

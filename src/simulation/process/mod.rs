@@ -1,4 +1,4 @@
-//! What a simulation uses of the system, and how it is removed: process trees and directories.
+//! The processes and directories of simulations: how they are started, measured and removed.
 
 mod answer;
 pub mod disk_usage;

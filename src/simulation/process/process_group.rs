@@ -27,10 +27,10 @@ pub struct SpawnSpec {
     pub inherits: bool,
     /// Environment variables, which replace the server's or add to them (see `inherits`).
     pub environment: Vec<(OsString, OsString)>,
-    /// How many programs wait outside of what is really run, each the parent of the next one: bubblewrap, and pasta before
-    /// it. What bubblewrap has started leads a group of its own, and all of that ends with each of them.
+    /// Number of wrappers around the program, each the parent of the next one: pasta if used, then bubblewrap. What
+    /// bubblewrap starts leads a group of its own, and ends with each wrapper.
     pub wrappers: usize,
-    /// Working folder; the server's own where absent.
+    /// Working directory; `None` for the server's own.
     pub folder: Option<PathBuf>,
     /// The directory that marks all processes of the tree, see [`process_tree::MARK`].
     pub mark: PathBuf,
@@ -39,7 +39,7 @@ pub struct SpawnSpec {
 }
 
 impl SpawnSpec {
-    /// A program of the server's own, in its environment and folder, that needs no grace time.
+    /// A program of the server's own, in its environment and working directory, without a grace period.
     pub fn new(command: Vec<OsString>, mark: &Path) -> Self {
         Self {
             command,
@@ -74,7 +74,7 @@ pub enum ExitReason {
 const NOT_FOUND: i32 = 127;
 /// Offset that bubblewrap adds to the number of the signal that has ended its program.
 const SIGNALLED: i32 = 128;
-/// Timeout of killed processes until they have exited.
+/// Time for killed processes to exit.
 const VANISH: Duration = Duration::from_secs(1);
 /// Interval between two checks whether the group is empty.
 const POLL: Duration = Duration::from_millis(5);
@@ -143,7 +143,7 @@ async fn wait(group: KillOnDrop, mut child: Child, asked: oneshot::Receiver<()>,
     };
     group.signal(Signal::SIGKILL);
     actix_rt::time::timeout(VANISH, group.emptied()).await.ok();
-    // The system always tells how a child has ended.
+    // The system always reports how a child has ended.
     let reason = ExitReason::of(status.unwrap_or_default(), group.wrappers > 0);
     // The id of an empty group may be reused.
     std::mem::forget(group);
@@ -162,8 +162,8 @@ impl KillOnDrop {
         killpg(self.leader, signal).ok();
     }
 
-    /// Sends SIGTERM to what is really run. Its wrappers must not get it: they would end at once, and all that is inside with
-    /// them.
+    /// Sends SIGTERM to the program inside the wrappers. The wrappers must not get it: they would end at once, and kill
+    /// everything inside.
     fn ask_to_end(&self) {
         let mut inside = vec![self.leader.as_raw()];
         for _ in 0..self.wrappers {

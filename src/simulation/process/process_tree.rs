@@ -13,11 +13,11 @@ use nix::unistd::{Pid, getpgid};
 use procfs::process::{Process, all_processes};
 
 /// The environment variable that marks every process of a simulation: its value is the instance's directory. Children
-/// inherit it, so that processes are found that have left their process group and lost their parent. A process that has
+/// inherit it, so that processes are found even if they have left their group and lost their parent. A process that has
 /// also cleared its environment is not found.
 pub const MARK: &str = "WEBOTS_FLEET_INSTANCE";
 
-/// A process and all that descends from it at this moment.
+/// A process and its current descendants.
 pub fn tree(root: i32) -> Vec<i32> {
     let mut found = vec![root];
     let mut next = 0;
@@ -28,7 +28,7 @@ pub fn tree(root: i32) -> Vec<i32> {
     found
 }
 
-/// The children of a process. One that has ended has none.
+/// The children of a process; none if it has ended.
 pub fn children(pid: i32) -> Vec<i32> {
     let threads = std::fs::read_dir(format!("/proc/{pid}/task")).into_iter().flatten();
     let children = threads.flatten().filter_map(|thread| std::fs::read_to_string(thread.path().join("children")).ok());
@@ -37,7 +37,7 @@ pub fn children(pid: i32) -> Vec<i32> {
 
 /// Kills every process that has the mark of an instance below `folder`, and the groups that such processes lead.
 ///
-/// It looks until it has found none twice in a row: a process may have forked meanwhile, and one that is just executing
+/// It scans until it has found none twice in a row: a process may have forked meanwhile, and one that is just executing
 /// another program has no environment for a moment. Blocks for 5 ms at least, for some seconds at most.
 pub fn kill_marked(folder: &Path) {
     let mut found_none = false;
@@ -64,7 +64,7 @@ const MOST_SCANS: usize = 200;
 /// Pause between two scans: killed processes need a moment to exit.
 const BETWEEN_SCANS: Duration = Duration::from_millis(5);
 
-/// The processes with the mark of an instance below `folder`. A zombie has no environment.
+/// The processes with the mark of an instance below `folder`. Zombies have no environment.
 fn marked(folder: &Path) -> Vec<Pid> {
     let mark = |process: &Process| process.environ().ok()?.remove(OsStr::new(MARK));
     let is_marked = |process: &Process| mark(process).is_some_and(|mark| Path::new(&mark).starts_with(folder));
@@ -72,12 +72,12 @@ fn marked(folder: &Path) -> Vec<Pid> {
     marked.map(|process| Pid::from_raw(process.pid())).collect()
 }
 
-/// The files that a process has open and that have lost their names. `None` if it hides what it has open.
+/// The unlinked files that a process has open. `None` if it hides its open files.
 pub fn nameless_files(pid: i32) -> Option<Vec<Metadata>> {
     let descriptors = match std::fs::read_dir(format!("/proc/{pid}/fd")) {
         Ok(descriptors) => descriptors,
         Err(error) if error.kind() == ErrorKind::PermissionDenied && is_running(pid) => return None,
-        // It has ended.
+        // The process has ended.
         Err(_) => return Some(Vec::new()),
     };
     let is_nameless = |path: &Path| {
@@ -88,7 +88,7 @@ pub fn nameless_files(pid: i32) -> Option<Vec<Metadata>> {
     Some(files.filter(|about| about.is_file() && about.nlink() == 0).collect())
 }
 
-/// Whether a process has not ended. One that has, and was not waited for, shows its files to nobody.
+/// Whether a process has not ended. The open files of a zombie can't be read.
 fn is_running(pid: i32) -> bool {
     Process::new(pid).and_then(|process| process.stat()).is_ok_and(|stat| !matches!(stat.state, 'Z' | 'X'))
 }

@@ -1,6 +1,6 @@
 //! Runs a program to its end: without a shell, within limits. Dropping the future kills it.
 //!
-//! Also runs other work on a thread of its own, which programs that it runs may block.
+//! Also runs other work on a thread of its own, because programs that it runs may block the thread.
 
 use std::ffi::OsString;
 use std::io;
@@ -23,7 +23,7 @@ pub struct Run {
     pub spec: SpawnSpec,
     /// Timeout, after which it is killed.
     pub time: Duration,
-    /// Size limit of its answer, in bytes. Where it is 0, there is none: its standard output is told with its errors.
+    /// Size limit of its answer, in bytes; 0: no answer, its standard output is passed on with its standard error.
     pub answer: u64,
     /// Resource limits of it and its children. They apply a moment after the start.
     pub limits: Vec<(Resource, u64)>,
@@ -108,8 +108,8 @@ impl Run {
         };
         let said = Receiver::from_owned_fd(said.into())?;
         let output = Receiver::from_owned_fd(output.into())?;
-        // The pipe is closed at the limit: who writes on would wait for its reader. A broken pipe ends the answer; the
-        // exit code decides whether that is an error.
+        // The pipe is closed at the limit: a program that writes more would otherwise block. A broken pipe ends the
+        // answer; the exit code decides whether that is an error.
         let answer = async move {
             let mut answer = Vec::new();
             output.take(most + 1).read_to_end(&mut answer).await.ok();
@@ -123,8 +123,8 @@ impl Run {
     }
 }
 
-/// Runs a future on a thread of the blocking pool, in a runtime of its own. On a busy machine each step of a future waits
-/// until its thread gets a core: here they do not wait for the steps of others. Dropping the returned future drops it.
+/// Runs a future on a thread of the blocking pool, in a runtime of its own. On a busy machine each step of a future
+/// waits for a core: here it does not wait for other futures as well. Dropping the returned future cancels the work.
 ///
 /// # Errors
 /// When there is no thread or runtime for it, or it panics.

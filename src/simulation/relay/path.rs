@@ -18,7 +18,7 @@ pub fn parse_path(path: &str) -> Option<(Token, &str)> {
     }
 }
 
-/// Whether a segment of a path names a file or folder, even if it is decoded twice: no name has a percent sign.
+/// Whether a segment of a path is a plain name, even if it is decoded twice: a percent sign is not allowed.
 fn is_safe_segment(part: &str) -> bool {
     let Ok(name) = percent_decode_str(part).decode_utf8() else { return false };
     let is_plain = !name.contains(|letter: char| letter.is_control() || matches!(letter, '/' | '\\' | '%'));

@@ -6,7 +6,7 @@ use std::net::{Shutdown, TcpStream};
 
 use actix_web::web::Bytes;
 
-/// How many times a direction is read before other streams have their turn.
+/// Maximum number of reads of a direction before other streams have their turn.
 const MAX_READS: usize = 16;
 
 /// A stream.
@@ -21,9 +21,9 @@ pub struct Stream {
 
 /// A direction of a stream.
 pub struct Direction {
-    /// The connection that is read, which does not block.
+    /// The connection to read from; it does not block.
     pub from: TcpStream,
-    /// What was read and is not yet written.
+    /// Data that was read and is not yet written.
     pending: Bytes,
     source: Source,
     has_ended: bool,
@@ -36,7 +36,7 @@ pub enum Source {
     Empty,
     /// Something, perhaps.
     Readable,
-    /// All up to the end, for it has closed.
+    /// Everything up to the end: the connection has closed.
     Closed,
 }
 
@@ -46,7 +46,7 @@ impl Stream {
         Self { up, down, _held: held }
     }
 
-    /// Copies what can be copied in both directions. Returns whether it was interrupted for other streams to have their turn.
+    /// Copies both directions as far as possible without waiting. Returns whether it stopped to let others continue.
     pub fn copy(&mut self, buffer: &mut [u8]) -> bool {
         let down = self.down.copy(&self.up.from, buffer);
         let up = self.up.copy(&self.down.from, buffer);
@@ -60,7 +60,7 @@ impl Stream {
 }
 
 impl Direction {
-    /// What comes from this connection, of which `pending` was read already.
+    /// Reads from this connection; `pending` was read from it already.
     pub fn new(from: TcpStream, pending: Bytes) -> Self {
         Self { from, pending, source: Source::Readable, has_ended: false }
     }
@@ -76,7 +76,7 @@ impl Direction {
         }
         self.try_copy(to, buffer).unwrap_or_else(|_| {
             self.has_ended = true;
-            // Its end then closes, so that the other direction ends, too. An error: it has closed.
+            // That end then closes, and the other direction ends, too. An error: it has closed already.
             to.shutdown(Shutdown::Write).ok();
             false
         })
@@ -113,7 +113,7 @@ impl Direction {
     }
 }
 
-/// Writes as much as a connection takes at once; epoll reports when it takes more. Returns how much that is.
+/// Writes as much as possible without waiting, and returns how much; epoll reports when the connection takes more.
 fn write(mut to: &TcpStream, bytes: &[u8]) -> io::Result<usize> {
     if bytes.is_empty() {
         return Ok(0);

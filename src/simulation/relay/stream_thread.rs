@@ -1,5 +1,5 @@
-//! The thread that copies all streams: one epoll instance serves them with fewer wakeups than several, and without the wakers
-//! of tasks a message costs little more than a read and a write.
+//! The thread that copies all streams: one epoll instance needs fewer wakeups than several, and without task wakers a
+//! message costs little more than a read and a write.
 
 use std::collections::{BTreeSet, HashMap};
 use std::io;
@@ -11,15 +11,15 @@ use parking_lot::Mutex;
 
 use super::stream::{Source, Stream};
 
-/// Size of the buffer that all streams share, in bytes. What one end does not take at once of it is kept for that stream.
+/// Size of the buffer that all streams share, in bytes. What an end does not take at once is kept for that stream.
 const BUFFER: usize = 64 * 1024;
-/// How many events are taken at once.
+/// Maximum number of events per wakeup.
 const MAX_EVENTS: usize = 256;
 
 /// The thread. It ends with the process.
 pub struct StreamThread {
     epoll: Epoll,
-    /// By their numbers. Epoll calls the directions of a stream by twice its number, and one more.
+    /// By number. The epoll keys of a stream's directions are twice its number (up) and one more (down).
     streams: Mutex<HashMap<u64, Stream>>,
     next: AtomicU64,
 }
@@ -34,7 +34,7 @@ impl StreamThread {
         let started = Arc::new(Self { epoll, streams: Mutex::default(), next: AtomicU64::new(0) });
         let thread = Arc::clone(&started);
         std::thread::Builder::new().name("streams".to_owned()).spawn(move || {
-            // Without it all streams would stand still: the service manager restarts the server.
+            // Without this thread all streams would stall: the server aborts, and the service manager restarts it.
             std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| thread.run())).ok();
             std::process::abort()
         })?;
@@ -58,7 +58,7 @@ impl StreamThread {
 
     fn run(&self) {
         let (mut buffer, mut events) = (vec![0; BUFFER], [EpollEvent::empty(); MAX_EVENTS]);
-        // The streams that go on once others had their turn.
+        // The streams that continue after others had their turn.
         let mut interrupted = BTreeSet::new();
         loop {
             let timeout = if interrupted.is_empty() { EpollTimeout::NONE } else { EpollTimeout::ZERO };
@@ -74,8 +74,8 @@ impl StreamThread {
         }
     }
 
-    /// Copies what can be copied of the stream with the direction of which epoll has reported this. Returns whether it was
-    /// interrupted.
+    /// Copies the stream of the direction with this key, for which epoll has reported `source`. Returns whether that
+    /// was interrupted.
     fn copy(&self, key: u64, source: Source, buffer: &mut [u8]) -> bool {
         let mut streams = self.streams.lock();
         let Some(stream) = streams.get_mut(&(key >> 1)) else { return false };
@@ -88,7 +88,7 @@ impl StreamThread {
     }
 }
 
-/// What can be read of an end of which epoll reports this.
+/// What can be read from a connection for which epoll reports these events.
 fn source(events: EpollFlags) -> Source {
     if events.intersects(EpollFlags::EPOLLRDHUP | EpollFlags::EPOLLHUP | EpollFlags::EPOLLERR) {
         Source::Closed

@@ -1,4 +1,4 @@
-//! Simulations, as this server itself reaches them, and the files that they serve.
+//! How this server reaches simulations, and the files that they serve.
 
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
@@ -15,31 +15,31 @@ use super::stream_thread::StreamThread;
 /// Timeout of a simulation's answer.
 pub(super) const ANSWER_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// Headers of Webots' answer that its client gets.
+/// Headers of Webots' answer that are forwarded to the client.
 const FORWARDED_HEADERS: [HeaderName; 4] =
     [header::CONTENT_TYPE, header::ETAG, header::CACHE_CONTROL, header::LAST_MODIFIED];
 
-/// Reaches simulations on this machine; one for each worker.
+/// Reaches simulations on this machine; one per worker.
 pub struct Upstream {
     client: awc::Client,
     address: IpAddr,
     /// Copies all streams.
     pub(super) stream_thread: Arc<StreamThread>,
-    /// How long a simulation may leave unread what was sent to it: until then nobody notices that its client has left.
+    /// Time for which a simulation may leave sent data unread. Until then it goes unnoticed that its client has left.
     pub(super) silence: Duration,
 }
 
-/// The answer to a client whose simulation answers nothing that makes sense in time.
+/// The response if a simulation sends no valid answer in time.
 pub(super) fn no_answer() -> HttpResponse {
     HttpResponse::BadGateway().body("Error: the simulation does not answer.")
 }
 
 impl Upstream {
-    /// Reaches them at this address. Streams are copied on this thread. A simulation has `silence` to read what was sent to
-    /// it.
+    /// Reaches simulations at this address, and copies their streams on this thread. A simulation has `silence` to read
+    /// what was sent to it.
     pub fn new(address: IpAddr, stream_thread: Arc<StreamThread>, silence: Duration) -> Self {
         let connector = awc::Connector::new().limit(0);
-        // Redirects are not followed, and an answer may take as long as the simulation.
+        // Redirects are not followed, and the transfer of an answer may take as long as the simulation.
         let client = awc::Client::builder().connector(connector).disable_timeout().disable_redirects();
         Self { client: client.no_default_headers().finish(), address, stream_thread, silence }
     }
@@ -52,8 +52,8 @@ impl Upstream {
     /// Fetches a file of the simulation with this port, or its video, and forwards the answer as fast as the client reads it.
     /// `held` is dropped with the answer.
     pub async fn fetch(&self, port: u16, file: &str, request: &HttpRequest, held: impl std::any::Any) -> HttpResponse {
-        // A connection that is kept could lead to another simulation on the same port later.
-        // Webots compares the names of headers letter by letter (WbTcpServer.cpp of R2025a).
+        // A connection that is kept alive could reach another simulation on the same port later.
+        // Webots compares header names case-sensitively (WbTcpServer.cpp of R2025a).
         let url = format!("http://{}{file}", self.simulation(port));
         let mut query = self.client.get(url).no_decompress().force_close().camel_case();
         if let Some(tag) = request.headers().get(header::IF_NONE_MATCH) {
@@ -69,8 +69,8 @@ impl Upstream {
                 response.insert_header((name, value));
             }
         }
-        // The content is made by worlds: it gets an origin of its own, so that it can't act as a page of this server, and no
-        // referrer, because its URL has the token.
+        // Worlds provide the content: it gets an origin of its own, so that it can't act as a page of this server, and
+        // sends no referrer, because its URL contains the token.
         response.insert_header((header::CONTENT_SECURITY_POLICY, "sandbox allow-scripts"));
         response.insert_header((header::REFERRER_POLICY, "no-referrer"));
         if matches!(answer.status(), StatusCode::NO_CONTENT | StatusCode::NOT_MODIFIED) {

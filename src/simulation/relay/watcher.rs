@@ -1,4 +1,4 @@
-//! The stream of a watcher, who can only request a kind of stream: that changes nothing for others.
+//! The stream of a watcher: it can only request a kind of stream, which changes nothing for others.
 
 use std::io::{self, ErrorKind};
 
@@ -11,14 +11,14 @@ use tokio_util::codec::Encoder;
 
 use crate::shared::http::websocket::FrameReader;
 
-/// How much is read at once, in bytes.
+/// Size of a read, in bytes.
 const BUFFER: usize = 16 * 1024;
 
-/// Relays between these until one has left; of each something was read already. Of what the watcher sends, Webots gets the
-/// requests for a kind of stream until it has answered, and nothing else.
+/// Relays between a watcher and Webots until one of them disconnects; `sent` and `answered` were read already. Webots
+/// receives only the watcher's requests for a kind of stream, and these only until it has answered.
 ///
 /// # Errors
-/// When one has left, or the watcher violates the protocol.
+/// When one disconnects, or the watcher violates the protocol.
 pub(super) async fn relay(
     (mut watcher, sent): (TcpStream, Bytes),
     (mut webots, answered): (TcpStream, Bytes),

@@ -20,7 +20,7 @@ use crate::shared::http::{upgrade, websocket};
 /// Size limit of the head of a simulation's answer, in bytes.
 const MAX_HEAD: usize = 8 * 1024;
 
-/// Connects a client with the WebSocket at this path of the simulation with this port, or answers why that can't be. A client
+/// Connects a client to the WebSocket at this path of the simulation with this port, or responds why it can't. A client
 /// that is `read_only` can only request a kind of stream. `held` is dropped with the connection.
 pub async fn connect(
     upstream: &Upstream,
@@ -56,16 +56,16 @@ pub async fn connect(
     response.finish()
 }
 
-/// Opens the WebSocket of a simulation with the key of its client's request. Returns the connection, and what was read of it
-/// after the handshake.
+/// Opens the WebSocket of a simulation with the key of its client's request. Returns the connection, and what was read
+/// from it after the handshake.
 async fn open(upstream: &Upstream, port: u16, path: &str, request: &HttpRequest) -> io::Result<(TcpStream, Bytes)> {
     let key = request.headers().get(header::SEC_WEBSOCKET_KEY).and_then(|key| key.to_str().ok());
     let (address, key) = (upstream.simulation(port), key.ok_or(ErrorKind::InvalidInput)?);
     let mut tcp = TcpStream::connect(address).await?;
     // Messages are small, and must not wait until the one before is acknowledged.
     tcp.set_nodelay(true)?;
-    // What Webots sends is acknowledged at once, though fewer acknowledgements (TCP_QUICKACK) would cost less. Qt leaves Nagle's
-    // algorithm on for what a server accepts: a small message of Webots would wait up to 40 ms for the one before.
+    // Delayed acknowledgements (TCP_QUICKACK off) would cost less, but Qt leaves Nagle's algorithm on for accepted
+    // connections: a small message of Webots would wait up to 40 ms for the acknowledgement of the one before.
     setsockopt(&tcp, sockopt::TcpUserTimeout, &u32::try_from(upstream.silence.as_millis()).unwrap_or(u32::MAX))?;
     let head = format!(
         "GET {path} HTTP/1.1\r\nHost: {address}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\

@@ -16,8 +16,8 @@ pub struct Connection {
     pub peer: Peer,
     /// Receives what is for the client.
     pub client: Recipient<ToClient>,
-    /// What the client does. Its end is the end of the connection: the client may come back. A session that drops it has
-    /// ended, or has sent the client the last text.
+    /// The client's actions. They end with the connection: the client may come back. A session drops the receiver when
+    /// it ends, or after it has sent the client the last text.
     pub actions: UnboundedReceiver<ClientAction>,
 }
 
@@ -43,7 +43,7 @@ pub enum ClientAction {
     Disconnect,
 }
 
-/// Asks a session to continue with another connection. The session then sends all to it, also the reason of a refusal.
+/// Asks a session to continue with another connection. The session sends everything to it, including a refusal.
 #[derive(Message)]
 #[rtype(result = "()")]
 pub struct Resume {
@@ -73,8 +73,8 @@ impl Sessions {
     }
 }
 
-/// Proves that a session or a stream belongs to a client. It never appears in a log or on a page of others; the one of a
-/// session appears in no URL either. The time of a comparison tells nothing: it is one of numbers.
+/// Proves that a session or a stream belongs to a client. It never appears in a log or on a page of others, and that of
+/// a session in no URL. A comparison is of numbers, so its duration reveals nothing.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub struct Token {
     /// The same for all tokens of a session.

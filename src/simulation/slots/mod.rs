@@ -1,4 +1,4 @@
-//! The slots that clients wait for: leases, the queue, and the limit per address; the streams of simulations that have one.
+//! The slots that clients wait for: leases, the queue, and the limits per address and user; the streams of simulations.
 
 mod present;
 mod slot_lease;

@@ -14,7 +14,7 @@ use crate::simulation::snapshot::{Simulation, Stage};
 
 /// A simulation of this server.
 pub(super) struct Present {
-    /// The number of clients ahead in the queue, as it was sent last.
+    /// The number of clients ahead in the queue, as last sent.
     pub sent_position: Option<usize>,
     /// Receives its events.
     pub listener: Recipient<SlotEvent>,
@@ -22,9 +22,9 @@ pub(super) struct Present {
     pub shown: Simulation,
     /// Its client, which counts for its address.
     pub client: Peer,
-    /// Those that its client belongs to, and how many slots each may have, unless it may have all.
+    /// The address and the user of its client, if their slots are limited, each with its limit.
     pub parties: Vec<(Party, usize)>,
-    /// The tokens that lead to its stream, while there is one.
+    /// The valid tokens for its stream.
     pub accesses: Vec<(Token, Holder)>,
     /// How it ends. Only the first report counts.
     pub how: Option<End>,
@@ -41,22 +41,22 @@ pub enum SlotEvent {
     Granted(u16),
     /// The first watcher of the simulation connects, or the last one leaves.
     Watched(bool),
-    /// The administrator stops the simulation; the words are for its client.
+    /// The administrator stops the simulation; the text is for its client.
     Stopped(String),
 }
 
-/// Who has a token that leads to the stream of a simulation.
+/// The holder of a token for the stream of a simulation.
 #[derive(Clone, Copy, PartialEq)]
 pub(super) enum Holder {
     /// The client of the simulation.
     Client,
-    /// Somebody who may watch once.
+    /// A watcher who has not connected yet. The token admits one connection.
     Invited,
-    /// Somebody who watches. The token is valid as long as that connection.
+    /// A connected watcher. The token is valid as long as that connection.
     Watcher,
 }
 
-/// Clients that share slots: those of one address, and those of one user, whose name a trusted reverse proxy sends.
+/// Clients that share a limit of slots: those of one address, or of one user, whom a trusted reverse proxy names.
 #[derive(PartialEq, Eq, Hash)]
 pub(super) enum Party {
     Address(IpAddr),
@@ -64,7 +64,7 @@ pub(super) enum Party {
 }
 
 impl Party {
-    /// Why it gets no other slot, as text for the client: it has so many, and so many of its clients wait.
+    /// Why it gets no other slot, as text for the client: it has `slots`, and `waiting` of its clients wait.
     pub(super) fn refusal(&self, slots: usize, waiting: usize) -> String {
         let have = match self {
             Self::Address(_) => "Clients of your address have",
@@ -77,13 +77,13 @@ impl Party {
     }
 }
 
-/// Number of events that are kept of a simulation.
+/// Number of events that are kept per simulation.
 const MAX_EVENTS: usize = 60;
 /// Longest text of an event, in characters.
 const MAX_EVENT_LENGTH: usize = 500;
 
 impl Present {
-    /// A simulation that a client has just asked for.
+    /// A simulation that a client has just requested.
     pub(super) fn new(shown: Simulation, client: Peer, listener: Recipient<SlotEvent>) -> Self {
         let event = format!("its client asks for {}", shown.world);
         let mut present = Self {
@@ -100,7 +100,7 @@ impl Present {
         present
     }
 
-    /// Lends it a port.
+    /// Grants it a port.
     pub(super) fn lend(&mut self, port: u16) {
         self.shown.port = Some(port);
         self.shown.stage = Stage::CheckingOut;
@@ -108,8 +108,8 @@ impl Present {
         self.listener.do_send(SlotEvent::Granted(port));
     }
 
-    /// Adds an event. Clients that may read the output may read it, so it contains no address and no path of the
-    /// machine.
+    /// Adds an event, without paths of the machine. It must not contain an address, because clients may see it in
+    /// the output.
     pub(super) fn note(&mut self, event: &str) {
         if self.events.len() < MAX_EVENTS {
             let event = excerpt(&without_paths(event), MAX_EVENT_LENGTH);
@@ -117,8 +117,8 @@ impl Present {
         }
     }
 
-    /// The record of its end, once its owner has stopped. An owner that has reported no end has lost its client, or
-    /// panicked while Webots ran.
+    /// The record of its end, once its owner has stopped. If the owner has reported no end, its client has left, or the
+    /// owner has panicked while Webots ran.
     pub(super) fn ended(mut self) -> Ended {
         let how = self.how.take().unwrap_or_else(|| {
             let (reason, why) = match self.shown.launched {

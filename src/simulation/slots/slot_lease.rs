@@ -55,14 +55,14 @@ impl SlotLease {
         self.slots.update(self.id, change);
     }
 
-    /// Logs an event of the simulation under its id, and records what everybody may read of it.
+    /// Logs an event of the simulation under its id, and records `shown`, the text that clients may read.
     pub fn log(&self, level: log::Level, event: &str, shown: &str) {
         log::log!(target: "simulation", level, "{}: {event}", self.id);
         self.slots.change(self.id, |present| present.note(shown));
     }
 
-    /// Reports how the simulation ends, before the lease is dropped. Only the first report counts. Its tokens
-    /// lead nowhere from then on: another simulation may soon have its port.
+    /// Reports how the simulation ends, before the lease is dropped. Only the first report counts. Its tokens become
+    /// invalid, because another simulation may soon have its port.
     pub fn end(&self, reason: EndReason, why: &str, taken: Taken) {
         self.slots.change(self.id, |present| {
             present.accesses.clear();

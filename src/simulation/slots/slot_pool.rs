@@ -38,8 +38,8 @@ pub(super) struct Slots {
 const RECHECK: Duration = Duration::from_secs(1);
 
 impl SlotPool {
-    /// Leases these ports; `queue_capacity` clients may wait. One address and one user may have this many slots, and as many
-    /// clients that wait; without a number, all. Each end is recorded with `ends`.
+    /// Leases these ports; `queue_capacity` clients may wait. `per_address` and `per_user` limit the slots of one
+    /// address and one user, and likewise their waiting clients. Each end is recorded with `ends`.
     pub fn new(
         ports: RangeInclusive<u16>,
         queue_capacity: usize,
@@ -51,7 +51,7 @@ impl SlotPool {
         Arc::new(Self(Mutex::new(Slots { ports, queue_capacity, per_address, per_user, arrivals: 0, present, ends })))
     }
 
-    /// Checks again each second which ports other programs have left.
+    /// Checks every second whether ports that other programs used are free again, and grants them.
     pub async fn recheck(self: Arc<Self>) {
         loop {
             actix_rt::time::sleep(RECHECK).await;
@@ -59,7 +59,7 @@ impl SlotPool {
         }
     }
 
-    /// Has a simulation wait for a slot, and grants it one if it is its turn.
+    /// Adds a simulation to the queue, and grants it a slot if it is its turn.
     ///
     /// # Errors
     /// Why it may not wait, as text for the client: the slots and the queue are full, or its address or its user has
@@ -104,8 +104,7 @@ impl SlotPool {
         self.change(id, |present| change(&mut present.shown));
     }
 
-    /// Stops the simulation that has this id now, and no other one: `why` is for its client. Returns whether there is
-    /// one.
+    /// Stops the simulation with this id; `why` is the text for its client. Returns whether there is one.
     pub fn stop(&self, id: &str, why: String) -> bool {
         let slots = self.0.lock();
         let found = slots.present.values().find(|one| one.shown.id.to_string() == id);
@@ -140,11 +139,11 @@ impl Slots {
         self.queue().find(|waiting| waiting.parties.iter().all(may_have_one)).map(|waiting| waiting.shown.id)
     }
 
-    /// Why one more simulation may not wait, if so, as text for its client.
+    /// Why one more simulation may not wait, as text for its client; `None` if it may.
     fn refusal(&self, present: &Present) -> Option<String> {
         for party in &present.parties {
             let waiting = self.queue().filter(|one| one.parties.contains(party)).count();
-            // Whoever may have all slots leaves a part of the queue to others, too.
+            // Even with a high limit, a party leaves a part of the queue to others.
             if waiting >= party.1.min((self.queue_capacity * 3 / 4).max(1)) {
                 let all = self.present.values().filter(|one| one.parties.contains(party)).count();
                 return Some(party.0.refusal(all - waiting, waiting));

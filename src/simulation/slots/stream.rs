@@ -1,5 +1,4 @@
-//! The streams of running simulations, and the tokens that lead to them: those of simulations' clients, and those of
-//! watching administrators.
+//! The streams of running simulations and their tokens: for simulations' clients, and for watching administrators.
 
 use std::sync::Arc;
 
@@ -8,7 +7,7 @@ use super::slot_pool::SlotPool;
 use crate::simulation::sessions::Token;
 use crate::simulation::simulation_id::SimulationId;
 
-/// The stream that a token leads to.
+/// The stream of a token.
 #[derive(Debug, Clone, Copy)]
 pub struct StreamTarget {
     /// The simulation.
@@ -27,7 +26,7 @@ pub struct WatchGuard {
 }
 
 impl Present {
-    /// Notifies the session if one watcher is connected: the first one has come, or the last one leaves.
+    /// Notifies the session if one watcher is connected: it is the first one, or the last one that leaves.
     fn notify_of_watchers(&self, is_watched: bool) {
         if self.accesses.iter().filter(|(_, holder)| *holder == Holder::Watcher).count() == 1 {
             self.listener.do_send(SlotEvent::Watched(is_watched));

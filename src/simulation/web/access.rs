@@ -1,4 +1,4 @@
-//! Who visits a page, and may see what; and from which pages browsers may use simulations.
+//! What the visitor of a page may see, and which origins may start simulations.
 
 use actix_web::HttpRequest;
 use actix_web::error::ErrorForbidden;
@@ -8,12 +8,12 @@ use crate::shared::http::{AuthError, Origin};
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::state::AppState;
 
-/// Who has sent a request, as far as the password shows. Another password may be meant for a web server in front.
+/// The sender of a request, as the password shows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Visitor {
     /// No password is configured.
     Anybody,
-    /// The request has no password, or another one.
+    /// The request has no password, or another one, which may be meant for a web server in front.
     Stranger,
     /// The request has the password.
     Administrator,
@@ -23,7 +23,7 @@ impl Visitor {
     /// The sender of a request.
     ///
     /// # Errors
-    /// When its address has sent too many passwords: the page must not pass for that of a stranger.
+    /// When its address has sent too many passwords: the administrator must not get the page for strangers.
     pub fn of(request: &HttpRequest, server: &AppState) -> Result<Self, AuthError> {
         let Some(auth) = &server.admin_auth else { return Ok(Self::Anybody) };
         match auth.check(request, server.config.trusted_proxies.peer(request)) {
@@ -33,8 +33,8 @@ impl Visitor {
         }
     }
 
-    /// Whether the visitor may see the ports of simulations: a client that reaches one controls its simulation. If no
-    /// password is configured and clients need the ports, all visitors see them, as on the original's page.
+    /// Whether the visitor may see the ports of simulations: a client that can reach a port controls its simulation. If
+    /// no password is configured and clients need the ports, all visitors see them, as on the original's page.
     pub fn sees_ports(self, config: &SimulationConfig) -> bool {
         match self {
             Self::Administrator => true,
@@ -44,10 +44,10 @@ impl Visitor {
     }
 }
 
-/// A page of another origin may use visitors' browsers to start simulations, unless origins are listed.
+/// Checks the origin of a page that uses a browser to start simulations. Without listed origins, all are allowed.
 ///
 /// # Errors
-/// The response to the request of a page that may not.
+/// The response to a page that may not.
 pub fn check_origin(request: &HttpRequest, allowed: &[Origin]) -> actix_web::Result<()> {
     let Some(origin) = request.headers().get(header::ORIGIN) else { return Ok(()) };
     let origin = origin.to_str().unwrap_or_default();

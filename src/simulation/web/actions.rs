@@ -1,4 +1,4 @@
-//! Actions of administrators: each needs their password.
+//! Actions of administrators: each requires their password.
 
 use actix_web::error::ErrorNotFound;
 use actix_web::http::header;
@@ -41,7 +41,7 @@ async fn drain(request: HttpRequest, server: web::Data<AppState>) -> HttpRespons
     HttpResponse::Accepted().body("draining")
 }
 
-/// Stops one simulation, and no other one that comes in its place: an id is never used again.
+/// Stops one simulation, and never its successor in the slot: an id is not used again.
 async fn stop(
     request: HttpRequest,
     id: web::Path<String>,

@@ -30,7 +30,7 @@ const ASSETS: &[Asset] = &[
     asset!("simulation_monitor.js"),
     asset!("watch.js"),
 ];
-/// How much of an output's end is shown, in bytes: all that is kept of one that has ended, with its events.
+/// Size of the end of an output that is shown, in bytes: all that is kept of an ended simulation, with its events.
 const MAX_TAIL: u64 = 96 * 1024;
 
 /// The page `/watch`.
@@ -40,7 +40,7 @@ struct Watch<'one> {
     one: &'one Simulation,
     /// The path of the stream, with a token for one connection.
     stream: String,
-    /// Webots' own viewer, where this server has it.
+    /// Webots' own viewer, if this server has it.
     script: Option<&'static str>,
 }
 
@@ -175,7 +175,7 @@ async fn watch(
     Ok(html(page.render(), VIEWER))
 }
 
-/// Webots' own viewer shows what worlds bring: it runs in an embedded page with an origin of its own.
+/// Webots' own viewer shows content of worlds: it runs in an embedded page with an origin of its own.
 async fn viewer() -> HttpResponse {
     html(WebotsViewer.render(), FOREIGN_SCRIPTS)
 }

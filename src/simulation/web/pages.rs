@@ -116,7 +116,7 @@ fn time(seconds_since_1970: u64) -> String {
     timestamp(SystemTime::UNIX_EPOCH + Duration::from_secs(seconds_since_1970))
 }
 
-/// The URL of a simulation's world as a link, in which nothing is invisible or turns letters around.
+/// The URL of a simulation's world as a link, with invisible and text-reversing characters escaped.
 pub fn link(one: &Simulation) -> String {
     Url::parse(&one.world).map_or_else(|_| one_line(&one.world), String::from)
 }

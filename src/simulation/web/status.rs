@@ -1,4 +1,4 @@
-//! The simulation server for other programs: `/status`.
+//! The page `/status`, for other programs.
 
 use serde::Serialize;
 use serde_json::{Value, json};
@@ -34,7 +34,7 @@ pub fn status_page(server: &AppState, snapshot: &Snapshot) -> impl Serialize + u
     };
     let more = json!({
         "isolation": server.launcher.level,
-        // That of their programs, where it is not Docker's.
+        // The network of worlds' programs; null at level `container`, where it is Docker's.
         "network": server.launcher.network(),
         // Seconds since the start.
         "uptime": server.started.elapsed().as_secs(),

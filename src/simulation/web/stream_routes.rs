@@ -18,7 +18,7 @@ pub fn configure(app: &mut web::ServiceConfig) {
 
 async fn stream(request: HttpRequest, server: web::Data<AppState>) -> actix_web::Result<HttpResponse> {
     let nothing = || ErrorNotFound("Error: there is no such stream.");
-    // As the client has written it: what it has encoded stays so.
+    // The path as the client has sent it: what is percent-encoded stays so.
     let (token, path) = relay::parse_path(request.uri().path()).ok_or_else(nothing)?;
     let StreamTarget { simulation, port, read_only } = server.slots.stream(token).ok_or_else(nothing)?;
     if let Some(refusal) = refuse_body(&request) {
@@ -26,7 +26,7 @@ async fn stream(request: HttpRequest, server: web::Data<AppState>) -> actix_web:
     }
     let headers = request.headers();
     let is_websocket = headers.contains_key(header::UPGRADE);
-    // Worlds' pages and Webots' own viewer run in frames without an origin; the token is what strangers lack.
+    // Worlds' pages and Webots' own viewer run in frames without an origin: the token keeps strangers out.
     let is_in_frame = headers.get(header::ORIGIN).is_some_and(|origin| origin == "null");
     if !is_in_frame {
         check_origin(&request, &server.config.allowed_origins)?;

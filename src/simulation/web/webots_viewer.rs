@@ -19,7 +19,7 @@ pub fn folder(config: &SimulationConfig) -> Option<PathBuf> {
     Some(home.join(FOLDER)).filter(|folder| folder.join(SCRIPT).is_file())
 }
 
-/// A file below a directory; `None` if the path leads out of it.
+/// A file below a directory; `None` if the path points outside it.
 pub fn file_below(folder: &Path, path: &str) -> Option<PathBuf> {
     let path = percent_decode_str(path).decode_utf8().ok()?;
     let path = Path::new(path.as_ref());

@@ -16,13 +16,13 @@ pub enum WebotsEvent {
     Text(String),
     /// Its process was started.
     Started,
-    /// It listens on this port, and this token leads to its stream.
+    /// It listens on this port, and this is the token for its stream.
     Listening(u16, Token),
     /// It has sent a heartbeat.
     Heartbeat,
     /// It has sent no heartbeat for this many seconds.
     Hanging(u64),
-    /// It is paused, and ends then for that; or it does not end for that any more.
+    /// It is paused and ends at this time if it stays so; `None`: that end is cancelled.
     IdleEnd(Option<Instant>),
     /// It has ended, and why.
     Exited(WebotsExit),
@@ -34,7 +34,7 @@ pub struct WebotsExit {
     /// Whether it exited by itself, without an error.
     pub clean: bool,
     /// Whether this server is the cause, so that another one may accept the client: Docker has failed or stopped, or
-    /// Webots has exited before it listened, which it does before it loads its world.
+    /// Webots has exited before it listened (it listens before it loads its world).
     pub own: bool,
     /// The reason, as text for the client.
     pub why: String,

@@ -1,6 +1,6 @@
-//! Ends a simulation that stays paused. Its client is notified some time before, and may keep it.
+//! Ends a simulation that stays paused. Its client is notified before, and can keep it.
 //!
-//! The messages between a page and Webots do not pass this server: Webots' output shows that a simulation is paused.
+//! The server does not read the messages between a page and Webots: Webots' output shows that a simulation is paused.
 
 use std::time::{Duration, Instant};
 

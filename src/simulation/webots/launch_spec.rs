@@ -19,7 +19,7 @@ use crate::simulation::process::{SpawnSpec, until_answering};
 use crate::simulation::protocol::Mode;
 use crate::simulation::slots::Slot;
 
-/// A port that does not even refuse a connection for so long has a program that does not take it.
+/// If a connection is neither accepted nor refused in this time, a program has the port and does not respond.
 const SILENCE: Duration = Duration::from_millis(100);
 
 /// Everything that one Webots is started with.
@@ -38,7 +38,7 @@ pub struct LaunchSpec {
     pub project: Arc<Project>,
     /// How it is shown.
     pub mode: Mode,
-    /// The GPU that it was given, if one was.
+    /// The GPU assigned to it, if any.
     pub gpu: Option<Gpu>,
     /// The slot, with its port.
     pub slot: Slot,
@@ -47,7 +47,7 @@ pub struct LaunchSpec {
 }
 
 impl LaunchSpec {
-    /// The request for its containers. The path of the world in its container is known once its image is.
+    /// The request for its containers. The world's path in the container is added once the image is known.
     pub fn request(&self) -> ContainerRequest {
         let command = std::iter::once(self.config.container.program.clone()).chain(self.options()).collect();
         ContainerRequest { project: Arc::clone(&self.project), port: self.slot.port, gpu: self.gpu.clone(), command }
@@ -73,7 +73,7 @@ impl LaunchSpec {
     /// How the process is started and ended on the machine, and its control group.
     ///
     /// # Errors
-    /// When there is no Xvfb, or a folder that it needs can't be made.
+    /// When there is no Xvfb, or a directory that it needs can't be created.
     pub fn spawn_spec(&self) -> std::io::Result<(SpawnSpec, Option<Cgroup>)> {
         let instance = self.project.instance.path();
         let display = if self.config.xvfb {
@@ -101,14 +101,14 @@ impl LaunchSpec {
         self.watcher.clone().until_too_much(disk)
     }
 
-    /// Where this server reaches it.
+    /// The address at which this server reaches it.
     fn address(&self) -> SocketAddr {
         let address = self.launcher.reached().unwrap_or_else(|| self.config.address_of_simulations());
         (address, self.slot.port).into()
     }
 
-    /// Whether another program listens there. It is not bound to find out: a process that is just being started elsewhere
-    /// would inherit that.
+    /// Whether another program listens at its port. Checked by a connection instead of `bind`: a process that
+    /// another thread is just starting would inherit the bound socket.
     pub fn is_port_taken(&self) -> bool {
         let connected = TcpStream::connect_timeout(&self.address(), SILENCE);
         connected.map_or_else(|error| error.kind() == ErrorKind::TimedOut, |_| true)

@@ -65,7 +65,7 @@ pub fn launch(
             in_container = containers.cause(reason).await;
             containers.remove().await;
         }
-        // This ends also what has left the process group.
+        // This also kills processes that have left the process group.
         let (on_machine, taken) = match cgroup {
             Some(cgroup) => actix_rt::task::spawn_blocking(move || cgroup.end()).await.unwrap_or_default(),
             None => (false, Taken::default()),
@@ -78,7 +78,7 @@ pub fn launch(
 }
 
 impl End {
-    /// Its kind, and the reason as text, of one that was not stopped; `was_ready` tells whether it had listened.
+    /// The kind and the reason (as text) of an end that was not requested; `was_ready`: whether Webots had listened.
     pub fn verdict(&self, was_ready: bool) -> (EndReason, String) {
         let kind = match (self.cause, self.reason) {
             (Some(cause), _) if cause.is_own() => EndReason::Fault,

@@ -44,11 +44,11 @@ pub struct Webots {
     hanging: bool,
     /// Why it was stopped, if it was.
     stopped_for: Option<(EndReason, String)>,
-    /// How it has ended, if it has: its session hears of it when this is dropped.
+    /// How it has ended, if it has: its session is notified when this actor is dropped.
     exit: Option<WebotsExit>,
 }
 
-/// So many heartbeats may be missed before Webots counts as hanging.
+/// Number of missed heartbeats after which Webots counts as hanging.
 const MISSED_HEARTBEATS: u32 = 6;
 
 impl Webots {
@@ -71,7 +71,7 @@ impl Webots {
         }
     }
 
-    /// Prepares its containers, where it runs in some, then starts it. Dropping the preparation discards what was created.
+    /// Prepares its containers, if it has any, then starts it. Dropping the preparation discards what was created.
     fn prepare(&mut self, ctx: &mut Context<Self>) {
         let Some(containers) = self.spec.containers.clone() else { return self.launch(None, ctx) };
         let (client, request) = (self.spec.events.clone(), self.spec.request());
@@ -100,7 +100,7 @@ impl Webots {
             return self.over(EndReason::Fault, &why, Taken::default(), ctx);
         }
         self.send(WebotsEvent::Started);
-        // A container prints when it runs.
+        // In containers, the wait begins when the container reports that it runs.
         self.spec.containers.is_none().then(|| self.await_port(ctx));
         ctx.run_interval(self.spec.config.timing.heartbeat, Self::check_heartbeat);
         let limit = self.spec.config.timing.launch;
@@ -118,7 +118,7 @@ impl Webots {
 
     /// Starts the process, and calls [`Self::ended`] when it has ended.
     fn spawn(&mut self, containers: Option<SimulationContainers>, ctx: &mut Context<Self>) -> std::io::Result<()> {
-        // Another program may have taken it during the checkout, and would be taken for Webots.
+        // Another program may have taken the port during the checkout, and would be mistaken for Webots.
         if self.spec.is_port_taken() {
             return Err(std::io::ErrorKind::AddrInUse.into());
         }
@@ -178,8 +178,8 @@ impl Webots {
         }
     }
 
-    /// Ends Webots: orderly, or at once if it exceeds a limit, which it could exceed further in a grace period. Only the
-    /// first reason counts.
+    /// Ends Webots: gracefully, or at once if it exceeds a limit, which it could exceed further in a grace period. Only
+    /// the first reason counts.
     pub(super) fn stop(&mut self, kind: EndReason, why: &str) {
         if self.stopped_for.is_some() {
             return;
@@ -200,7 +200,7 @@ impl Webots {
         self.over(kind, &why, end.taken, ctx);
     }
 
-    /// Reports the end, and ends. If Webots has not become ready, that is this server's own fault, but in containers the
+    /// Reports the end, and stops. If Webots has not become ready, that is this server's fault; in containers it is the
     /// project's, because the project determines what they run.
     fn over(&mut self, kind: EndReason, why: &str, taken: Taken, ctx: &mut Context<Self>) {
         self.spec.slot.lease.end(kind, why, taken);
@@ -221,14 +221,14 @@ impl Webots {
         self.spec.events.do_send(event);
     }
 
-    /// Logs an event with its port, which is not for everybody who reads of it: who has only a token reaches no port.
+    /// Logs an event with the port, and records it without: a client that has only a token must not learn the port.
     fn log(&self, level: Level, event: &str) {
         self.spec.slot.lease.log(level, &format!("port {}: {event}", self.spec.slot.port), event);
     }
 }
 
 impl Drop for Webots {
-    /// Its session always hears of its end, also if it panics and is dropped.
+    /// Notifies the session of the end, even after a panic.
     fn drop(&mut self) {
         let why = "The server has lost this simulation".to_owned();
         let exit = self.exit.take().unwrap_or(WebotsExit { clean: false, own: true, why });
