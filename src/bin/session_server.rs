@@ -19,7 +19,7 @@ struct Arguments {
     config: PathBuf,
     #[command(flatten)]
     options: start::CommonArgs,
-    /// Send one mail to the administrator, and a test to the webhook if there is one, say how it went, and end
+    /// Send a test mail to the administrator, and a test to the webhook if one is configured; print the results, and exit
     #[arg(long, conflicts_with = "check")]
     test_mail: bool,
 }

@@ -15,10 +15,10 @@ const LONGEST: Duration = Duration::from_hours(30 * 24);
 /// Open files that one client needs (its connections), and those that the program itself needs.
 const FILES: (u64, u64) = (4, 64);
 
-/// Plays a class of web clients against a fleet, and says how many fit.
+/// Runs a class of web clients against a fleet, and reports how many fit.
 ///
 /// It speaks to a session server as Webots' web page does: availability, a simulation server, the start, the scene and its
-/// updates, run, leave. Exit code 0: as expected; 1: not, or nothing could be measured; 2: wrong arguments, or --yes is missing;
+/// updates, run, leave. Exit code 0: as many as expected; 1: fewer, or nothing could be measured; 2: wrong arguments, or --yes is missing;
 /// 130: Ctrl-C or SIGTERM.
 #[derive(Parser, Debug, Clone)]
 #[command(version)]
@@ -29,41 +29,41 @@ pub(crate) struct Arguments {
     /// The world that all clients start
     #[arg(long, value_name = "https://github.com/USER/REPOSITORY/blob/BRANCH/worlds/NAME.wbt")]
     pub(crate) world: String,
-    /// How many clients come
+    /// Number of clients
     #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     pub(crate) clients: u32,
-    /// Within what time they come, evenly: 0s for all at once
+    /// Time over which the clients arrive, at regular intervals; 0s: all at once
     #[arg(long, default_value = "60s", value_parser = time)]
     pub(crate) over: Duration,
-    /// How long each stays once its simulation runs
+    /// Time for which each client stays once its simulation runs
     #[arg(long, default_value = "2m", value_parser = time)]
     pub(crate) stay: Duration,
-    /// How long a client waits for its simulation before it gives up
+    /// Time after which a client gives up if its simulation does not run
     #[arg(long, default_value = "5m", value_parser = time)]
     pub(crate) patience: Duration,
-    /// Shares of clients that misbehave, in percent: reload, return (reload and come back), drop (leave without closing), sleep (a tab that reads nothing),
-    /// vanish (a network that is gone), hasty (start and go at once). Example: reload=10,vanish=5
+    /// Shares of clients that misbehave, in percent: reload, return (reload and resume), drop (leave without closing), sleep (a tab that reads nothing),
+    /// vanish (a lost network connection), hasty (start and leave at once). Example: reload=10,vanish=5
     #[arg(long, default_value = "", value_parser = str::parse::<Mix>)]
     pub(crate) misbehave: Mix,
-    /// Clients come again and again for this time, in place of once
+    /// Repeat visits for this time, instead of one visit per client
     #[arg(long, value_parser = time)]
     pub(crate) soak: Option<Duration>,
-    /// A simulation below this share of real time does not count as one that fits
+    /// Least share of real time at which a simulation counts as one that fits
     #[arg(long, default_value_t = 0.9, value_parser = share)]
     pub(crate) real_time: f64,
-    /// How many clients have to fit for exit code 0
+    /// Number of clients that must fit for exit code 0
     #[arg(long, value_name = "CLIENTS")]
     pub(crate) expect: Option<u32>,
-    /// Where to write the numbers for machines
+    /// File for the results as JSON
     #[arg(long, value_name = "FILE")]
     pub(crate) json: Option<PathBuf>,
-    /// What the viewer asks Webots for: w3d (R2025a), x3d (up to R2023b)
+    /// Format that the viewer requests from Webots: w3d (R2025a), x3d (up to R2023b)
     #[arg(long, default_value = "w3d", value_parser = ["w3d", "x3d"])]
     pub(crate) viewer: String,
-    /// Walk through all steps with one client, and compare what comes with what is expected of a fleet and of Webots
+    /// Take one client through all steps, and compare each message with what a fleet and Webots should send
     #[arg(long, conflicts_with_all = ["clients", "over", "stay", "real_time", "misbehave", "soak", "expect", "json"])]
     pub(crate) explain: bool,
-    /// Load a fleet that is not on this machine
+    /// Allow a fleet that is not on this machine
     #[arg(long)]
     pub(crate) yes: bool,
 }

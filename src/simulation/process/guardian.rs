@@ -22,9 +22,9 @@ use super::{instance_dir, process_tree};
 /// The command line of a guardian.
 #[derive(Debug, clap::Args)]
 pub struct Arguments {
-    /// Folder of the run
+    /// Directory of the run
     folder: PathBuf,
-    /// Whose containers are removed
+    /// Owner of the containers to remove
     #[arg(long)]
     pub containers: Option<String>,
 }
