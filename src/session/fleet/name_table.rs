@@ -35,11 +35,11 @@ const MAX_ERROR_LENGTH: usize = 120;
 
 /// Resolves names to simulation servers, all at the same time.
 pub async fn look_up_all(names: Vec<PublicAddress>) -> Vec<(PublicAddress, LookupResult)> {
-    join_all(names.into_iter().map(async |name| {
+    let lookups = names.into_iter().map(|name| async {
         let found = servers(&name).await;
         (name, found)
-    }))
-    .await
+    });
+    join_all(lookups).await
 }
 
 async fn servers(name: &PublicAddress) -> LookupResult {
