@@ -114,7 +114,7 @@ async fn a_viewer_hears_the_whole_scene_first() {
 }
 
 #[actix_rt::test]
-async fn what_one_asks_for_moves_the_world_of_all_and_is_answered_to_the_one() {
+async fn an_action_of_one_viewer_moves_the_world_of_all() {
     let simulator = Simulator::start();
     let (mut one, mut other) = (simulator.spectator().await, simulator.spectator().await);
     one.send("pause").await;
@@ -150,7 +150,7 @@ async fn what_one_asks_for_moves_the_world_of_all_and_is_answered_to_the_one() {
 }
 
 #[actix_rt::test]
-async fn real_time_and_fast_run_until_paused_and_later_viewers_hear_which() {
+async fn later_viewers_receive_the_mode_of_the_simulation() {
     let simulator = Simulator::start();
     for mode in ["real-time", "fast"] {
         let mut viewer = simulator.spectator().await;

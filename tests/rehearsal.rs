@@ -81,7 +81,7 @@ async fn a_class_that_fits_is_told_so() {
 }
 
 #[actix_rt::test]
-async fn a_class_that_does_not_fit_is_told_why_and_time_in_the_line_counts_as_waiting() {
+async fn a_class_that_does_not_fit_is_reported_with_reasons() {
     let fleet = Fleet::with_places(1).await;
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("class.json");
@@ -117,7 +117,7 @@ async fn the_acceptance_run_finds_the_demo_as_expected() {
 }
 
 #[actix_rt::test]
-async fn a_fleet_that_is_not_there_or_elsewhere_or_only_a_part_is_refused_in_one_line() {
+async fn a_fleet_that_can_not_be_rehearsed_is_refused_in_one_line() {
     let ((_taken, port), fleet) = (ports::dead_port(), Fleet::with_places(1).await);
     let no_session_server = (1, "error: ws://", ": no session server, maybe a simulation server\n");
     for (url, arguments, (code, begin, end)) in [
@@ -138,7 +138,7 @@ async fn a_fleet_that_is_not_there_or_elsewhere_or_only_a_part_is_refused_in_one
 }
 
 #[actix_rt::test]
-async fn a_fleet_behind_https_is_rehearsed_where_its_certificate_is_trusted() {
+async fn a_fleet_behind_https_is_rehearsed() {
     let (lab, other) = (Authority::new(), Authority::new());
     let script = Script {
         session: vec!["wss://{}"],
@@ -157,7 +157,7 @@ async fn a_fleet_behind_https_is_rehearsed_where_its_certificate_is_trusted() {
 }
 
 #[actix_rt::test]
-async fn who_was_too_late_for_a_place_waits_for_the_next_one_until_the_patience_ends() {
+async fn who_gets_no_slot_waits_for_the_next_one() {
     let full = "Error: no simulation server available at the moment.";
     let never = "Error: no simulation server accepts https://github.com/lab/arm.";
     let given_up = format!("None fits; 1 got none: no simulation within 4s: {full}");
@@ -187,7 +187,7 @@ async fn explained(script: Script) -> String {
 }
 
 #[actix_rt::test]
-async fn the_acceptance_run_ends_at_a_step_that_never_does_or_fails_and_says_where() {
+async fn an_acceptance_run_ends_at_the_step_that_fails() {
     let client = |text| Script { client: vec![text], ..Script::default() };
     let webots = |texts| Script { webots: texts, ..Script::default() };
     let cases = [

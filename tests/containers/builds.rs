@@ -7,7 +7,7 @@ use super::image::NAME;
 use crate::support::{Client, WORLD, arm, is_told, until};
 
 #[actix_rt::test]
-async fn a_projects_own_dockerfile_is_built_once_for_all_who_want_it_and_what_it_makes_is_there() {
+async fn a_projects_dockerfile_is_built_once_for_all_clients() {
     let Some(_docker) = docker().await else { return };
     let dockerfile = format!(
         "FROM {NAME}\nARG PROJECT_PATH\nRUN mkdir -p $PROJECT_PATH\nCOPY . $PROJECT_PATH\nRUN sleep 2 && cp \

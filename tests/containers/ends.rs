@@ -33,7 +33,7 @@ async fn everything_is_gone_soon_after_the_server_was_killed() {
 }
 
 #[actix_rt::test]
-async fn what_an_earlier_run_has_left_is_removed_and_nothing_of_others() {
+async fn only_leftovers_of_this_server_are_removed() {
     let Some(_docker) = docker().await else { return };
     let folder = tempfile::tempdir().unwrap();
     std::fs::create_dir(folder.path().join("cache")).unwrap();
@@ -73,7 +73,7 @@ async fn a_server_that_is_started_again_at_once_keeps_what_it_starts() {
 }
 
 #[actix_rt::test]
-async fn a_docker_that_is_stopped_is_told_and_all_goes_on_when_it_is_back() {
+async fn a_stopped_docker_is_reported_until_it_is_back() {
     let Some(_docker) = alone().await else { return };
     let (server, mut client) = running(server(2)).await;
     daemon::kill();
@@ -97,7 +97,7 @@ async fn a_docker_that_is_stopped_is_told_and_all_goes_on_when_it_is_back() {
 }
 
 #[actix_rt::test]
-async fn a_world_that_ends_like_one_of_a_stopped_docker_is_not_taken_for_that() {
+async fn an_end_that_looks_like_a_stopped_docker_is_the_worlds() {
     let Some(_docker) = docker().await else { return };
     for (line, words) in [("exit 143", "exit code 143"), ("kill -KILL $$", "exit code 137")] {
         let server = server_running(line).start().await;
@@ -109,7 +109,7 @@ async fn a_world_that_ends_like_one_of_a_stopped_docker_is_not_taken_for_that() 
 }
 
 #[actix_rt::test]
-async fn a_start_that_docker_refuses_counts_against_the_server_and_not_the_world() {
+async fn a_start_that_docker_refuses_is_the_servers_fault() {
     let Some(_docker) = docker().await else { return };
     let server = server(1).set("container", serde_json::json!({ "mounts": ["/nowhere/x:relative"] }));
     let server = server.start().await;

@@ -30,7 +30,7 @@ async fn a_build_has_no_more_memory_than_a_simulation() {
 }
 
 #[actix_rt::test]
-async fn what_an_image_does_to_folders_and_devices_is_its_projects_fault() {
+async fn folders_and_devices_of_an_image_are_its_projects_fault() {
     let Some(_docker) = docker().await else { return };
     let (server, folder) = (server(1), tempfile::tempdir().unwrap());
     let replaced = |folder| (format!("rm -rf {folder} && touch {folder}"), "");
@@ -50,7 +50,7 @@ async fn what_an_image_does_to_folders_and_devices_is_its_projects_fault() {
 }
 
 #[actix_rt::test]
-async fn a_device_that_a_dockerfile_makes_in_the_project_opens_nothing() {
+async fn a_device_made_by_a_dockerfile_opens_nothing() {
     let Some(_docker) = docker().await else { return };
     // The memory of the machine, and a disk that there may be.
     let devices = "RUN cd /usr/local/webots-project && mknod mem c 1 1 && mknod disk b 254 0 && mknod controllers/zero c 1 5 \

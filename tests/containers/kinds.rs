@@ -25,7 +25,7 @@ async fn a_project_has_an_editor_on_the_port_of_webots_plus_500() {
 }
 
 #[actix_rt::test]
-async fn a_folder_that_leads_out_of_the_project_or_has_an_odd_name_is_not_shown_to_an_editor() {
+async fn an_editor_shows_no_folder_outside_of_the_project() {
     let Some(_docker) = docker().await else { return };
     let server = server(1).start().await;
     let work = server.forge().work_tree("lab/arm", "main");
@@ -60,7 +60,7 @@ const COMPETITION: [(&str, &str); 4] = [
 ];
 
 #[actix_rt::test]
-async fn a_participant_connects_to_webots_and_what_the_editor_changes_counts_after_a_reset() {
+async fn a_participant_connects_and_runs_edited_code_after_a_reset() {
     let Some(_docker) = docker().await else { return };
     let files = COMPETITION.map(|(path, text)| (path, text.replace("{NAME}", NAME)));
     let world = format!("{WORLD}Robot {{ name \"participant\" controller \"participant\" }}\n");

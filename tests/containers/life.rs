@@ -11,7 +11,7 @@ use crate::support::{Client, WORLD, arm, instance_folders_in, is_told, until, wo
 const GONE: Duration = Duration::from_secs(10);
 
 #[actix_rt::test]
-async fn a_world_runs_in_a_container_and_nothing_is_left_when_its_client_goes() {
+async fn a_world_runs_in_a_container_and_leaves_nothing() {
     let Some(_docker) = docker().await else { return };
     let (server, client) = running(server(2)).await;
     let steps = ["loading: Creating network", "shutdownTimeout: 7200", "webots:ws://localhost:"];
@@ -72,7 +72,7 @@ async fn who_comes_back_finds_its_container_as_it_runs() {
 }
 
 #[actix_rt::test]
-async fn a_container_has_no_more_than_it_needs_and_its_start_waits_for_no_heartbeat() {
+async fn a_container_has_no_more_than_it_needs() {
     let Some(_docker) = docker().await else { return };
     let limits = json!({ "memory": 300, "cores": 1, "processes": 77, "openFiles": 2048 });
     let server = server(1).set("limits", limits).set("timing", json!({ "heartbeat": 600, "launch": 90 }));
@@ -101,7 +101,7 @@ async fn a_container_has_no_more_than_it_needs_and_its_start_waits_for_no_heartb
 }
 
 #[actix_rt::test]
-async fn an_existing_configuration_with_docker_true_runs_every_world_in_a_container() {
+async fn docker_true_runs_every_world_in_a_container() {
     let Some(_docker) = docker().await else { return };
     let server = server(3).set("isolation", "auto").set("docker", true).set("shareIdleTime", 100).start().await;
     server.forge().commit("other/world", "main", &[("worlds/a.wbt", WORLD)]);

@@ -55,7 +55,7 @@ impl Machine {
 }
 
 #[actix_rt::test]
-async fn the_commands_of_the_page_on_containers_lead_to_a_server_that_can_start() {
+async fn the_commands_for_containers_lead_to_a_ready_server() {
     let Some(_docker) = docker().await else { return };
     open_socket();
     let machine = Machine::new();

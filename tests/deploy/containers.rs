@@ -22,7 +22,7 @@ const LIBRARY: &str = r#"
 "#;
 
 #[test]
-fn a_participant_s_program_runs_connected_and_is_not_missed_when_it_ends() {
+fn a_participants_program_may_end_before_its_simulation() {
     needs!("cc");
     needs!("python3");
     let folder = tempfile::tempdir().unwrap();

@@ -62,7 +62,7 @@ fn settings<'all>(objects: &'all [Value], name: &str, key: &str) -> &'all str {
 }
 
 #[test]
-fn all_that_kustomize_makes_keeps_to_the_published_schemas_and_names_images_of_the_dockerfile() {
+fn what_kustomize_makes_conforms_to_the_schemas() {
     let dockerfile = std::fs::read_to_string(project("deploy/docker/Dockerfile")).unwrap();
     let python = text(Command::new(project("tests/python.sh")).output().unwrap());
     for Made { name, yaml, objects } in &*ALL {
@@ -87,7 +87,7 @@ fn all_that_kustomize_makes_keeps_to_the_published_schemas_and_names_images_of_t
 }
 
 #[test]
-fn pods_pass_the_restricted_standard_but_for_those_that_draw_on_the_nodes_display() {
+fn pods_pass_the_restricted_standard_but_for_the_nodes_display() {
     for Made { name, objects, .. } in &*ALL {
         let namespace = &of_kind(objects, "Namespace")[0]["metadata"]["labels"]["pod-security.kubernetes.io/enforce"];
         let deployments = of_kind(objects, "Deployment");

@@ -32,7 +32,7 @@ async fn tells(server: Builder, signals: &[(Signal, &[&str])]) {
 }
 
 #[actix_rt::test]
-async fn a_service_manager_is_told_when_a_server_is_ready_has_drained_and_stops() {
+async fn a_service_manager_is_notified_of_readiness_and_stop() {
     tells(session_server(&["localhost:1".to_owned()]), &[(Signal::SIGTERM, &["STOPPING=1\n"])]).await;
     let drained: (_, &[&str]) = (Signal::SIGUSR1, &["STOPPING=1\nSTATUS=drained"]);
     tells(demo_server(1), &[drained]).await;

@@ -15,7 +15,7 @@ fn matched(pattern: &str) -> Vec<u16> {
 }
 
 #[test]
-fn the_rules_forward_the_ports_of_the_configuration_and_no_others() {
+fn the_rules_forward_only_configured_ports() {
     let config: Value = serde_json::from_str(include_str!("../../deploy/config/simulation/main.json")).unwrap();
     let [port, places] = ["port", "maxConnections"].map(|key| u16::try_from(config[key].as_u64().unwrap()).unwrap());
     let pattern = Regex::new(r"\^/\((?:\?<fleet_port>)?([0-9|\[\]-]+\|[0-9|\[\]-]+)\)/").unwrap();

@@ -47,7 +47,7 @@ fn exported(page: &str) -> BTreeSet<String> {
 }
 
 #[test]
-fn promtool_finds_no_fault_in_the_alerts_and_the_dashboard_and_these_tell_the_fleets_that_are_not_well() {
+fn alerts_pass_promtool_and_fire_for_unhealthy_fleets() {
     promtool(&["check", "rules"], &project("deploy/prometheus/alerts.yml"));
     promtool(&["check", "config"], &project("deploy/prometheus/prometheus.yml"));
     promtool(&["test", "rules"], &project("tests/deploy/alerts.yml"));
@@ -59,7 +59,7 @@ fn promtool_finds_no_fault_in_the_alerts_and_the_dashboard_and_these_tell_the_fl
 }
 
 #[actix_rt::test]
-async fn alerts_dashboard_and_docs_name_the_metrics_that_the_servers_export() {
+async fn alerts_dashboard_and_docs_name_exported_metrics() {
     let driver = readings::gpu_driver();
     let simulation = demo_server(1).env("LD_LIBRARY_PATH", driver.path().to_str().unwrap()).start().await;
     let session = session_server(&[simulation.address(), "dns+fleet.test:2000".to_owned()]).start().await;

@@ -35,7 +35,7 @@ async fn class(session: &Server, clients: u16) -> Vec<Client> {
 }
 
 #[actix_rt::test]
-async fn a_server_with_a_full_disk_takes_nobody_and_the_whole_class_runs_elsewhere() {
+async fn a_server_with_a_full_disk_takes_nobody() {
     disk::hide_mounts_from_others();
     let folder = tempfile::tempdir().unwrap();
     let small = folder.path().join("small");

@@ -13,7 +13,7 @@ const CLIENTS: usize = 5_000;
 const BOUND: Duration = Duration::from_secs(20);
 
 #[actix_rt::test]
-async fn on_a_quiet_machine_five_thousand_clients_come_back_at_once_and_hear_the_truth() {
+async fn on_a_quiet_machine_five_thousand_clients_reconnect_at_once() {
     crate::support::raise_file_limit();
     let folder = tempfile::tempdir().unwrap();
     let (reserved, simulation_port) = dead_port();

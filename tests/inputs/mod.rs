@@ -55,7 +55,7 @@ fn is_one_line(text: &str) -> bool {
 
 /// What a web client sends.
 #[test]
-fn a_client_is_answered_in_the_form_of_the_protocol_whatever_it_sends() {
+fn any_message_is_answered_in_the_form_of_the_protocol() {
     try_many(include_str!("seeds/client_message.txt"), |input| {
         let text = String::from_utf8_lossy(input);
         match ClientRequest::parse(&text) {
@@ -77,7 +77,7 @@ fn a_client_is_answered_in_the_form_of_the_protocol_whatever_it_sends() {
 
 /// Configuration files of both servers.
 #[test]
-fn a_configuration_is_read_or_refused_in_one_line_whatever_is_in_it() {
+fn any_configuration_is_read_or_refused_in_one_line() {
     let folder = tempfile::tempdir_in("/dev/shm").or_else(|_| tempfile::tempdir()).unwrap();
     let file = folder.path().join("configuration.json");
     try_many(include_str!("seeds/configuration.txt"), |input| {
@@ -161,7 +161,7 @@ fn a_load_is_a_number_from_0_whatever_a_server_answers() {
 
 /// `webots.yml` of a project.
 #[test]
-fn a_project_asks_for_nothing_outside_of_itself_whatever_is_in_its_webots_yml() {
+fn any_webots_yml_requests_nothing_outside_of_its_project() {
     try_many(include_str!("seeds/webots_yml.txt"), |input| {
         // Each example is a line of its file.
         let text = String::from_utf8_lossy(input).replace("\\n", "\n").replace("\\r", "\r");

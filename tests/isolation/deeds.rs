@@ -232,7 +232,7 @@ async fn the_environment_is_what_webots_needs_and_what_a_key_adds() {
 }
 
 #[actix_rt::test]
-async fn what_is_empty_in_a_sandbox_stays_so_and_its_shared_memory_is_bounded() {
+async fn empty_folders_of_a_sandbox_stay_empty() {
     needs!("bwrap");
     let help = Command::new("bwrap").arg("--help").output().unwrap();
     if !String::from_utf8_lossy(&help.stdout).contains("--disable-userns") {

@@ -19,7 +19,7 @@ fn with(builder: Builder, programs: &tempfile::TempDir, isolation: &str) -> Buil
 }
 
 #[actix_rt::test]
-async fn a_level_or_a_network_that_is_demanded_and_can_not_be_had_refuses_the_start_in_one_line() {
+async fn a_required_level_that_is_missing_refuses_the_start() {
     let (none, ends) = (programs(None), programs(Some("exit 1")));
     let denied = programs(Some("echo 'bwrap: setting up uid map: Permission denied' >&2; exit 1"));
     let hangs = programs(Some("exec sleep 1000"));
@@ -49,7 +49,7 @@ async fn a_level_or_a_network_that_is_demanded_and_can_not_be_had_refuses_the_st
 }
 
 #[actix_rt::test]
-async fn where_no_sandbox_can_be_had_auto_falls_back_with_a_warning_on_log_and_monitor_page() {
+async fn auto_warns_where_no_sandbox_works() {
     let programs = programs(Some("echo 'bwrap: No permissions' >&2; exit 1"));
     let server = with(demo_server(1), &programs, "auto").start().await;
     let words = "bubblewrap makes no sandbox here (bwrap: No permissions)";
@@ -79,7 +79,7 @@ async fn a_sandbox_is_what_a_machine_has_by_itself() {
 }
 
 #[actix_rt::test]
-async fn limits_that_a_machine_can_not_keep_are_told_at_the_start_and_by_a_check() {
+async fn limits_that_a_machine_can_not_enforce_are_reported() {
     let lines = [
         "limits.memory does not hold: systemd has not delegated control groups with the controller memory",
         "limits.cores does not hold: systemd has not delegated control groups with the controller cpu",
@@ -104,7 +104,7 @@ async fn limits_that_a_machine_can_not_keep_are_told_at_the_start_and_by_a_check
 }
 
 #[actix_rt::test]
-async fn a_webots_that_does_not_become_ready_tells_its_level_and_the_keys() {
+async fn a_webots_that_is_never_ready_names_level_and_keys() {
     needs!("bwrap");
     for (isolation, is_told) in [("sandbox", true), ("none", false)] {
         let webots = Webots::script("echo 'no module named arm'; exit 1");

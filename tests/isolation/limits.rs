@@ -146,7 +146,7 @@ impl Drop for Delegated {
 }
 
 #[actix_rt::test]
-async fn a_simulation_has_a_control_group_of_its_own_where_they_are_delegated() {
+async fn a_simulation_has_its_own_control_group() {
     let Some(delegated) = Delegated::new() else {
         return skip("there is no cgroup v2 in which this user may make groups");
     };

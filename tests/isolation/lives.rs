@@ -81,7 +81,7 @@ async fn a_simulation_has_its_grace_time_at_each_level() {
 }
 
 #[actix_rt::test]
-async fn a_simulation_that_takes_no_notice_is_killed_after_its_grace_time() {
+async fn a_simulation_that_ignores_sigterm_is_killed() {
     needs!("bwrap");
     for (level, user, network) in levels() {
         let stage = Stage::new();

@@ -143,7 +143,7 @@ async fn who_takes_all_ports_in_its_own_network_keeps_nobody_out() {
 }
 
 #[actix_rt::test]
-async fn a_display_is_within_reach_at_each_level_and_of_its_own_network() {
+async fn a_display_can_be_reached_at_each_level() {
     needs!("Xvfb");
     let _alone = display::alone().await;
     needs!("xhost");
@@ -245,7 +245,7 @@ async fn which_network_simulations_have_is_told() {
 }
 
 #[actix_rt::test]
-async fn a_machine_without_ipv4_or_ipv6_has_networks_of_simulations_own() {
+async fn a_machine_with_one_version_of_ip_has_own_networks() {
     let Some(user) = ordinary() else { return };
     for (ip, address, route) in [("ip -6", "2001:db8::2/64", "2001:db8::1"), ("ip -4", "192.0.2.2/24", "192.0.2.1")] {
         // What this thread starts from here on is on a machine of its own, with this address and route alone.

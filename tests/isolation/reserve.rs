@@ -93,7 +93,7 @@ fn go(folder: &Path, line: &str) {
 }
 
 #[actix_rt::test]
-async fn on_a_quiet_machine_simulations_never_use_up_the_reserve_of_the_disk() {
+async fn on_a_quiet_machine_the_reserve_of_the_disk_is_kept() {
     disk::hide_mounts_from_others();
     let folder = open_folder();
     let small = folder.path().join("small");

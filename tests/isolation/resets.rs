@@ -66,7 +66,7 @@ const EXCHANGE: &str = "import ctypes, os, sys\n\
     libc.unlinkat(folder, b'c.py', 0)\n";
 
 #[actix_rt::test]
-async fn who_exchanges_folders_and_links_during_a_reset_leads_nothing_out_of_the_project() {
+async fn a_reset_never_writes_outside_of_the_project() {
     needs!("bwrap");
     let outside = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap();
     let outside_shown = outside.path().display();

@@ -34,7 +34,7 @@ fn start(project: &Project, name: &str) -> (String, String) {
 }
 
 #[test]
-fn a_start_builds_the_programs_that_it_starts_when_their_source_has_changed() {
+fn a_start_builds_changed_programs() {
     let project = Project::copy();
     for folder in ["src", "templates", "bin-of-cargo"] {
         std::fs::create_dir(project.path(folder)).unwrap();

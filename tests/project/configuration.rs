@@ -153,7 +153,7 @@ fn the_examples_of_the_page_are_taken_without_a_warning() {
 }
 
 #[test]
-fn values_come_from_files_and_the_environment_and_passwords_are_not_shown() {
+fn values_come_from_files_and_the_environment() {
     let [session, simulation] = kinds();
     let secret = tempfile::NamedTempFile::new().unwrap();
     std::fs::write(secret.path(), "s3cret\n").unwrap();

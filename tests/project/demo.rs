@@ -106,7 +106,7 @@ async fn a_server_that_does_not_end_is_killed_with_what_it_started() {
 }
 
 #[actix_rt::test]
-async fn without_webots_everything_runs_and_a_client_is_told_what_to_do() {
+async fn without_webots_a_client_is_told_what_to_do() {
     let project = Project::copy();
     let home = project.path("no webots here");
     project.configure("simulation/local", |config| config["webotsHome"] = home.to_str().unwrap().into());

@@ -11,7 +11,7 @@ fn pages() -> Vec<PathBuf> {
 }
 
 #[test]
-fn every_link_to_a_file_leads_to_one_and_the_readme_to_every_page() {
+fn every_link_leads_to_a_file_and_the_readme_to_every_page() {
     let readme = std::fs::read_to_string(root().join("README.md")).unwrap();
     for page in pages() {
         let name = page.strip_prefix(root()).unwrap().to_str().unwrap();

@@ -52,7 +52,7 @@ async fn what_runs_already_is_not_started_twice() {
 }
 
 #[actix_rt::test]
-async fn when_one_server_does_not_start_its_last_words_are_shown_and_the_other_is_stopped() {
+async fn a_server_that_does_not_start_shows_its_last_words() {
     let project = Project::copy();
     for port in [project.simulation, project.session] {
         let _listener = TcpListener::bind(("127.0.0.1", port)).unwrap();
@@ -67,7 +67,7 @@ async fn when_one_server_does_not_start_its_last_words_are_shown_and_the_other_i
 }
 
 #[actix_rt::test]
-async fn a_wrong_configuration_is_refused_in_one_line_and_stops_nothing_that_runs() {
+async fn a_wrong_configuration_is_refused_and_stops_nothing() {
     needs!("bwrap");
     let project = Project::copy();
     project.done(&["start", "demo"]).await;
@@ -83,7 +83,7 @@ async fn a_wrong_configuration_is_refused_in_one_line_and_stops_nothing_that_run
 }
 
 #[actix_rt::test]
-async fn a_stale_pid_file_neither_hinders_a_start_nor_ends_another_process() {
+async fn a_stale_pid_file_does_no_harm() {
     needs!("bwrap");
     let project = Project::copy();
     let file = project.path("log/simulation/demo.pid");

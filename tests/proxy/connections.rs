@@ -25,13 +25,13 @@ async fn is_told_what_happens(browser: &Browser, path: &str) {
     }
 }
 
-async fn quiet_connections_last_and_a_restart_costs_only_connections_of_its_own(rules: Rules) {
+async fn a_web_server_keeps_quiet_connections(rules: Rules) {
     let mut fleet = Fleet::start(rules).await;
     quiet_connections_last(&fleet).await;
     restarts(&mut fleet).await;
 }
 
-through_both!(quiet_connections_last_and_a_restart_costs_only_connections_of_its_own);
+through_both!(a_web_server_keeps_quiet_connections);
 
 async fn quiet_connections_last(fleet: &Fleet) {
     let browser = &fleet.browser;

@@ -8,7 +8,7 @@ use super::whole_way::the_whole_way;
 use crate::support::until;
 
 #[actix_rt::test]
-async fn the_door_leads_a_visitor_everywhere_in_the_fleet_and_nowhere_else() {
+async fn the_door_leads_to_the_whole_fleet_and_nowhere_else() {
     leads_nowhere_else(&the_whole_way(Rules::Door).await).await;
 }
 

@@ -88,7 +88,7 @@ async fn servers_behind_a_name_come_and_go() {
 }
 
 #[actix_rt::test]
-async fn a_name_server_that_fails_or_has_nothing_to_tell_changes_nothing_and_is_told_once() {
+async fn a_failed_lookup_keeps_the_servers_and_is_logged_once() {
     let Some(mut names) = NameServer::start() else {
         return;
     };

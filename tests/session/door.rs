@@ -62,7 +62,7 @@ async fn a_message_may_come_in_pieces_and_must_not_be_large() {
 }
 
 #[actix_rt::test]
-async fn texts_that_come_at_once_are_answered_in_their_order_and_too_many_are_refused_after_that() {
+async fn many_texts_at_once_are_answered_in_order_up_to_a_limit() {
     let server = StandIn::start(Manner::of_owner("other"));
     let session = session_server(&[server.address()]).start().await;
     let mut client = Client::connect(&session.websocket("/session")).await;

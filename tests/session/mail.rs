@@ -176,7 +176,7 @@ async fn a_test_mail_says_how_it_went() {
 }
 
 #[actix_rt::test]
-async fn a_password_goes_over_an_encrypted_connection_to_a_trusted_server_only() {
+async fn a_password_is_sent_to_a_trusted_server_only() {
     let folder = tempfile::tempdir().unwrap();
     let authority = folder.path().join("authority.pem").to_str().unwrap().to_owned();
     let (right, wrong) = (json!({"mailSenderPassword": "s3cret"}), json!({"mailSenderPassword": "guess"}));

@@ -45,7 +45,7 @@ async fn a_burst_between_two_reports_is_spread_evenly() {
 }
 
 #[actix_rt::test]
-async fn a_server_without_a_free_place_or_room_for_one_more_client_gets_nobody() {
+async fn a_server_without_a_free_slot_gets_nobody() {
     let servers = [Manner::status(10.0, 4, 4), Manner::status(91.0, 9, 100), Manner::status(60.0, 2, 4)];
     let servers = servers.map(StandIn::start);
     let session = between_reports(&servers, 10.0).start().await;

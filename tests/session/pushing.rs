@@ -67,7 +67,7 @@ async fn no_value_comes_twice_however_a_server_flaps() {
 }
 
 #[actix_rt::test]
-async fn a_silent_client_is_gone_when_its_time_is_up_and_one_that_reads_stays() {
+async fn a_silent_client_is_disconnected_in_time() {
     // The pings come at 3 and at 6 seconds.
     let session = session_server(&[]).set("timing", serde_json::json!({"ping": 3, "silence": 4})).start().await;
     let mut reader = Client::connect(&session.websocket("/session")).await;
@@ -106,7 +106,7 @@ async fn nothing_piles_up_for_a_client_that_asks_without_reading() {
 }
 
 #[actix_rt::test]
-async fn clients_who_are_too_many_for_the_configuration_or_for_the_files_that_may_be_open_are_refused() {
+async fn too_many_clients_are_refused() {
     for (builder, least) in [(session_server(&[]).set("maxClients", 2), 2), (session_server(&[]).files(200), 20)] {
         let session = builder.start().await;
         let connect = || async { tokio_tungstenite::connect_async(session.websocket("/session")).await };

@@ -33,7 +33,7 @@ async fn pages_of_other_origins_may_ask_and_nothing_is_posted_there() {
 }
 
 #[actix_rt::test]
-async fn the_status_tells_all_of_each_server_and_the_metrics_what_an_alarm_needs() {
+async fn status_and_metrics_have_what_an_alarm_needs() {
     let lab = json!({"load": 20, "version": "9", "docker": false, "allowedRepositories": ["https://github.com/lab"],
         "instances": {"queued": 0, "starting": 1, "idle": 2, "running": 3, "places": 9, "arrivals": 6}});
     let servers = [Manner::Status(lab), Manner::Body(500, Vec::new()), Manner::Load("40".into())].map(StandIn::start);
@@ -122,7 +122,7 @@ async fn a_fault_of_the_configuration_is_one_line_and_exit_code_2() {
 }
 
 #[actix_rt::test]
-async fn what_a_server_says_is_data_on_the_page_and_in_the_log_and_hides_nothing() {
+async fn texts_of_a_server_are_data_on_the_page_and_in_the_log() {
     let evil = "<script>alert(1)</script>\r\n2026-01-01T00:00:00Z [ERROR] forged";
     let hidden = "1\u{202e}gpj\u{200b}.exe\u{2028}";
     let repository = "https://github.com/lab\u{202e}bal";

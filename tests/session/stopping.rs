@@ -15,7 +15,7 @@ use crate::support::stopwatch::Stopwatch;
 use crate::support::{http, until};
 
 #[actix_rt::test]
-async fn clients_are_told_to_go_and_the_server_ends_within_five_seconds() {
+async fn a_stop_notifies_clients_and_takes_five_seconds_at_most() {
     let servers = [StandIn::start(Manner::idle(1.0, 10)), StandIn::start(Manner::Hang)];
     let mut session = session_server(&addresses(&servers)).start().await;
     let url = session.websocket("/session");
@@ -53,7 +53,7 @@ async fn connections_that_wait_for_another_request_end_at_once() {
 }
 
 #[actix_rt::test]
-async fn servers_are_added_drained_and_removed_without_dropping_a_client() {
+async fn servers_are_added_and_removed_without_dropping_a_client() {
     let servers = [1.0, 2.0, 3.0].map(|load| StandIn::start(Manner::idle(load, 100)));
     let [one, two, three] = servers.each_ref().map(StandIn::address);
     let session =

@@ -71,7 +71,7 @@ async fn a_certificate_that_is_not_trusted_is_named_with_the_reason() {
 }
 
 #[actix_rt::test]
-async fn a_certificate_that_has_signed_itself_is_trusted_where_it_is_in_the_trust_store() {
+async fn a_self_signed_certificate_in_the_trust_store_is_trusted() {
     let folder = tempfile::tempdir().unwrap();
     let signed = |name: &str, signs_others| Certificate::self_signed(folder.path(), name, signs_others);
     let (own, other, authority) = (signed("own", false), signed("other", false), signed("authority", true));

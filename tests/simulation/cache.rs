@@ -86,7 +86,7 @@ fn cut_packs(repository: &Path) {
 }
 
 #[actix_rt::test]
-async fn a_repository_that_is_being_used_stays_and_goes_with_its_last_user_where_the_budget_is_exceeded() {
+async fn a_repository_in_use_is_evicted_after_its_last_user() {
     let (forge, webots, marks) = (Forge::with_arm(), reader(), tempfile::tempdir().unwrap());
     forge.commit_noise("lab/arm", 2 << 20);
     forge.commit("lab/leg", "main", &[("worlds/a.wbt", &world_text("leg"))]);

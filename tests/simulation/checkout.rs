@@ -182,7 +182,7 @@ async fn a_repository_can_run_nothing() {
 }
 
 #[actix_rt::test]
-async fn equal_checkouts_are_done_once_and_a_cached_start_fetches_nothing() {
+async fn equal_checkouts_are_joined_and_cached() {
     let wrapper = Wrapper::git("case \"$*\" in *fetch*) sleep 0.7;; esac");
     let server = server_of(reader(), 6).env("PATH", &wrapper.path()).start().await;
     let forge = server.forge();
@@ -287,7 +287,7 @@ async fn a_controller_is_reset_and_nothing_else() {
 }
 
 #[actix_rt::test]
-async fn the_files_of_the_folders_above_a_project_are_there_and_no_other_folders() {
+async fn files_above_a_project_are_there_without_other_folders() {
     let forge = Forge::new();
     let webots = Webots::script(
         "for last; do :; done\ncd \"$(dirname \"$last\")/../../..\"\necho \"files [$(find . -type f | sort | tr '\\n' ' ')]\"\nexit 1",

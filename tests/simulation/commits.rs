@@ -41,7 +41,7 @@ async fn any_commit_of_a_branch_or_tag_runs() {
 }
 
 #[actix_rt::test]
-async fn a_commit_that_no_branch_or_tag_vouches_for_runs_only_where_that_is_allowed() {
+async fn a_commit_of_no_branch_or_tag_runs_only_with_any_commit() {
     let (forge, webots) = (Forge::with_arm(), reader());
     let proposed = forge.commit("lab/arm", "proposal", &[("worlds/a.wbt", WORLD), ("controllers/c/c.py", "evil")]);
     let bare = forge.path().join("lab/arm");

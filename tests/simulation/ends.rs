@@ -42,7 +42,7 @@ async fn ends(server: &Server, reason: &str) -> f64 {
 }
 
 #[actix_rt::test]
-async fn a_simulation_has_one_id_from_its_first_message_to_its_last_trace() {
+async fn a_simulation_keeps_one_id() {
     let (server, _folder, file) = ending_server().await;
     let mut client = Client::ready(&server).await;
     assert!(client.heard[0].starts_with("session: "), "{:?}", client.heard);
@@ -129,7 +129,7 @@ async fn what_is_kept_needs_the_password_where_there_is_one() {
 }
 
 #[actix_rt::test]
-async fn what_hides_or_turns_letters_around_in_a_worlds_name_is_shown_as_such() {
+async fn hidden_letters_in_a_worlds_name_are_shown() {
     let forge = Forge::new();
     let text = "#VRML_SIM R2025a utf8\n";
     let (file, encoded) = ("a\u{202e}b\u{2028}\u{200b}.wbt", "c%E2%80%AEd%E2%80%A8.wbt");

@@ -26,7 +26,7 @@ fn commit(forge: &Forge, branch: &str) -> String {
 }
 
 #[actix_rt::test]
-async fn a_fetch_that_hangs_holds_up_nobody_who_needs_no_fetch_and_others_only_for_a_while() {
+async fn a_fetch_that_hangs_delays_only_those_who_need_it() {
     let (forge, webots) = (forge(&["main", "slow", "one"]), reader());
     let (main, slow) = (commit(&forge, "main"), commit(&forge, "slow"));
     git(&forge.path().join("lab/arm"), &["tag", "as-slow", "slow"]);

@@ -131,7 +131,7 @@ async fn a_forge_is_asked_over_https_and_followed_nowhere_else() {
 }
 
 #[actix_rt::test]
-async fn what_the_administrator_has_set_for_git_holds_and_what_a_world_could_have_written_does_not() {
+async fn git_uses_the_administrators_settings_only() {
     let (forge, webots, home) = (Forge::new(), reader(), tempfile::tempdir().unwrap());
     forge.commit("lab/private", "main", &[("worlds/a.wbt", &world_text("private"))]);
     let https = Https::new(forge, String::new());

@@ -14,7 +14,7 @@ const TOLD: &str = "idle: 2";
 const WHY: &str = "The simulation was paused for 0.05 minutes";
 
 #[actix_rt::test]
-async fn who_stays_paused_is_told_and_keeps_its_simulation_or_loses_it() {
+async fn a_paused_simulation_ends_unless_its_client_keeps_it() {
     let server = quick(demo_server(1)).set("idleTimeout", LIMIT).start().await;
     // An old page, which sends nothing more.
     let begin = Instant::now();

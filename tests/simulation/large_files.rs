@@ -22,7 +22,7 @@ async fn a_world_whose_large_files_are_missing_opens_without_them() {
 }
 
 #[actix_rt::test]
-async fn what_a_forge_sends_as_large_files_is_bounded_whatever_the_pointers_say() {
+async fn the_size_of_large_files_is_bounded() {
     let (forge, webots) = (Forge::with_arm(), reader());
     forge.commit("lab/arm", "main", &[("meshes/a.dae", POINTER), (".gitattributes", ATTRIBUTES)]);
     // A git-lfs that loads more and more for 12345 bytes.

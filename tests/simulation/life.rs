@@ -6,11 +6,11 @@
 //! |---|---|---|
 //! | its client closes, the connection breaks or is half open | all but stopping, in which it has no client | `a_client_that_goes...` |
 //! | Webots ends, in three ways | launching, idle, running: in others there is none | `a_client_is_told_how_webots_ended` |
-//! | Webots does not end when asked | stopping | `isolation::lives::a_simulation_that_takes_no_notice_is_killed_after_its_grace_time` |
+//! | Webots does not end when asked | stopping | `isolation::lives::a_simulation_that_ignores_sigterm_is_killed` |
 //! | git is killed, or hangs | checking out | `checkout::a_kill_in_the_middle_of_a_fetch...`, `fetching::a_git_that_is_stopped...` |
 //! | the time limit | launching, idle, running, stopping: it counts from the start of Webots | `simulation_limits` (`time`) |
 //! | the limits of a checkout and of a launch | checking out, launching | `simulation_limits` (`time`), `ready::a_launch_that_never_listens...` |
-//! | SIGTERM to the server | all | `a_server_that_stops_tells_its_clients_and_leaves_nothing_in_any_state` |
+//! | SIGTERM to the server | all | `a_server_that_stops_notifies_clients_and_leaves_nothing` |
 //! | SIGKILL to the server | all | `a_server_that_is_killed_leaves_nothing_in_any_state` |
 //! | the client's actor panics | all but stopping, in which there is none | `simulation_limits` (`panics`) |
 //! | Webots' actor panics | launching, idle, running, stopping: in others there is none | `simulation_limits` (`panics`) |
@@ -31,7 +31,7 @@ pub fn quick(builder: Builder) -> Builder {
 }
 
 #[actix_rt::test]
-async fn a_client_that_goes_in_whatever_way_leaves_nothing_in_any_state() {
+async fn a_client_that_leaves_in_any_way_leaves_nothing_behind() {
     // All but the last, in which it has no client.
     for state in &ALL[..6] {
         for way in ["closes", "breaks", "is half open"] {
@@ -67,7 +67,7 @@ async fn a_client_that_goes_in_whatever_way_leaves_nothing_in_any_state() {
 }
 
 #[actix_rt::test]
-async fn a_server_that_stops_tells_its_clients_and_leaves_nothing_in_any_state() {
+async fn a_server_that_stops_notifies_clients_and_leaves_nothing() {
     for state in ALL {
         let mut scene = Scene::new(state, |builder| quick(builder).set("timing.grace", 2.0)).await;
         let asked = Instant::now();

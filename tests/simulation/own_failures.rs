@@ -23,7 +23,7 @@ async fn broken(places: u16) -> (Server, tempfile::TempDir, PathBuf) {
 }
 
 #[actix_rt::test]
-async fn a_client_whose_start_fails_for_the_servers_reason_is_sent_elsewhere_and_the_server_tells_so() {
+async fn a_start_that_fails_because_of_the_server_is_sent_elsewhere() {
     let (server, _folder, repaired) = broken(2).await;
     for count in 1..=3 {
         let mut client = Client::start(&server, &arm()).await;

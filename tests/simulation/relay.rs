@@ -116,7 +116,7 @@ where
 }
 
 #[actix_rt::test]
-async fn a_simulation_is_steered_and_its_files_are_had_through_the_server_alone() {
+async fn a_simulation_and_its_files_are_reached_through_the_server() {
     needs!("bwrap");
     for level in ["none", "sandbox"] {
         let server = relay(|builder| builder.set("isolation", level)).await;
@@ -181,7 +181,7 @@ async fn all_frames_and_close_codes_pass_in_both_directions() {
 }
 
 #[actix_rt::test]
-async fn a_viewer_that_does_not_read_holds_up_nobody_and_fills_no_memory() {
+async fn a_viewer_that_does_not_read_costs_nothing() {
     let played = Played::new(|builder| builder.set("timing.silence", 3600)).await;
     let (_client, path) = start(&played.server).await;
     let memory = || {
@@ -341,7 +341,7 @@ async fn a_webots_that_does_not_answer_costs_its_client_an_error() {
 }
 
 #[actix_rt::test]
-async fn the_token_stays_for_who_comes_back_and_dies_with_the_simulation() {
+async fn a_token_is_valid_as_long_as_its_simulation() {
     let server = relay(|builder| builder.set("adminPassword", PASSWORD)).await;
     let (mut client, path) = start(&server).await;
     let resume = client.token().await;

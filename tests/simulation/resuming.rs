@@ -97,7 +97,7 @@ async fn a_token_works_once_and_its_client_alone_is_told_it() {
 }
 
 #[actix_rt::test]
-async fn only_who_closes_with_1000_or_has_not_asked_for_more_ends_its_simulation_at_once() {
+async fn only_a_close_with_1000_ends_a_resumable_simulation_at_once() {
     let server = quick(demo_server(2)).start().await;
     for code in [1001, 3000, 1000] {
         let (client, token) = Client::resumable(&server).await;
@@ -124,7 +124,7 @@ async fn only_who_closes_with_1000_or_has_not_asked_for_more_ends_its_simulation
 }
 
 #[actix_rt::test]
-async fn a_client_behind_a_link_that_stalls_comes_back_another_way_or_is_given_up() {
+async fn a_client_behind_a_stalled_link_resumes_or_is_given_up() {
     let change =
         |builder: Builder| builder.set("timing.ping", 0.2).set("timing.silence", 3.0).set("timing.absence", 1.5);
     let server = change(quick(demo_server(1))).start().await;
@@ -211,7 +211,7 @@ async fn a_server_that_stops_leaves_nothing_of_who_is_away() {
 }
 
 #[actix_rt::test]
-async fn who_comes_back_counts_for_the_address_that_has_asked_and_keeps_to_allowed_origins() {
+async fn who_resumes_counts_for_the_first_address() {
     let change = |builder: Builder| {
         let builder = builder.set("trustedProxies", json!(["127.0.0.1"])).set("maxPlacesPerAddress", 1);
         builder.set("allowedOrigins", json!(["https://fleet.example.org"]))
@@ -233,7 +233,7 @@ async fn who_comes_back_counts_for_the_address_that_has_asked_and_keeps_to_allow
 }
 
 #[actix_rt::test]
-async fn a_class_that_vanishes_at_once_comes_back_to_the_same_simulations() {
+async fn a_whole_class_resumes_its_simulations() {
     const CLASS: usize = 50;
     let change = |builder: Builder| builder.set("timing.launch", 60).set("timing.heartbeat", 2);
     let server = change(quick(demo_server(2 * u16::try_from(CLASS).unwrap()))).start().await;

@@ -11,7 +11,7 @@ use crate::support::listener::{Request, listen};
 use crate::support::{Builder, Client, SOON, arm, demo_server, http, until};
 
 #[actix_rt::test]
-async fn a_server_that_drains_keeps_its_clients_takes_no_others_and_ends_with_the_last() {
+async fn a_draining_server_ends_with_its_last_client() {
     // As engines give passwords.
     let secret = tempfile::NamedTempFile::new().unwrap();
     std::fs::write(secret.path(), "secret\n").unwrap();

@@ -24,7 +24,7 @@ async fn stop(server: &Server, id: &str, body: &str) -> u16 {
 }
 
 #[actix_rt::test]
-async fn a_simulation_is_stopped_in_any_state_and_its_client_hears_why() {
+async fn a_simulation_is_stopped_in_any_state() {
     for state in &ALL[1..6] {
         let mut scene = Scene::new(state, with_password).await;
         let (server, client) = (&scene.server, scene.client.as_mut().unwrap());
@@ -49,7 +49,7 @@ async fn a_simulation_is_stopped_in_any_state_and_its_client_hears_why() {
 }
 
 #[actix_rt::test]
-async fn only_the_password_stops_a_simulation_and_no_page_of_another_site_does() {
+async fn only_the_password_stops_a_simulation() {
     let server = with_password(demo_server(2)).start().await;
     let mut client = Client::ready(&server).await;
     let url = path(&server, client.id());
@@ -123,7 +123,7 @@ async fn a_body_belongs_to_its_request_and_holds_up_nobody() {
 }
 
 #[actix_rt::test]
-async fn a_stop_ends_no_simulation_that_has_come_in_the_place_of_another() {
+async fn a_stop_never_ends_the_next_simulation_of_a_slot() {
     let folder = tempfile::tempdir().unwrap();
     let builder = || with_password(demo_server(1)).folder(folder.path());
     let server = builder().start().await;

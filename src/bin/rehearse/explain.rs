@@ -293,7 +293,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn updates_are_measured_from_the_first_one_on_however_late_that_comes() {
+    fn updates_are_measured_from_the_first_one() {
         let began = Instant::now();
         let late =
             (400_u32..=3000).step_by(40).map(|ms| (began + Duration::from_millis(ms.into()), f64::from(ms - 400)));

@@ -192,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn what_belongs_together_is_one_mail_and_a_server_has_one_in_ten_minutes() {
+    fn notices_are_gathered_into_one_mail() {
         let one = |second, event| (second, vec![(1, event)]);
         for (notices, mails) in [
             // Servers that fail together.

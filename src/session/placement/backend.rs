@@ -306,7 +306,7 @@ mod tests {
     }
 
     #[test]
-    fn a_load_alone_shows_a_placement_after_a_while_and_teaches_no_cost() {
+    fn a_load_alone_teaches_no_cost() {
         let mut server = Server::new(10.0, None);
         server.place(0.0);
         for (after, expected) in [(0.0, 12.0), (4.0, 11.0), (8.0, 10.0)] {

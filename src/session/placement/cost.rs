@@ -299,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn load_of_other_programs_that_comes_and_goes_is_not_that_of_clients() {
+    fn load_of_other_programs_is_not_that_of_clients() {
         // Clients cost 2 %. Other programs take 40 % for two thirds of the time, also without clients.
         let mut reports = vec![(60, 3.0, 0), (30, 43.0, 0)];
         for present in [2, 5, 8, 5, 8, 3] {

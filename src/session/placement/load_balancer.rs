@@ -221,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn placements_without_room_close_no_server_and_are_spread_like_others() {
+    fn placements_without_room_close_no_server() {
         let now = Instant::now();
         for report in [|load| full_report(load, 0, 0), load_only] {
             let mut fleet = fleet(2.0, now, [10.0, 20.0, 30.0].map(report));
@@ -262,7 +262,7 @@ mod tests {
     }
 
     #[test]
-    fn session_servers_side_by_side_do_not_each_fill_the_fleet_alone() {
+    fn several_session_servers_share_the_fleet() {
         let now = Instant::now();
         let report = |clients: u32| report(1.0, Some(instances(clients, 500, clients.into())));
         let mut beside = [(); 2].map(|()| fleet(0.25, now, [report(0)]));
@@ -279,7 +279,7 @@ mod tests {
     }
 
     #[test]
-    fn a_session_server_that_is_alone_now_fills_the_fleet_all_the_same() {
+    fn a_session_server_that_is_alone_now_fills_the_fleet() {
         let now = Instant::now();
         let report = |arrivals| report(1.0, Some(instances(0, 20, arrivals)));
         let mut fleet = fleet(0.25, now, [report(0)]);

@@ -113,7 +113,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_pages_of_the_same_site_and_other_programs_change_something() {
+    fn only_pages_of_the_same_site_change_something() {
         let request = || TestRequest::post().insert_header((header::HOST, "lab.org:2000"));
         assert!(!is_cross_site(&request().to_http_request()));
         for (origin, is_other) in [

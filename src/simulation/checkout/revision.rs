@@ -137,7 +137,7 @@ mod tests {
     }
 
     #[test]
-    fn a_branch_with_slashes_is_found_and_preferred_to_a_shorter_tag() {
+    fn a_branch_with_slashes_is_preferred_to_a_shorter_tag() {
         let url = world("blob/feature/arm/lab/worlds/a.wbt");
         let answer =
             format!("{A}\trefs/tags/feature\n{B}\trefs/heads/feature/arm\n{B}\trefs/heads/x/refs/heads/feature\n");

@@ -256,7 +256,7 @@ mod tests {
     use crate::simulation::config::ContainerSettings;
 
     #[test]
-    fn a_container_gets_the_gpu_that_was_chosen_and_its_display_or_all_gpus() {
+    fn a_container_gets_the_chosen_gpu_and_its_display() {
         let keys = json!({ "isolation": "container", "gpus": "spread", "displays": [":0.0", ":0.1"], "display": ":7" });
         let mut config: SimulationConfig = serde_json::from_value(keys).unwrap();
         config.container = ContainerSettings { display: ContainerDisplay::Machine, ..ContainerSettings::default() };

@@ -263,7 +263,7 @@ mod tests {
     }
 
     #[test]
-    fn what_docker_answers_about_a_projects_image_is_the_projects_fault() {
+    fn a_failure_of_a_projects_image_is_the_projects_fault() {
         let failed =
             |message: &str| DockerError::Failed { command: "docker cp".to_owned(), message: message.to_owned() };
         let is_own = |error| matches!(blame(true, error), StartError::Server(_));

@@ -248,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn an_image_that_is_not_there_is_told_in_words_and_only_where_a_stage_begins() {
+    fn a_missing_image_is_reported_only_where_a_stage_begins() {
         let told =
             not_built("Step 1/4 : FROM cyberbotics/webots.cloud:R1-ubuntu22.04 AS a", failed("manifest unknown"));
         let told = told.to_string();
@@ -266,7 +266,7 @@ mod tests {
     }
 
     #[test]
-    fn a_registry_that_does_not_answer_is_the_fault_of_who_has_named_it() {
+    fn a_failing_registry_is_blamed_on_whoever_named_it() {
         let limited = || failed("toomanyrequests: You have reached your pull rate limit");
         assert!(matches!(not_pulled("a", limited()), StartError::Server(_)));
         assert!(matches!(not_built("Step 1/4 : FROM a", limited()), StartError::Project(_)));

@@ -166,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn the_load_is_the_mean_of_five_seconds_and_the_history_is_ten_minutes_long() {
+    fn the_load_is_a_mean_and_the_history_ten_minutes_long() {
         let (monitor, readings) = monitor(Spread::default());
         let load = || readings.borrow().load.map(Load::percent);
         assert_eq!(load(), None);
