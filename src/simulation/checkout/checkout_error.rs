@@ -26,7 +26,7 @@ pub enum Cause {
     NoCommit,
     /// The remote redirects to another URL.
     Moved,
-    /// The fetch or the answer exceeds its size limit. In a fetch, the kernel has killed the process that writes the pack.
+    /// The pack or the answer exceeds its size limit. In a fetch, the kernel has killed the process that writes it.
     TooLarge,
     /// This timeout was exceeded.
     Slow(Duration),

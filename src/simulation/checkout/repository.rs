@@ -56,7 +56,7 @@ impl Repository {
         self.configured(&[url], arguments)
     }
 
-    /// A git command on this repository with only these settings, each as `name=value`. It can't fetch: it has no URL.
+    /// A git command on this repository with only these settings, each as `name=value`, and without the remote's URL.
     pub fn configured(&self, settings: &[String], arguments: &[impl AsRef<OsStr>]) -> Run {
         self.git.command((&self.path, self.remote.lock().protocol), settings, arguments)
     }

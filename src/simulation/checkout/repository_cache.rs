@@ -1,4 +1,4 @@
-//! The directory `cacheDir`, and the cached repositories in it: `git/NAME` is a bare repository; its mtime is its last use.
+//! The directory `cacheDir` and the cached repositories in it: `git/NAME` is bare, and its mtime is its last use.
 //!
 //! Above `cacheSize`, repositories not in use are evicted, least recently used first.
 

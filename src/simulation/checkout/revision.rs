@@ -83,7 +83,7 @@ pub fn found(world: &ProjectUrl, answer: &str) -> Vec<Revision> {
 }
 
 impl Revision {
-    /// Its reference in the cached repository. A commit that was fetched under `anyCommit` has a separate one, so that it
+    /// Its reference in the cached repository. A commit that only `anyCommit` allows has a separate one, so that it
     /// does not run once that key is off.
     pub fn reference(&self) -> String {
         let kind = if self.trust == TrustSource::AnyCommit { "any" } else { "fleet" };
