@@ -61,7 +61,7 @@ fn display(config: &SimulationConfig) -> Result<String, String> {
     Ok(format!("an X server answers at {}", displays.join(", ")))
 }
 
-/// Whether anybody can bypass the relay and reach the ports of simulations.
+/// Whether others can bypass the relay and reach the ports of simulations.
 fn streams(config: &SimulationConfig) -> Result<String, String> {
     let (first, last) = config.streaming_ports().into_inner();
     match packet_filter::closes_streams() {

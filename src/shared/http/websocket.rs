@@ -120,8 +120,8 @@ pub fn refuse(error: &HandshakeError) -> HttpResponse {
     HttpResponse::build(error.error_response().status()).body(format!("Error: this is a WebSocket: {error}."))
 }
 
-/// Upgrades a request to a WebSocket that the given actor serves, or answers with the error. The actor
-/// receives complete messages, including invalid ones ([`wrong_message`]).
+/// Upgrades a request to a WebSocket that the given actor serves, or answers with the error. The actor receives
+/// complete messages, including invalid ones ([`wrong_message`]).
 pub fn open<A>(request: &HttpRequest, payload: Payload, actor: A) -> HttpResponse
 where
     A: Actor<Context = WebsocketContext<A>> + StreamHandler<Result<Message, ProtocolError>>,

@@ -23,8 +23,8 @@ pub async fn stopped<A: Actor>(name: &str, actor: Addr<A>) -> String {
     format!("the actor {name} is gone")
 }
 
-/// Runs a task, and restarts it after each panic. More than [`MAX_PANICS`] within a minute end the server
-/// with exit code 1, so that its service manager restarts it.
+/// Runs a task, and restarts it after each panic. More than [`MAX_PANICS`] within a minute end the server with
+/// exit code 1, so that its service manager restarts it.
 pub async fn restarted(name: &str, mut task: impl AsyncFnMut()) {
     let (mut since, mut panics) = (Instant::now(), 0);
     while AssertUnwindSafe(task()).catch_unwind().await.is_err() {

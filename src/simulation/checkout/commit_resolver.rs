@@ -134,10 +134,10 @@ impl CommitResolver {
         Ok(search.read(revision, path).await?.map(|_| repository))
     }
 
-    /// Discards the cached repositories of a world, which are corrupt.
+    /// Discards the cached repositories of a world, one of which is corrupt.
     ///
     /// # Errors
-    /// When it can't be removed.
+    /// When one can't be removed.
     pub async fn discard(&self, world: &ProjectUrl, failure: &CheckoutError) -> Result<(), CheckoutError> {
         log::warn!("{world}: {failure}. The cached repository is broken: it is fetched anew");
         for content in [COMMITS, HISTORY] {

@@ -197,7 +197,7 @@ fn result(command: String, ran: Result<Ran, RunError>, reason: String) -> Result
     }
 }
 
-/// The cause if Docker fails with the containers of a simulation. `is_projects` tells whether the project has defined
+/// The cause if Docker fails with the containers of a simulation. `is_projects`: whether the project has defined
 /// one of their images: then the project is the cause, unless the disk is full.
 pub fn blame(is_projects: bool, error: DockerError) -> StartError {
     match &error {

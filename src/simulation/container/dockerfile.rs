@@ -16,8 +16,8 @@ pub struct Dockerfile {
 /// The label of everything that this server has built, also of leftovers of failed builds.
 pub const LABEL: &str = "webots-fleet.owner";
 /// The last instruction: lets the server's user read the home of the image's own user, such as the assets and settings
-/// of Webots in `/root`. It changes only the modes that it must, because each changed file is copied into a layer of the
-/// image. It fails only for root, because other users can't change the modes of all files.
+/// of Webots in `/root`. It changes only the modes that it must, because each changed file is copied into a layer. It
+/// fails only for root, because other users can't change the modes of all files.
 const OPEN_HOME: &str = concat!(
     r#"RUN ["/bin/sh","-c","[ ! -d \"$HOME\" ] || [ \"$HOME\" = / ] || find \"$HOME\" -xdev "#,
     r#"\\( -type d ! -perm -5 -o -type f ! -perm -4 \\) -exec chmod a+rX {} + || [ $(id -u) != 0 ]"]"#,

@@ -10,7 +10,7 @@ use crate::simulation::machine::Usages;
 /// Blocks for two seconds, which `docker stats` takes.
 pub fn measure(owner: &ResourceOwner, roots: &BTreeMap<u16, i32>) -> Usages {
     let format = "{{.Name}}\t{{.CPUPerc}}\t{{.MemUsage}}";
-    // Without names: if a named container has ended meanwhile, the whole command fails.
+    // Without names of containers: the whole command would fail if one of them had just ended.
     let printed = blocking(&["stats", "--no-stream", "--format", format], SHORT_TIMEOUT);
     let mut all = Usages::new();
     for (name, cpu, memory) in printed.unwrap_or_default().lines().filter_map(columns) {
