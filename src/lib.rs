@@ -1,7 +1,7 @@
 //! A fleet for interactive robot simulations in the browser: a session server and simulation servers.
 //!
-//! They replace two Python servers; comments call those *the original*. This page is the map. Each directory is a module:
-//! its `mod.rs` says what belongs there and re-exports its public API.
+//! They replace two Python servers, which comments call *the original*. This page is the map. Each directory is a
+//! module: its `mod.rs` says what belongs there and re-exports its public API.
 //!
 //! | module | contents |
 //! |---|---|
@@ -11,10 +11,10 @@
 //! | [`shared::run`] | start, readiness, log, stop |
 //! | [`shared::http`] | pages, live updates, WebSockets, limits, certificates, metrics |
 //! | [`session::placement`] | which server gets the next client: the load of a server and the key that servers are sorted by (`backend`), the choice of the first (`load_balancer`), cost |
-//! | [`session::mail`] | notices: to whom (`smtp`, one address, from the key `administrator` in `config/session_config`) and how (`channel`), what is in them (`notice_text`), when they go (`outbox`) |
+//! | [`session::mail`] | notices: to whom (`smtp`, one address, from the key `administrator` in `config/session_config`) and how (`channel`), what is in them (`notice_text`), when they are sent (`outbox`) |
 //! | [`session::fleet`] | the registry and the monitors of simulation servers |
 //! | [`session::web`] | routes, pages, `/status`, Prometheus metrics (gauges in `metrics`, counters in `app`) and the WebSocket of the session server |
-//! | [`simulation::process`] | process trees: how they start and end (`process_group`; what a server that has died left: `process_tree`, `guardian`); directories of simulations |
+//! | [`simulation::process`] | process trees: how they start and end (`process_group`; leftovers of a dead server: `process_tree`, `guardian`); directories of simulations |
 //! | [`simulation::machine`] | readings of the machine (`sensors`) and its GPUs (`gpus`), the load and `monitor.csv` (`load_monitor`); which GPU a simulation gets (`spread`) |
 //! | [`simulation::checkout`] | worlds checked out with git; `timing.checkout` limits a whole checkout (`checkout_service`) and a stalled fetch (`git`), `projectSize` its size; `config/mirrors` has the address of each Git host |
 //! | `simulation::isolation` | how a simulation is launched: its level of isolation (`launcher`), the variables that it inherits, limits; the control group that ends with it (`cgroup`) |
@@ -23,21 +23,22 @@
 //! | [`simulation::webots`] | one running Webots: its command line and GPU (`launch_spec`), its log (path and size in `launched`, its lines in `output`), its end (`launched`) |
 //! | [`simulation::client`] | a client's WebSocket (`web_client`), the session of its simulation, which sends it nearly all messages (`session`; `start`: before Webots runs, with the choice of the GPU) |
 //! | [`simulation::sessions`] | how a connection is attached to its session, and how a client resumes it |
-//! | [`simulation::slots`] | the slots that clients wait for: leases, the queue and the shares of addresses and users (`slot_pool`), the streams of simulations and the tokens that lead to them (`stream`) |
+//! | [`simulation::slots`] | the slots that clients wait for: leases, the queue and the shares of addresses and users (`slot_pool`), the streams of simulations and the tokens that identify them (`stream`) |
 //! | `simulation::relay` | a stream between a client and the port of its Webots |
 //! | `simulation::web` | routes, pages, `/status` and Prometheus metrics of the simulation server (gauges in `metrics`, counters in `app` and `ends`) |
 //!
 //! The HTML of pages is in `templates/session` and `templates/simulation` (`monitor.html`: the head of
 //! the monitor's table, `row.html`: a row), their styles (`style.css`) and scripts in `templates/assets`.
 //!
-//! Each server also has a folder `config` (every key; time limits in `timing`), its `app` (start and end) and its `state`
-//! (what its paths share). Files of `simulation` are the [`protocol`](simulation::protocol), which words all
-//! messages to clients (but the reason in an error, which its cause words), the `snapshot` of all
-//! simulations, the `simulation_id`, the `client_identity`, the `announcer` (key `notify`), `preflight` (`--check`) and `readiness` (`/health`).
+//! Each server also has a directory `config` (every key; time limits in `timing`), its `app` (start and end) and its
+//! `state` (what its routes share). Files of `simulation` are the [`protocol`](simulation::protocol) with the texts of
+//! all messages to clients (except the reason in an error, which its cause defines), the `snapshot` of all simulations,
+//! the `simulation_id`, the `client_identity`, the `announcer` (key `notify`), `preflight` (`--check`) and `readiness`
+//! (`/health`).
 //! The programs are in `src/bin`.
-//! Imports point down only, in the order that `tests/project/layering.rs` lists. `session` and `simulation` never see each
-//! other. A child never names its parent. The parent gives it a `Recipient` for the child's events, which the child's file
-//! defines.
+//! Modules import only from layers below them, in the order that `tests/project/layering.rs` lists. `session` and
+//! `simulation` never see each other. A child never names its parent. The parent gives it a `Recipient` for the child's
+//! events, which the child's file defines.
 //!
 //! # Who talks to whom
 //!
@@ -70,21 +71,21 @@
 //! guards. Dropping it frees all three, whatever its state, even after a panic. When the simulation server exits, for
 //! whatever reason, its [`simulation::process::guardian`] process ends everything that the server has started.
 //! One `simulation::isolation::Watcher` enforces what the kernel does not: how much simulations write. One thread copies
-//! all streams that are relayed, but those of watchers; the server exits if it panics.
+//! all relayed streams except those of watchers; the server exits if that thread panics.
 //!
 //! # What ends, and what restarts
 //!
 //! | actor or task | ends by itself | after a panic |
 //! |---|---|---|
 //! | Registry, `LoadMonitor` | never | the server logs it and exits with code 1: the service manager restarts it |
-//! | monitor | when its server is removed from the configuration, or no name resolves to that server any more | it begins again |
-//! | mailer | never | it begins again; the notices that it held are lost |
+//! | monitor | when its server is removed from the configuration, or no name resolves to that server any more | it is restarted |
+//! | mailer | never | it is restarted; the notices that it held are lost |
 //! | `WebClient` | with its connection | its connection closes, and its session is notified |
 //! | `Session` | with its simulation, or its client | its lease is released, and its client is notified |
 //! | Webots | with its process tree; it is never restarted, its client is notified | its process tree is killed at once, its directory removed, its slot released |
 //!
-//! The `SlotPool` is no actor: a mutex guards it. Tasks begin again by [`shared::run::permanent::restarted`]; after more than
-//! five panics of one within a minute the server exits with code 1.
+//! The `SlotPool` is not an actor: a mutex guards it. [`shared::run::permanent::restarted`] restarts the tasks; after
+//! more than five panics of one task within a minute the server exits with code 1.
 //!
 //! # Facts about actix 0.13 that this relies on
 //!

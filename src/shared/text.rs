@@ -4,7 +4,7 @@ use icu_properties::props::{BinaryProperty, DefaultIgnorableCodePoint};
 
 /// Returns a text without line breaks, terminal control sequences, direction marks and invisible characters.
 ///
-/// Control characters become spaces. Invisible characters, including those for the direction, become U+FFFD.
+/// Control characters become spaces. Invisible characters, including direction marks, become U+FFFD.
 pub fn one_line(text: &str) -> String {
     let visible = |letter: char| match letter {
         // The fast path: most characters need no lookup in Unicode's tables.

@@ -1,5 +1,5 @@
-//! Announces this server to other services at start: posts the form of the original to each address in `notify`, up to
-//! six times. Nothing waits for it.
+//! Announces this server to other services at start: posts the form of the original to each address in `notify`, in the
+//! background and up to six times.
 
 use std::time::Duration;
 
@@ -15,7 +15,7 @@ const ANSWER: Duration = Duration::from_secs(10);
 
 /// Size limit of an answer, in bytes.
 const MAX_ANSWER_SIZE: usize = 64 * 1024;
-/// How much of it is logged, in characters.
+/// Longest excerpt of an answer in the log, in characters.
 const SHOWN: usize = 200;
 
 /// Starts the announcements of a server.
@@ -41,7 +41,7 @@ async fn announce(address: String, form: Vec<(&'static str, String)>, pause: Dur
         let problem = match client.post(&address).send_form(&form).await {
             Ok(mut answer) if answer.status().is_success() => {
                 let body = answer.body().limit(MAX_ANSWER_SIZE).await.unwrap_or_default();
-                // Some refuse with status 200 and words.
+                // Some services refuse with status 200 and a text.
                 log::info!(
                     "announced to {address}, which answered {:?}",
                     excerpt(&String::from_utf8_lossy(&body), SHOWN)

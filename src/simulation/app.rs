@@ -61,12 +61,12 @@ impl Application {
     }
 }
 
-/// Raises the limit of open files, and returns the number of clients that it allows. `maxClients` may be lowered,
-/// because each client has connections for pages besides its WebSocket.
+/// Raises the limit of open files. Returns the number of clients that it allows, at most `maxClients`: each client has
+/// connections for pages and streams besides its WebSocket.
 fn bound_clients(config: &SimulationConfig) -> Result<usize, String> {
     let places = config.max_connections;
     let needed = OWN_FILES + FILES_PER_SIMULATION * usize::from(places);
-    // What is relayed has a connection on either side.
+    // Each relayed stream or file has two connections: to its client and to Webots.
     let each = TCP_PER_CLIENT + 2 * streams_per_client(config);
     let wanted = config.max_clients.saturating_mul(each).saturating_add(needed);
     let files = raise_open_files(u64::try_from(wanted).unwrap_or(u64::MAX));
@@ -77,7 +77,7 @@ fn bound_clients(config: &SimulationConfig) -> Result<usize, String> {
 /// Runs a server until a signal or an administrator stops it.
 ///
 /// # Errors
-/// When an actor that must live has stopped, or the system refuses what the server needs.
+/// When the `LoadMonitor` has stopped, or the system refuses what the server needs.
 pub async fn serve(assembly: Application) -> Result<(), AppError> {
     let Application { server, socket, mut signals } = assembly;
     let owner = server.containers.as_ref().map(|containers| containers.run.0.as_str());
@@ -103,7 +103,7 @@ pub async fn serve(assembly: Application) -> Result<(), AppError> {
     start::announce("simulation server", &config.http_url(), &format!("{}/client", config.websocket_url(port)), port);
     let slots = Arc::clone(&server.slots);
     actix_rt::spawn(Arc::clone(&slots).recheck());
-    // It is answered unless this thread is blocked, or another one keeps the slots.
+    // This runs unless this thread is blocked, or another one holds the lock of the slots.
     actix_rt::spawn(service_manager::feed_watchdog(async move || slots.instances().places > 0));
     let why = tokio::select! {
         why = handle_signals(&mut signals, &server) => why,
@@ -204,7 +204,7 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
         connections: ConnectionLimiter::new(max_tcp(&config), config.max_clients, config.max_clients_per_address),
         metrics,
         starts,
-        // Each start costs a checkout and a Webots. A class that takes all slots, and then reloads its pages, stays within it.
+        // Each start costs a checkout and a Webots. The quota lets a class take all slots, and then reload its pages.
         start_quota: AddressQuota::new(200.max(2 * u32::from(config.max_connections)), 60),
         live: LiveUpdates::default(),
         administrators: LiveUpdates::default(),

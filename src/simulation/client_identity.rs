@@ -19,7 +19,7 @@ const MAX_USER_LENGTH: usize = 200;
 const MAX_LABEL_LENGTH: usize = 60;
 
 impl ClientIdentity {
-    /// Cuts the names to their longest length, in one line; an empty name becomes `None`.
+    /// Truncates the names, each as one line; an empty name becomes `None`.
     pub fn new(user: Option<&str>, label: Option<&str>) -> Self {
         let cut = |text: &str, most| one_line(text).trim().chars().take(most).collect::<String>();
         let cut = |text: Option<&str>, most| text.map(|text| cut(text, most)).filter(|text| !text.is_empty());

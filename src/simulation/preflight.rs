@@ -30,7 +30,7 @@ pub fn check(config: &SimulationConfig) -> Vec<String> {
     findings.into_iter().map(line).collect()
 }
 
-/// The findings on what worlds' programs may do.
+/// The findings on what worlds' programs can access.
 fn isolation(config: &SimulationConfig, launcher: &Launcher) -> Vec<(&'static str, Result<String, String>)> {
     let mut findings = vec![match &launcher.shortcoming {
         Some(why) => ("isolation", Err(format!("none, worlds' programs may do whatever this user may: {why}"))),
@@ -61,7 +61,7 @@ fn display(config: &SimulationConfig) -> Result<String, String> {
     Ok(format!("an X server answers at {}", displays.join(", ")))
 }
 
-/// Whether others reach the ports of simulations past the relay.
+/// Whether others can bypass the relay and reach the ports of simulations.
 fn streams(config: &SimulationConfig) -> Result<String, String> {
     let (first, last) = config.streaming_ports().into_inner();
     match packet_filter::closes_streams() {

@@ -2,9 +2,9 @@
 //!
 //! | from the client (JSON) | |
 //! |---|---|
-//! | `{"start": {"url": WORLD, "mode": "x3d" \| "w3d" \| "mjpeg", "resumable": true, "name": NAME}}` | start a simulation; to a resumable one its client can come back; who the client calls itself |
-//! | `{"resume": TOKEN}` | come back to a simulation |
-//! | `{"keep": true}` | do not end a simulation because it is paused; that time begins again |
+//! | `{"start": {"url": WORLD, "mode": "x3d" \| "w3d" \| "mjpeg", "resumable": true, "name": NAME}}` | start a simulation; `resumable`: its client may resume it; `name`: what the client calls itself |
+//! | `{"resume": TOKEN}` | resume a simulation |
+//! | `{"keep": true}` | keep a paused simulation: its idle timeout begins again |
 //! | `{"reset controller": "NAME/FILE"}` | restore a file below `controllers/` |
 //! | any other JSON | ignored, as the Python server does: old pages send it |
 //!
@@ -15,18 +15,18 @@
 //! | `ide: enable` | the project has an editor, on Webots' port + 500 |
 //! | `type:TYPE` | the project's type in its `webots.yml` |
 //! | `loading: TEXT` | progress |
-//! | `loading: Error: TEXT` | why the simulation failed; the connection is closed after it |
-//! | `shutdownTimeout: SECONDS` | the process was launched, and will be ended after this many seconds |
+//! | `loading: Error: TEXT` | why the simulation failed; the connection is closed, except after `reset controller` |
+//! | `shutdownTimeout: SECONDS` | Webots was launched, and will be ended after this many seconds |
 //! | `webots:URL` | Webots is ready there |
 //! | `absence: SECONDS` | how long the simulation waits for its client once the connection is broken |
-//! | `resume: TOKEN` | what to come back with |
-//! | `idle: SECONDS`, `idle: never` | when the simulation ends unless it runs or is kept; that it does not any more |
+//! | `resume: TOKEN` | the token to resume the simulation with |
+//! | `idle: SECONDS`, `idle: never` | when the paused simulation ends unless it runs or is kept; `never`: it no longer will |
 //! | `.` | Webots is alive |
 //! | `watched: 1` or `watched: 0` | an administrator watches the simulation from now on, or no longer |
-//! | `reset controller: NAME/FILE` | done |
+//! | `reset controller: NAME/FILE` | the file was restored |
 //!
-//! Webots' page inserts every TEXT into `innerHTML`: it passes through [`client_text`] and [`without_paths`] here, and
-//! nowhere else.
+//! Webots' page inserts every TEXT into `innerHTML`, so it passes through [`client_text`] and [`without_paths`] here,
+//! and nowhere else.
 
 use serde::{Deserialize, Deserializer};
 use serde_json::Value;
@@ -34,7 +34,7 @@ use serde_json::Value;
 use crate::shared::text::{client_text, without_paths};
 use crate::simulation::sessions::Token;
 
-/// The requests of a client, of which the first one counts; unknown fields are ignored.
+/// The requests in a message, of which only one takes effect; unknown fields are ignored.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Deserialize)]
 #[serde(default)]
 pub struct ClientRequest {
@@ -44,7 +44,7 @@ pub struct ClientRequest {
     /// Resume the simulation of this token.
     #[serde(deserialize_with = "value")]
     pub resume: Option<String>,
-    /// Keep a simulation that is to end because it is paused.
+    /// Restart the idle timeout of a paused simulation.
     pub keep: bool,
     /// Start a simulation.
     #[serde(deserialize_with = "value")]
@@ -85,7 +85,7 @@ pub enum Mode {
 )]
 pub struct ClientRequestError(String);
 
-/// Reads a field that is there: `null` is no request, and the client would wait for an answer.
+/// Reads a field that is present. `null` is an error: if it were ignored, the client would wait for an answer.
 fn value<'de, D: Deserializer<'de>, T: Deserialize<'de>>(field: D) -> Result<Option<T>, D::Error> {
     T::deserialize(field).map(Some)
 }
@@ -107,7 +107,7 @@ impl ClientRequest {
 /// The heartbeat of Webots.
 pub const HEARTBEAT: &str = ".";
 
-/// A text that a project requests: `ide: enable`, or its type, which ends its line as in the original.
+/// A text that a project requests: `ide: enable`, or its type, which keeps its line end as in the original.
 pub fn of_project(text: &str) -> String {
     let end = if text.ends_with('\n') { "\n" } else { "" };
     client_text(text.trim_end()) + end
@@ -139,7 +139,7 @@ pub fn elsewhere(why: &str) -> String {
     error(&format!("{why}. Connect again: the session server chooses another simulation server"))
 }
 
-/// Why an administrator has stopped a simulation, without what makes it an error.
+/// Why an administrator has stopped a simulation, without the prefix of an error.
 pub fn stopped_by_teacher(reason: &str) -> String {
     let words = "Your teacher has stopped this simulation";
     if reason.is_empty() { words.to_owned() } else { format!("{words}: {reason}") }
@@ -175,17 +175,17 @@ pub fn watched(is_watched: bool) -> String {
     format!("watched: {}", u8::from(is_watched))
 }
 
-/// What its client can come back with.
+/// The token with which the client can resume the simulation.
 pub fn resume(token: &Token) -> String {
     format!("resume: {}", token.reveal())
 }
 
-/// After how many seconds the simulation ends because it is paused, or that it does not any more.
+/// Seconds until the simulation ends because it is paused; `None`: it no longer will.
 pub fn idle(seconds: Option<u64>) -> String {
     seconds.map_or("idle: never".to_owned(), |seconds| format!("idle: {seconds}"))
 }
 
-/// Why a client can't come back to a simulation, with the reason for its end if it is known.
+/// Why a client can't resume a simulation, with the reason for its end if it is known.
 pub fn ended(why: Option<&str>) -> String {
     error(&why.map_or("this simulation has ended".to_owned(), |why| format!("this simulation has ended: {why}")))
 }

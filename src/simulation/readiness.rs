@@ -19,14 +19,14 @@ use crate::simulation::process::DiskRoom;
 const PERIOD: Duration = Duration::from_secs(5);
 /// Interval while the server is not ready.
 const PERIOD_WHILE_NOT_READY: Duration = Duration::from_secs(1);
-/// Timeout of a check: a disk that does not answer blocks its writers. The next check starts only after the last one has
+/// Timeout of a check: a disk that does not answer blocks its writers. The next check starts only after this one has
 /// ended.
 const HUNG: Duration = Duration::from_mins(1);
 /// Bytes that each check writes to the disk. An empty file can be created on a full disk.
 const WRITTEN: usize = 1 << 20;
 
-/// Number of consecutive starts that failed for a reason of this server's own. A start that failed for its world's or
-/// its client's reason does not change it. Session servers prefer servers without.
+/// Number of consecutive failed starts of which this server is the cause. A start that failed because of its world or
+/// its client does not change it. Session servers prefer servers without failed starts.
 #[derive(Debug, Default)]
 pub struct FailedStarts(AtomicU32);
 
@@ -42,7 +42,7 @@ impl FailedStarts {
         self.0.store(0, Ordering::Relaxed);
     }
 
-    /// The number in a row.
+    /// Returns the count.
     pub fn count(&self) -> u32 {
         self.0.load(Ordering::Relaxed)
     }
@@ -57,7 +57,7 @@ pub fn watch(
     readings: watch::Receiver<Arc<Readings>>,
     failed_starts: Arc<FailedStarts>,
 ) -> watch::Receiver<Option<String>> {
-    // The first check comes before the first client; GPUs are not read yet.
+    // The first check runs before the first client; GPUs are not read yet.
     let first = check(&config, &run, None).err();
     let (sender, problem) = watch::channel(None);
     publish(&sender, first, &failed_starts);
@@ -99,7 +99,7 @@ fn publish(sender: &watch::Sender<Option<String>>, found: Option<String>, failed
     });
 }
 
-/// Checks everything that each simulation needs. Blocks for two seconds for each display, and for as long as the disk does.
+/// Checks everything that each simulation needs. Blocks for up to two seconds per display, and as long as the disk.
 fn check(config: &SimulationConfig, run: &Path, readings: Option<&Readings>) -> Result<(), String> {
     readings.map_or(Ok(()), |readings| check_gpus(config, readings))?;
     if config.docker {
@@ -123,7 +123,7 @@ fn check(config: &SimulationConfig, run: &Path, readings: Option<&Readings>) -> 
     Ok(())
 }
 
-/// Checks that there are GPUs and none is lost, where they are required.
+/// Checks that there are GPUs and none is lost, if they are required.
 fn check_gpus(config: &SimulationConfig, readings: &Readings) -> Result<(), String> {
     let none = || readings.gpus.is_empty().then(|| "sees none".to_owned());
     match readings.gpu_problem.clone().or_else(none) {

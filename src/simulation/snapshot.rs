@@ -60,10 +60,10 @@ pub struct Simulation {
     pub pid: Option<i32>,
     /// The streaming port, once there is one.
     pub port: Option<u16>,
-    /// The number of its GPU, where simulations are spread over several.
+    /// The number of its GPU, if simulations are spread over several.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gpu: Option<u32>,
-    /// Until when it waits for its client, which is away, in seconds since 1970.
+    /// When it stops waiting for its disconnected client, in seconds since 1970.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub away_until: Option<u64>,
     /// The version of Webots that the world was made for.

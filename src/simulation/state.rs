@@ -34,11 +34,11 @@ pub struct AppState {
     pub slots: Arc<SlotPool>,
     /// The sessions that their clients can resume.
     pub sessions: Arc<Sessions>,
-    /// Reads the machine.
+    /// Measures the load of the machine.
     pub load_monitor: Addr<LoadMonitor>,
     /// The newest readings of the machine.
     pub readings: watch::Receiver<Arc<Readings>>,
-    /// Chooses the GPU of each simulation, where they are spread over several.
+    /// Chooses the GPU of each simulation, if they are spread over several.
     pub spread: Option<Arc<Spread>>,
     /// Launches simulations at a level of isolation.
     pub launcher: Arc<Launcher>,
@@ -54,7 +54,7 @@ pub struct AppState {
     pub phase: watch::Sender<Phase>,
     /// Why the server can't start simulations; `None` if it can.
     pub problem: watch::Receiver<Option<String>>,
-    /// Counts starts that failed for a reason of this server's own.
+    /// Counts consecutive failed starts of which this server is the cause.
     pub failed_starts: Arc<FailedStarts>,
     /// Records the ends of simulations.
     pub ends: Ends,
@@ -72,7 +72,7 @@ pub struct AppState {
     pub starts: prometheus::IntCounterVec,
     /// The open monitor pages.
     pub live: LiveUpdates,
-    /// Those of administrators, which show more.
+    /// The open monitor pages of administrators, which show more.
     pub administrators: LiveUpdates,
     /// CPU and memory of each simulation.
     pub usage: UsageMonitor,
@@ -97,7 +97,7 @@ impl AppState {
         self.is_draining() || self.problem.borrow().is_some()
     }
 
-    /// Accepts no new clients from now on; the server ends when the last one has gone.
+    /// Accepts no new clients from now on; the server ends when the last one has left.
     pub fn drain(&self) {
         let is_new = self.phase.send_if_modified(|phase| {
             let is_open = *phase == Phase::Open;

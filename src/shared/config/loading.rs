@@ -14,7 +14,7 @@ use crate::shared::text::one_line;
 pub trait Configuration: DeserializeOwned + Serialize {
     /// Aliases of keys.
     const ALIASES: &'static [&'static str] = &[];
-    /// Keys that must be there.
+    /// Keys that the file must contain.
     const REQUIRED: &'static [&'static str] = &[];
 
     /// Sets the values that depend on the machine and on the configuration file, and checks the rules between values.

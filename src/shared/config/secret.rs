@@ -18,7 +18,7 @@ pub fn read_file(file: &Path) -> io::Result<String> {
     std::fs::read_to_string(file)
 }
 
-/// A text that is never printed or logged; output shows `********`. The configuration contains it, or names a file.
+/// A text that is never printed or logged; output shows `********`. The configuration contains it, or names its file.
 #[derive(Clone, Deserialize)]
 #[serde(try_from = "WireSecret")]
 pub struct Secret {
@@ -52,7 +52,7 @@ impl Secret {
         &self.text
     }
 
-    /// The file that it was read from; `None` if the configuration contains it.
+    /// The file that the secret was read from; `None` if the configuration contains it.
     pub fn file(&self) -> Option<&Path> {
         self.file.as_deref()
     }

@@ -14,7 +14,7 @@ use shellexpand::LookupError;
 
 use crate::shared::text::excerpt;
 
-/// How much of a value that is not allowed is shown, in characters.
+/// Longest excerpt of an invalid value in an error, in characters.
 const MAX_SHOWN: usize = 60;
 
 /// A path with `~` and `$VARIABLE` expanded.

@@ -1,5 +1,5 @@
-//! The public address of a server: `HOST:PORT`, or `HOST/PORT` behind a reverse proxy that rewrites ports. If that
-//! proxy is not on its usual port, it is `HOST:WEBPORT/PORT`.
+//! The public address of a server: `HOST:PORT`, or `HOST/PORT` behind a reverse proxy that rewrites ports. If the proxy
+//! does not listen on the default port, the address is `HOST:WEBPORT/PORT`.
 
 use std::fmt;
 use std::num::NonZeroU16;
@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 /// A server's public address.
 ///
 /// With port rewrite (a reverse proxy on port 443 forwards `https://HOST/PORT/...` to that local port) the port is the
-/// first segment of the path: `HOST/PORT`. Without, it is the plain `HOST:PORT`.
+/// first segment of the path: `HOST/PORT`. Without port rewrite, the address is `HOST:PORT`.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct PublicAddress {
@@ -38,12 +38,12 @@ pub fn complete_host(server: &mut String, rewritten: bool) -> Result<Option<Stri
 }
 
 impl PublicAddress {
-    /// The address of `port` on `host`; `rewritten` tells whether a reverse proxy rewrites ports.
+    /// The address of `port` on `host`; `rewritten`: whether a reverse proxy rewrites ports.
     pub fn new(host: &str, port: u16, rewritten: bool) -> Self {
         Self { host: host.into(), port, rewritten }
     }
 
-    /// The host in lower case, with the port of the reverse proxy if that is not the usual one.
+    /// The host in lower case, with the port of the reverse proxy if that is not the default.
     pub fn host(&self) -> &str {
         &self.host
     }

@@ -12,7 +12,7 @@ use crate::shared::config::expand;
 pub struct PublicUrl {
     /// The WebSocket URL of the reverse proxy, without a slash at its end.
     door: String,
-    /// The path after the reverse proxy, with placeholders.
+    /// The path below that URL, with placeholders.
     path: String,
 }
 

@@ -9,15 +9,15 @@ use url::Url;
 /// A world: a repository on a Git host, and the path of a world file below a reference of it.
 ///
 /// The reference may contain slashes (`feature/arm`), so the URL alone does not show where it ends;
-/// [`ProjectUrl::candidates`] returns the possible readings, and the repository decides.
+/// [`ProjectUrl::candidates`] returns the possible readings, and the repository's branches and tags decide.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct ProjectUrl {
     host: String,
-    /// The path segments that name the repository, percent-decoded, as all of these.
+    /// The path segments that name the repository, percent-decoded, as are the other segments.
     repository: Vec<String>,
-    /// Those that the Git host inserts before the reference, such as `blob`.
+    /// The segments that the Git host inserts before the reference, such as `blob`.
     marker: Vec<String>,
-    /// Reference, folder, `worlds` and the world file.
+    /// Reference, the project's directory, `worlds` and the world file.
     inside: Vec<String>,
 }
 
@@ -30,7 +30,7 @@ pub struct Reading {
     pub folder: String,
 }
 
-/// Why a text is not the URL of a world: the problem, without a capital letter and a period. The message is for the web
+/// Why a text is not the URL of a world: the problem, without initial capital and period. The message is for the web
 /// client.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
@@ -109,7 +109,7 @@ impl ProjectUrl {
     /// The possible readings, sorted by the length of the reference, shortest first.
     pub fn candidates(&self) -> Vec<Reading> {
         let before_worlds = self.inside.len().saturating_sub(2);
-        // No branch has more slashes.
+        // Longer references are not expected: each reading costs names in the query of the remote.
         (1..=before_worlds.min(12))
             .filter_map(|length| {
                 let (reference, folder) = self.inside.get(..before_worlds)?.split_at_checked(length)?;
@@ -125,7 +125,7 @@ impl fmt::Display for ProjectUrl {
     }
 }
 
-/// Removes the `.git` that git may append to the name of a repository: both name the same one.
+/// Removes the `.git` that git may append to the name of a repository: both names mean the same repository.
 pub(super) fn plain_repository(mut segments: Vec<String>) -> Result<Vec<String>, ProjectUrlError> {
     let name = segments.last_mut().ok_or_else(|| url_error("it names no repository"))?;
     while name.to_ascii_lowercase().ends_with(".git") {
@@ -134,7 +134,7 @@ pub(super) fn plain_repository(mut segments: Vec<String>) -> Result<Vec<String>,
     if name.is_empty() { Err(url_error("it names no repository")) } else { Ok(segments) }
 }
 
-/// Splits an `https` URL into its host and its percent-decoded path segments, as the standard of URLs has it, and refuses
+/// Splits an `https` URL into its host and its percent-decoded path segments, by the URL Standard, and refuses
 /// anything that git or the file system could resolve differently.
 ///
 /// # Errors
@@ -165,7 +165,7 @@ fn decode_segment(raw: &str) -> Result<String, ProjectUrlError> {
     Ok(segment.into_owned())
 }
 
-/// Finds the end of the repository and the begin of the reference.
+/// Finds the end of the repository and the start of the reference.
 pub(super) fn split_repository(segments: &[String]) -> Result<(usize, usize), ProjectUrlError> {
     let words: Vec<&str> = segments.iter().map(String::as_str).collect();
     if let Some(dash) = words.iter().position(|word| *word == "-")

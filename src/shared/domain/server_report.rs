@@ -38,7 +38,7 @@ pub struct ServerReport {
     /// Whether the server accepts no new clients because it is about to stop.
     #[serde(default)]
     pub draining: bool,
-    /// Number of consecutive starts that failed last for a reason of the server's own.
+    /// Number of consecutive failed starts of which the server is the cause.
     #[serde(default)]
     pub failed_starts: u32,
     /// Why the server can't start simulations; `None` if it can.
@@ -64,7 +64,7 @@ pub struct Instances {
     pub arrivals: u64,
 }
 
-/// Prefixes that this version does not know guide nobody: their server enforces them itself.
+/// Ignores prefixes that this version can't parse: the server that reports them enforces them itself.
 fn prefixes<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<Vec<UrlPrefix>, D::Error> {
     let texts = Vec::<String>::deserialize(deserializer)?;
     Ok(texts.into_iter().filter_map(|text| UrlPrefix::try_from(text).ok()).collect())
@@ -96,8 +96,8 @@ impl ServerReport {
 
     /// Whether the server accepts this world, by this report.
     ///
-    /// A report without `docker` comes from a Python server. The Python session server expects it to run every world
-    /// that it does not rule out, and so does this one.
+    /// A report without `docker` comes from a Python server. The Python session server expects such a server to run
+    /// every world that its report does not exclude, and so does this one.
     pub fn accepts(&self, world: &ProjectUrl) -> bool {
         let is_open = self.allowed_repositories.is_empty() || self.share_idle_time > 0.0;
         let share_idle_time = match self.docker {

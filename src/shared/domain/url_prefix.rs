@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::project_url::{ProjectUrl, ProjectUrlError, plain_repository, split_repository, split_url};
 
-/// A URL prefix by whole path segments, of a host, an owner or a repository: `https://github.com/lab` covers
+/// A URL prefix of whole path segments: a host, an owner or a repository. `https://github.com/lab` covers
 /// `https://github.com/lab/x`, but not `https://github.com/lab-evil/x` (the original compares characters, and accepts
 /// it).
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]

@@ -3,7 +3,7 @@
 use actix_files::file_extension_to_mime;
 use actix_web::{HttpRequest, HttpResponse};
 
-/// A file that pages refer to as `assets/NAME`: its name, whose extension determines its type, and its content.
+/// A file that pages refer to as `assets/NAME`: its name and its content. The extension determines the type.
 pub type Asset = (&'static str, &'static str);
 
 /// Embeds a file of `templates/assets` at build time.

@@ -58,8 +58,8 @@ impl BasicAuth {
     }
 }
 
-/// Refuses a request for an action unless it brings the password and no page of another site has made it (CSRF): the
-/// browser would add the stored password. Without a password in the configuration there are no actions.
+/// Refuses a request for an action without the password, or from a page of another site (CSRF), to which the browser
+/// would add the stored password. Without a password in the configuration all actions are refused.
 pub fn refuse_action(auth: Option<&BasicAuth>, request: &HttpRequest, peer: Peer) -> Option<HttpResponse> {
     if is_cross_site(request) {
         return Some(HttpResponse::Forbidden().body("Error: this request comes from a page of another site."));
@@ -67,7 +67,7 @@ pub fn refuse_action(auth: Option<&BasicAuth>, request: &HttpRequest, peer: Peer
     require_administrator(auth, request, peer)
 }
 
-/// Whether a page of another site has made a request. Browsers send the page's `Origin`; other programs send none.
+/// Whether a page of another site has sent a request. Browsers send the page's `Origin`; other programs send none.
 fn is_cross_site(request: &HttpRequest) -> bool {
     let header = |name| request.headers().get(name).map(|value| value.to_str().unwrap_or_default());
     let host = header(header::HOST).unwrap_or_default();
@@ -85,7 +85,7 @@ pub fn require_administrator(auth: Option<&BasicAuth>, request: &HttpRequest, pe
     auth.check(request, peer).err().map(HttpResponse::from_error)
 }
 
-/// The password that a request brings, with whatever user name.
+/// The password of a request; the user name is ignored.
 fn password_of(request: &HttpRequest) -> Option<String> {
     let (scheme, credentials) = request.headers().get(header::AUTHORIZATION)?.to_str().ok()?.split_once(' ')?;
     if !scheme.eq_ignore_ascii_case("basic") {

@@ -1,11 +1,11 @@
-//! A client's TCP connection that reads the next request only once the answer to the one before has begun. A request may
-//! have a body of up to 8 KiB.
+//! A client's TCP connection that reads the next request only after the answer to the previous one has begun. A request
+//! may have a body of up to 8 KiB.
 //!
 //! actix decodes all requests that it has read before it answers the first. Without this limit, a client that sends
 //! many requests and reads no answer would fill the memory.
 //!
 //! Once a request was answered with 101 (Switching Protocols), the connection can be taken from actix, as
-//! `hyper::upgrade` does: bytes that are only copied need no parser of HTTP between.
+//! `hyper::upgrade` does: bytes that are only copied need no HTTP parser.
 
 use std::cell::RefCell;
 use std::io;
@@ -26,7 +26,7 @@ use super::routing::MAX_BODY;
 
 /// Size of one read from the socket, in bytes.
 const READ_AT_ONCE: usize = 4 * 1024;
-/// Begin of the answer that upgrades a connection to a WebSocket.
+/// Start of the answer that upgrades a connection to a WebSocket.
 const SWITCHING_PROTOCOLS: &[u8] = b"HTTP/1.1 101 ";
 /// Size limit of the head of a request, in bytes: actix refuses one that is as large.
 const MAX_HEAD: usize = 128 * 1024;
@@ -44,21 +44,21 @@ enum State {
     WebSocket,
 }
 
-/// A connection that speaks another protocol than HTTP from now on.
+/// A connection that was upgraded from HTTP to another protocol.
 #[derive(Debug)]
 pub struct Upgraded {
     /// The connection.
     pub tcp: TcpStream,
-    /// What was read from it after the request.
+    /// The bytes that were read after the request.
     pub read_buffer: Bytes,
     /// Counts the connection.
     pub permit: ConnectionPermit,
 }
 
-/// Where a connection goes when it is upgraded; empty where nobody takes it.
+/// Receives the connection when it is upgraded; `None` if no handler waits for it.
 type UpgradeSlot = Rc<RefCell<Option<oneshot::Sender<Upgraded>>>>;
 
-/// The connection of a request, once the answer 101 was written to it. An error means that it has ended before.
+/// The connection of a request, once the answer 101 was written to it. An error means that it ended before that.
 pub fn upgrade(request: &HttpRequest) -> oneshot::Receiver<Upgraded> {
     let (sender, receiver) = oneshot::channel();
     if let Some(slot) = request.conn_data::<UpgradeSlot>() {
@@ -77,7 +77,7 @@ pub struct ClientStream {
     unread: BytesMut,
     /// Number of bytes of the current request that were not yet passed to actix.
     left: usize,
-    /// Whether the system takes no more of an answer, since the client does not read.
+    /// Whether the socket's send buffer is full, because the client does not read.
     is_blocked: bool,
     state: State,
 }
@@ -95,7 +95,7 @@ impl ClientStream {
         }
     }
 
-    /// Called by actix for each new connection, so that its requests find its slot.
+    /// Called by actix for each new connection, so that its requests find its upgrade slot.
     pub fn on_connect(&self, data: &mut Extensions) {
         data.insert(Rc::clone(&self.upgrade));
     }
@@ -125,8 +125,8 @@ impl ClientStream {
     }
 }
 
-/// The length of the request that these bytes begin with; `None` while its head is incomplete. Of an invalid one, or
-/// one that is too large, which actix answers, it is all bytes.
+/// The length of the request at the start of these bytes; `None` while its head is incomplete. If the head is invalid
+/// or too large, the request is all bytes, and actix answers with the error.
 fn request_length(bytes: &[u8]) -> Option<usize> {
     let mut headers = [httparse::EMPTY_HEADER; MAX_HEADERS];
     let mut request = httparse::Request::new(&mut headers);
@@ -150,11 +150,11 @@ impl AsyncRead for ClientStream {
         buffer: &mut ReadBuf<'_>,
     ) -> Poll<io::Result<()>> {
         if self.connection.is_none() {
-            // End of input: actix has no more to do with what was handed over.
+            // End of input: the connection was handed over.
             return Poll::Ready(Ok(()));
         }
         if self.is_blocked || self.upgrade.borrow().is_some() {
-            // The next write wakes the task, or the socket once it accepts more.
+            // The next write wakes the task, or the socket does once it accepts more.
             return Poll::Pending;
         }
         if self.left == 0 {

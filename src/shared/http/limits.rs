@@ -1,5 +1,5 @@
-//! Limits of connections, in all and for each client address, and of what an address may do in a time: so that one does
-//! not use up everything.
+//! Limits of connections, in total and per client address, and rate limits per address, so that one client can't use up
+//! everything.
 
 use std::collections::HashMap;
 use std::collections::hash_map::Entry;
@@ -28,18 +28,18 @@ pub enum ConnectionKind {
     Stream,
 }
 
-/// TCP connections of an address for each client that it may have, at least: browsers open several.
+/// Fewest TCP connections per web client for which the limits leave room: browsers open several.
 pub const TCP_PER_CLIENT: usize = 2;
-/// Limit of what is relayed at once for each client that there may be: a stream, and the files of a scene, of which
-/// browsers load six at a time.
+/// Limit of concurrent relayed streams and files per web client: one stream and six files of a scene, because browsers
+/// load six at a time.
 pub const STREAMS_PER_CLIENT: usize = 7;
 /// Default limit of web clients per address.
 const MAX_CLIENTS_PER_ADDRESS: usize = 1000;
 /// Limit of pages that listen to `/events`.
 const MAX_PAGES: usize = 1000;
 
-/// Default limit for one address, of `all` slots, connections and the like: three quarters. A class often sits behind
-/// one address, and so may a client that would take everything.
+/// Default limit for one address, out of `all` slots or connections: three quarters. A class often shares one address,
+/// but a single client must not take everything.
 pub fn share(all: usize) -> usize {
     all - all / 4
 }
@@ -54,7 +54,7 @@ pub struct ConnectionLimiter {
     open: Counts,
 }
 
-/// What a number of open connections is about: those of an address, or all of a kind.
+/// What a count of open connections covers: one address, or (`None`) all of a kind.
 type Key = (ConnectionKind, Option<IpAddr>);
 /// Numbers of open connections.
 type Counts = Arc<Mutex<HashMap<Key, usize>>>;
@@ -127,7 +127,7 @@ impl ConnectionLimiter {
     }
 }
 
-/// The numbers in which a connection is counted.
+/// The keys of the counts to which a connection contributes.
 fn keys(kind: ConnectionKind, address: Option<IpAddr>) -> impl Iterator<Item = Key> {
     [Some((kind, None)), address.map(|address| (kind, Some(address)))].into_iter().flatten()
 }
@@ -164,7 +164,7 @@ const MAX_ADDRESSES: usize = 10_000;
 pub struct AddressQuota(DefaultKeyedRateLimiter<IpAddr>);
 
 impl AddressQuota {
-    /// An unused quota: `burst` times at once, and `per_minute` times in each minute after that.
+    /// An unused quota: `burst` uses at once, and `per_minute` uses in each minute after that.
     pub fn new(burst: u32, per_minute: u32) -> Self {
         let [burst, per_minute] = [burst, per_minute].map(|number| NonZeroU32::MIN.saturating_add(number - 1));
         Self(RateLimiter::keyed(Quota::per_minute(per_minute).allow_burst(burst)))

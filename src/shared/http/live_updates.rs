@@ -26,7 +26,7 @@ const PERIOD: Duration = Duration::from_secs(1);
 const LARGE: usize = 32 * 1024;
 /// Longest interval between two renderings, in periods.
 const MAX_PERIODS: usize = 5;
-/// Interval of empty events while nothing changes, which show a page that the server is alive, in periods.
+/// Interval of empty events while nothing changes, in periods: they show a page that the server is alive.
 const KEEP_ALIVE: u32 = 15;
 /// Bytes that are written to a connection at once. All connections share the bytes of an event; only a chunk is copied,
 /// so that a page that does not read costs little memory.
@@ -74,7 +74,7 @@ struct Latest {
 }
 
 impl LiveUpdates {
-    /// Answers a page that listens. `permit` counts it; `render` is called once per second.
+    /// Answers a page that listens. `permit` counts it; `render` is called at most once per second.
     pub fn listen<R, F>(&self, permit: ConnectionPermit, phase: watch::Receiver<Phase>, render: R) -> HttpResponse
     where
         R: Fn() -> F + 'static,
@@ -98,7 +98,7 @@ impl LiveUpdates {
             if let Some(view) = render().await {
                 let event = Event { version: env!("CARGO_PKG_VERSION"), view: &view };
                 let event = format!("data: {}\n\n", serde_json::to_string(&event).unwrap_or_default());
-                // Bytes that stay the same are the same allocation, which pages compare.
+                // An unchanged event keeps its allocation, because pages compare its address.
                 if latest.event != event.as_bytes() {
                     latest.event = event.into();
                 }

@@ -4,7 +4,7 @@ use prometheus::{Encoder, GaugeVec, IntCounterVec, Opts, Registry, TextEncoder};
 
 /// The metrics of one server.
 ///
-/// Counters live as long as the server; gauges are set from its state whenever somebody asks.
+/// Counters live as long as the server; gauges are set from its state on each request.
 #[derive(Debug, Clone, Default)]
 pub struct Metrics {
     counters: Registry,

@@ -20,7 +20,7 @@ pub struct TrustedProxies(Vec<IpNet>);
 /// The client at the other end of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Peer {
-    /// The client's own address; or, if the header can't be parsed, that of the last proxy before the invalid part.
+    /// The client's own address; or, if a hop in the header is invalid, that of the proxy which added that hop.
     Client(IpAddr),
     /// A trusted proxy that sends no header, or a client on the same machine: it may stand for many clients.
     Proxy(IpAddr),
@@ -41,7 +41,7 @@ impl Peer {
 impl TrustedProxies {
     /// The client of a request.
     pub fn peer(&self, request: &HttpRequest) -> Peer {
-        // Only a request of a unit test comes from no address.
+        // Only requests in unit tests have no address.
         let address = request.peer_addr().map_or(Ipv4Addr::UNSPECIFIED.into(), |address| address.ip());
         self.resolve(address.to_canonical(), request.headers())
     }
@@ -51,8 +51,8 @@ impl TrustedProxies {
         self.resolve(address.to_canonical(), &HeaderMap::new())
     }
 
-    /// The value of a header that a trusted proxy sets. A header that is there twice has none: the client may have sent one
-    /// of them.
+    /// The value of a header that a trusted proxy sets; `None` if the header is repeated, because the client may have
+    /// sent one of them.
     pub fn trusted_header(&self, request: &HttpRequest, header: &str) -> Option<String> {
         let is_trusted = request.peer_addr().is_some_and(|address| self.trusts(address.ip().to_canonical()));
         let mut lines = request.headers().get_all(header).filter(|_| is_trusted);

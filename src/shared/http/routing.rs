@@ -1,5 +1,5 @@
 //! What the routes of both servers share: allowed methods, CORS headers, bodies of requests, the answer for unknown paths.
-//! Bodies of actions are small, of a known length and in time; other requests have none.
+//! Only requests for actions may have a body, which is small, has a `Content-Length` and must arrive in time.
 
 use std::time::Duration;
 
@@ -15,12 +15,12 @@ use serde::de::DeserializeOwned;
 /// Range of `Retry-After`, in seconds.
 const RETRY_AFTER: std::ops::RangeInclusive<u16> = 2..=6;
 
-/// Size limit of a body, in bytes. A request with a larger one, or one in chunks, is answered without it.
+/// Size limit of a body, in bytes. A larger or chunked body is not read.
 pub const MAX_BODY: usize = 8 * 1024;
 /// Timeout of a body.
 const BODY_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// For reads. Monitoring programs like to request the head alone (RFC 9110, section 9.3.2).
+/// For reads. Monitoring programs often request the head alone (RFC 9110, section 9.3.2).
 pub const READ: &[Method] = &[Method::GET, Method::HEAD];
 /// For WebSockets and event streams, whose answers are unbounded.
 pub const GET: &[Method] = &[Method::GET];
@@ -47,12 +47,12 @@ fn wrong_method(methods: &[Method]) -> HttpResponse {
     HttpResponse::MethodNotAllowed().insert_header((header::ALLOW, allowed)).body(words)
 }
 
-/// The header `Retry-After`, in seconds. Random, so that a class that was refused at once does not retry at once.
+/// The header `Retry-After`, in seconds. Random, so that clients that are refused together do not retry together.
 pub fn retry_after() -> (HeaderName, HeaderValue) {
     (header::RETRY_AFTER, HeaderValue::from(rand::rng().random_range(RETRY_AFTER)))
 }
 
-/// Refuses a request with a body where none is read.
+/// Refuses a request that has a body, for routes that read none.
 pub fn refuse_body(request: &HttpRequest) -> Option<HttpResponse> {
     let headers = request.headers();
     let has_length = headers.get(header::CONTENT_LENGTH).is_some_and(|length| length != "0");

@@ -61,8 +61,7 @@ pub struct HttpServerOptions {
     pub trusted_proxies: TrustedProxies,
 }
 
-/// Serves an app on a port. Unlike actix-web's `HttpServer` it counts connections per address, and reads from each only
-/// as fast as its client reads the answers.
+/// Serves an app on a port.
 ///
 /// # Errors
 /// When the system does not let the port be used.
@@ -111,12 +110,12 @@ fn accept(
     let address = tcp.peer_addr()?;
     let peer = options.trusted_proxies.of_connection(address.ip());
     let permit = connections.admit(ConnectionKind::Tcp, peer).map_err(io::Error::other)?;
-    // Messages are small, and must not wait for the acknowledgement of the one before.
+    // Messages are small, and must not wait for the acknowledgement of the previous one.
     tcp.set_nodelay(true)?;
     let socket = SockRef::from(&tcp);
     // RFC 5482; on Linux it also covers a client that does not read (tcp(7)).
     socket.set_tcp_user_timeout(Some(options.silence))?;
-    // A peer that has vanished while nothing is sent, as on the stream of a paused simulation, is noticed by probes.
+    // Probes detect a peer that has vanished while nothing is sent, as on the stream of a paused simulation.
     let seconds = options.silence.as_secs().clamp(1, 3600);
     let probes = TcpKeepalive::new().with_time(Duration::from_secs(seconds));
     socket.set_tcp_keepalive(&probes.with_interval(Duration::from_secs(seconds.div_ceil(3))))?;

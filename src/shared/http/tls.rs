@@ -1,7 +1,7 @@
 //! Requests to https servers: which certificates are trusted, and why others are not.
 //!
 //! The trust store is the system's, to which a lab adds its own authority with `update-ca-certificates`. If one of the
-//! environment variables `SSL_CERT_FILE` and `SSL_CERT_DIR` is set, it is that file or directory alone.
+//! environment variables `SSL_CERT_FILE` and `SSL_CERT_DIR` is set, the store is that file or directory alone.
 
 use std::sync::Arc;
 
@@ -10,7 +10,7 @@ use rustls::{ClientConfig, Error, RootCertStore};
 
 use crate::shared::text::excerpt;
 
-/// Longest text about a certificate, which may be anybody's, in characters.
+/// Longest text about a certificate, in characters: any server may have sent it.
 const MAX_REASON_LENGTH: usize = 300;
 
 /// Returns the TLS configuration of requests; `None` if rustls can't be set up.

@@ -16,8 +16,8 @@ const MAX_MESSAGE: usize = 8 * 1024;
 /// Largest header of a WebSocket frame, in bytes (RFC 6455, section 5.2).
 const FRAME_HEADER: usize = 14;
 
-/// Why a connection must be closed, as text for the client, with the code: it has sent what is neither a text nor about the
-/// connection.
+/// Why a connection must be closed, as text for the client, with the close code: the client has sent neither a valid
+/// text nor a control frame.
 pub fn wrong_message(message: Result<Message, ProtocolError>) -> (String, CloseCode) {
     let (problem, code) = match message {
         Ok(_) => ("allowed are short texts".to_owned(), CloseCode::Unsupported),
@@ -27,10 +27,10 @@ pub fn wrong_message(message: Result<Message, ProtocolError>) -> (String, CloseC
     (format!("Wrong message: {problem}"), code)
 }
 
-/// Takes the frames of a client out of the bytes that it sends.
+/// Splits the bytes of a client into frames.
 pub struct FrameReader {
     codec: Codec,
-    /// What is no whole frame yet.
+    /// The bytes of an incomplete frame.
     unread: BytesMut,
 }
 
@@ -52,7 +52,7 @@ impl FrameReader {
     /// When it is too large or breaks the rules of WebSockets.
     pub fn take(&mut self) -> Result<Option<Frame>, ProtocolError> {
         let frame = self.codec.decode(&mut self.unread)?;
-        // The codec tells that a frame is too large only when all of it is there.
+        // The codec reports a frame that is too large only once it is complete.
         if frame.is_none() && self.unread.len() > MAX_MESSAGE + FRAME_HEADER {
             return Err(ProtocolError::Overflow);
         }
@@ -60,9 +60,9 @@ impl FrameReader {
     }
 }
 
-/// The messages of a client, each complete. What is not UTF-8 is binary, and a connection that breaks is closed.
+/// The complete messages of a client. A text that is not UTF-8 becomes binary, and a broken connection a close message.
 ///
-/// Bytes are read only once all messages before them were taken: actix' own stream reads on while messages wait, so that
+/// Bytes are read only after all earlier messages were taken: actix's own stream reads on while messages wait, so that
 /// one client could fill the memory.
 fn messages(payload: Payload) -> impl Stream<Item = Result<Message, ProtocolError>> {
     let state = (payload, FrameReader::default(), BytesMut::new());
@@ -86,8 +86,8 @@ fn messages(payload: Payload) -> impl Stream<Item = Result<Message, ProtocolErro
     })
 }
 
-/// The message that a frame ends; `partial` is what has come of a text whose last frame is missing (RFC 6455, section
-/// 5.4). The codec refuses frames in a wrong order.
+/// The message that a frame completes; `partial` holds the earlier frames of a fragmented text (RFC 6455, section 5.4).
+/// The codec refuses frames in a wrong order.
 fn complete(frame: Frame, partial: &mut BytesMut) -> Result<Option<Message>, ProtocolError> {
     Ok(Some(match frame {
         Frame::Text(text) => text_message(text),
@@ -120,8 +120,8 @@ pub fn refuse(error: &HandshakeError) -> HttpResponse {
     HttpResponse::build(error.error_response().status()).body(format!("Error: this is a WebSocket: {error}."))
 }
 
-/// Upgrades a request to a WebSocket that the given actor serves, or answers with the error. The actor gets
-/// complete messages, and those that are a [`wrong_message`].
+/// Upgrades a request to a WebSocket that the given actor serves, or answers with the error. The actor receives
+/// complete messages, including invalid ones ([`wrong_message`]).
 pub fn open<A>(request: &HttpRequest, payload: Payload, actor: A) -> HttpResponse
 where
     A: Actor<Context = WebsocketContext<A>> + StreamHandler<Result<Message, ProtocolError>>,

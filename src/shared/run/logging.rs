@@ -12,7 +12,7 @@ use crate::shared::text::one_line;
 /// Size from which the log is rotated, in bytes.
 const MAX_SIZE: u64 = 2_500_000;
 
-/// Starts logging to a file, which is rotated; without one to standard output, debug lines included. The environment variable `RUST_LOG` overrides which lines are written.
+/// Starts logging to a rotated file, or without one to standard output with debug lines. `RUST_LOG` overrides levels.
 ///
 /// # Errors
 /// When the file or its directory can't be created.

@@ -10,10 +10,10 @@ pub fn raise_open_files(wanted: u64) -> u64 {
     setrlimit(Resource::RLIMIT_NOFILE, limit, most).map_or(now, |()| limit)
 }
 
-/// Returns the limit of clients: `max_clients`, or fewer if this many open `files` are enough only for `possible` ones.
+/// Returns the limit of clients: `max_clients`, or `possible` if the limit of open `files` allows no more.
 ///
 /// # Errors
-/// When they are not even enough for what is `needed` at least.
+/// When `possible` is 0; `needed` names the minimum in the message.
 pub fn limit_clients(files: u64, possible: usize, max_clients: usize, needed: &str) -> Result<usize, String> {
     if possible == 0 {
         return Err(format!(

@@ -8,7 +8,7 @@ use futures_util::FutureExt;
 
 /// Interval between two checks of an actor, and between the end of a task and its next start.
 const INTERVAL: Duration = Duration::from_millis(500);
-/// Panics of a task within a minute after which a new one would help no more.
+/// Limit of panics of a task within a minute: after more of them, another restart would not help.
 const MAX_PANICS: u32 = 5;
 
 /// Waits until an actor has stopped, and returns a message about it. Such an actor has panicked, which is a bug in this
@@ -23,8 +23,8 @@ pub async fn stopped<A: Actor>(name: &str, actor: Addr<A>) -> String {
     format!("the actor {name} is gone")
 }
 
-/// Runs a task, and starts it again each time that it has panicked. More than [`MAX_PANICS`] within a minute end the
-/// server with exit code 1, so that its service manager restarts it.
+/// Runs a task, and restarts it after each panic. More than [`MAX_PANICS`] within a minute end the server with
+/// exit code 1, so that its service manager restarts it.
 pub async fn restarted(name: &str, mut task: impl AsyncFnMut()) {
     let (mut since, mut panics) = (Instant::now(), 0);
     while AssertUnwindSafe(task()).catch_unwind().await.is_err() {

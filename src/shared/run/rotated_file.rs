@@ -7,7 +7,7 @@ use std::fs::File;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-/// A file to which lines are appended. Beside it is the one before, `NAME.1`.
+/// A file to which lines are appended. The previous file is `NAME.1`.
 #[derive(Debug)]
 pub struct RotatedFile {
     path: PathBuf,

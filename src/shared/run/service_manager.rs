@@ -1,7 +1,7 @@
 //! Messages to the service manager (systemd). Without one, no message is sent.
 //!
-//! Its watchdog kills and restarts a server that sends no message for too long, so a message is sent only after an
-//! actor that the server depends on has answered.
+//! Its watchdog kills and restarts a server that sends no message for too long. A message is sent only if the server
+//! still works, see [`feed_watchdog`].
 
 use sd_notify::NotifyState;
 
@@ -15,7 +15,7 @@ pub fn stopping(why: &str) {
     send(&[NotifyState::Stopping, NotifyState::Status(why)]);
 }
 
-/// Sends a message to the watchdog, if there is one, three times within its limit, each time `answers` returns true.
+/// Checks `answers` three times within the limit of the watchdog, and sends a message each time it returns true.
 /// Never returns.
 pub async fn feed_watchdog(mut answers: impl AsyncFnMut() -> bool) {
     let Some(limit) = sd_notify::watchdog_enabled() else {

@@ -36,7 +36,7 @@ impl Signals {
         caught.collect::<io::Result<_>>().map(Self)
     }
 
-    /// Waits for the next request.
+    /// Waits for the next signal.
     pub async fn next(&mut self) -> ServerCommand {
         poll_fn(|context| {
             let received = self.0.iter_mut().find_map(|(signal, command)| match signal.poll_recv(context) {

@@ -29,7 +29,7 @@ pub struct CommonArgs {
     pub pid_file: Option<PathBuf>,
 }
 
-/// Reads a configuration file. An invalid one ends the program, which prints what is invalid in it, in one line.
+/// Reads a configuration file. If it is invalid, prints the error in one line and exits.
 pub fn read<C: Configuration>(file: &Path) -> LoadedConfig<C> {
     config::load(file).unwrap_or_else(|error| refuse(&error))
 }
@@ -50,7 +50,7 @@ pub fn check<C: Configuration>(loaded: &LoadedConfig<C>) {
     writeln!(io::stdout(), "{text}").ok();
 }
 
-/// Starts the log in a file, without one on standard output, writes the PID file if requested, and runs a server until it stops.
+/// Writes the PID file if requested, starts the log (without a file on standard output), and runs a server to its end.
 pub fn serve(
     log: Option<&Path>,
     options: &CommonArgs,
@@ -71,7 +71,7 @@ pub fn serve(
     for warning in warnings {
         log::warn!("{warning}");
     }
-    // It is not dropped, because that would wait for blocking threads, as in a slow lookup of a name.
+    // It is not dropped, because that would wait for blocking threads, such as a slow DNS lookup.
     let system = ManuallyDrop::new(actix_rt::System::new());
     match system.block_on(server) {
         Ok(()) => ExitCode::SUCCESS,

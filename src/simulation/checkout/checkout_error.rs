@@ -1,4 +1,4 @@
-//! Why a checkout failed: what git says, and the text for its client. Pure.
+//! Why a checkout failed: the messages of git, and the text for its client. Pure.
 
 use std::io;
 use std::time::Duration;
@@ -18,7 +18,7 @@ pub struct CheckoutError {
 /// What a failure means.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Cause {
-    /// The project, or what the client asks for, is the cause; the message is for the client.
+    /// The project or the client's request is the cause; the message is for the client.
     Refused,
     /// The repository does not exist, or is not public.
     NoRepository,
@@ -26,7 +26,7 @@ pub enum Cause {
     NoCommit,
     /// The remote redirects to another URL.
     Moved,
-    /// The fetch or the answer exceeds its size limit. In a fetch, the kernel has ended the program that writes its pack.
+    /// The pack or the answer exceeds its size limit. In a fetch, the kernel has killed the process that writes it.
     TooLarge,
     /// This timeout was exceeded.
     Slow(Duration),
@@ -44,7 +44,7 @@ pub enum Cause {
 const MESSAGES: &[(Cause, &[&str])] = &[
     (Cause::Machine, &["No space left on device", "Disk quota exceeded", "Read-only file system"]),
     (Cause::Machine, &["Input/output error", "Too many open files", "Cannot allocate memory"]),
-    // These hosts come from the configuration: URLs with other hosts are refused before.
+    // These hosts come from the configuration: URLs with other hosts are refused earlier.
     (Cause::Machine, &["Could not resolve host", "Failed to connect to", "Couldn't connect to"]),
     (Cause::Machine, &["SSL certificate", "certificate verification failed", "Resource temporarily unavailable"]),
     (Cause::Moved, &["returned error: 30"]),
@@ -83,7 +83,7 @@ impl CheckoutError {
         Self::new(known.map_or(Cause::Other, |(cause, _)| *cause), format!("git {command} {ending}: {said}"))
     }
 
-    /// The same as text for a client that asks for this world.
+    /// The same as text for a client that requests this world.
     pub(super) fn about(self, world: &ProjectUrl) -> Self {
         let (repository, why) = (world.repository(), self.message);
         let message = match self.cause {
@@ -100,14 +100,14 @@ impl CheckoutError {
         Self { cause: self.cause, message }
     }
 
-    /// Whether it is this server's fault, so that another server may do better: its disk, its network, its processes. A
-    /// cached repository may look broken because of what its owner has put there, and the next start has a new one.
+    /// Whether this server is the cause (its disk, network or processes), so that another server may succeed. A corrupt
+    /// repository does not count: its content may be the cause, and the next start fetches it again.
     pub fn is_own(&self) -> bool {
         self.cause == Cause::Machine
     }
 }
 
-/// The project, or what the client asks for, is the cause.
+/// An error with the cause [`Cause::Refused`].
 pub fn refused(message: impl Into<String>) -> CheckoutError {
     CheckoutError::new(Cause::Refused, message)
 }

@@ -32,12 +32,12 @@ pub struct CheckoutService {
     _keeps_within_budget: AbortOnDropHandle<()>,
 }
 
-/// Projects that are copied at a time: git may hold files in memory while it writes them.
+/// Limit of concurrent copies of projects: git may hold files in memory while it writes them.
 const COPIES: usize = 16;
 
 impl CheckoutService {
-    /// Prepares checkouts, which are led on the thread of the current runtime. `run` is the directory of this run of the
-    /// server; `rules` limit redirects of Git hosts.
+    /// Prepares checkouts, which run on the current runtime. `run` is the directory of this run of the server; `rules`
+    /// limit redirects of Git hosts.
     ///
     /// # Errors
     /// When the cache can't be created.
@@ -67,7 +67,7 @@ impl CheckoutService {
         AbortOnDropHandle::new(self.runtime.spawn(job))
     }
 
-    /// Checks a world out, which is then where its Git host has redirected to.
+    /// Checks a world out. `world` follows redirects of its Git host.
     async fn check_out(
         &self,
         world: &mut ProjectUrl,
@@ -101,7 +101,7 @@ impl CheckoutService {
         progress: &SharedProgress,
     ) -> Result<Project, CheckoutError> {
         let found = self.resolver.resolve(world, &**progress).await?;
-        // It is never closed.
+        // The semaphore is never closed.
         let _turn = self.copies.acquire().await.ok();
         let (wanted, instance, progress) = (world.clone(), Arc::clone(instance), Arc::clone(progress));
         let (limit, name) = (self.config.project_size, found.revision.name.clone());
@@ -120,7 +120,7 @@ impl CheckoutService {
     /// Restores a file below the project's `controllers` directory to the state of the checkout.
     ///
     /// # Errors
-    /// When it is not a file of the checkout there, or git fails.
+    /// When the checkout has no such file, or git fails.
     pub async fn restore_controller(&self, project: &Project, file: &str) -> Result<(), CheckoutError> {
         let mut restored = self.restore(project, file).await;
         if let Err(error) = &restored

@@ -19,7 +19,7 @@ use crate::simulation::config::{Remote, SimulationConfig};
 pub struct CommitResolver {
     cache: Arc<RepositoryCache>,
     config: Arc<SimulationConfig>,
-    /// They limit redirects of Git hosts.
+    /// Limit redirects of Git hosts.
     rules: AdmissionRules,
     searches: SingleFlight<ProjectUrl, Result<Arc<ResolvedCommit>, CheckoutError>>,
     /// The remotes to which Git hosts have redirected, by [`Remote::key`]: GitLab redirects to `REPOSITORY.git`.
@@ -78,7 +78,7 @@ impl CommitResolver {
         Ok(moved)
     }
 
-    /// Returns the first of the commits that a URL may mean that contains its world.
+    /// Returns the first commit that contains the world, out of those that its URL may mean.
     async fn search(
         &self,
         world: &ProjectUrl,
@@ -134,10 +134,10 @@ impl CommitResolver {
         Ok(search.read(revision, path).await?.map(|_| repository))
     }
 
-    /// Discards what is cached of a world's repository, which has turned out to be corrupt.
+    /// Discards the cached repositories of a world, one of which is corrupt.
     ///
     /// # Errors
-    /// When it can't be removed.
+    /// When one can't be removed.
     pub async fn discard(&self, world: &ProjectUrl, failure: &CheckoutError) -> Result<(), CheckoutError> {
         log::warn!("{world}: {failure}. The cached repository is broken: it is fetched anew");
         for content in [COMMITS, HISTORY] {
@@ -148,8 +148,8 @@ impl CommitResolver {
 }
 
 impl Search<'_> {
-    /// Looks for a file at this path of a commit, which is fetched first if it is not in the cache. Returns the files of the
-    /// directories above the project's, each path ended by a zero byte.
+    /// Fetches a commit unless it is cached. If it has a file at `path`, returns the files of the directories above the
+    /// project's, each path ended by a zero byte.
     async fn read(self, revision: &Revision, path: &str) -> Result<Option<Vec<u8>>, CheckoutError> {
         let (repository, reference) = (self.repository, revision.reference());
         let arguments = revision.list_arguments(path);
@@ -170,7 +170,7 @@ impl Search<'_> {
         }
     }
 
-    /// Fetches a commit, if a branch or tag vouches for it or none need to.
+    /// Fetches a commit, if it is in a branch or tag or need not be.
     async fn fetch_commit(self, revision: &Revision) -> Result<(), CheckoutError> {
         let name = self.world.repository();
         if revision.trust == TrustSource::Url && !self.is_accepted(&revision.commit).await? {
@@ -197,7 +197,7 @@ impl Search<'_> {
         is_reachable(&history, commit).await
     }
 
-    /// Fetches into a repository what has this name.
+    /// Fetches into a repository. `name` is for the client.
     async fn fetch(self, into: &Arc<Repository>, arguments: Vec<String>, name: &str) -> Result<(), CheckoutError> {
         let on_line = |line: String| (self.progress)(steps::fetching(name, &line));
         into.fetch(arguments, &on_line).await.map_err(|error| match error.cause {

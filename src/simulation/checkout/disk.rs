@@ -23,12 +23,12 @@ pub fn remove_leftovers(repository: &Path) {
     let packs = fs::read_dir(repository.join("objects/pack")).into_iter().flatten().flatten();
     let unfinished = packs.filter(|pack| is_unfinished(pack.file_name().as_encoded_bytes())).map(|pack| pack.path());
     for path in unfinished.chain(["shallow.lock", "config.lock"].map(|name| repository.join(name))) {
-        // What is still there fails the fetch.
+        // If one can't be removed, the fetch fails.
         fs::remove_file(path).ok();
     }
 }
 
-/// Waits until one of the directories exceeds its limit, in bytes, or has one in it that can't be read.
+/// Waits until one of the directories exceeds its limit, in bytes, or contains a directory that can't be read.
 pub async fn outgrown(folders: Vec<(PathBuf, u64)>) {
     loop {
         actix_rt::time::sleep(CHECK_INTERVAL).await;
@@ -43,7 +43,7 @@ pub async fn outgrown(folders: Vec<(PathBuf, u64)>) {
     }
 }
 
-/// What everything below a folder takes, each file and folder at least what a name takes of a disk.
+/// The size of everything below a directory: per file or directory its length or its disk usage, the larger of the two.
 pub fn room_of(folder: &Path) -> u64 {
     sum(folder, measure)
 }
@@ -52,7 +52,7 @@ fn measure(about: &fs::Metadata) -> u64 {
     disk_usage::length(about).max(disk_usage::room(about))
 }
 
-/// The sum of everything below a folder. What nobody can look into does not count.
+/// The sum of everything below a directory, without directories that can't be read.
 pub fn sum(folder: &Path, measure: fn(&fs::Metadata) -> u64) -> u64 {
     let mut size = DiskUsage::new(measure, u64::MAX);
     size.add_folder(folder);

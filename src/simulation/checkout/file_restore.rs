@@ -15,14 +15,14 @@ use super::repository::Repository;
 use super::revision::Revision;
 use super::work_tree::checkout_command;
 
-/// The path in its repository of a file below the `controllers` folder of a project; nothing where its name leads elsewhere.
+/// The path in its repository of a file below a project's `controllers` directory; `None` if its name could leave it.
 pub fn controller(revision: &Revision, file: &str) -> Option<String> {
     let plain = |segment: &str| !segment.is_empty() && segment != "." && segment != ".." && !segment.contains('\0');
     (file.contains('/') && file.split('/').all(plain)).then(|| revision.path_of(&format!("controllers/{file}")))
 }
 
-/// Restores the file at this path of the repository to its commit. Returns false if its directory is none any more, or a
-/// directory has replaced the file.
+/// Restores the file at this path of the repository to its commit. Returns false if its directory is no longer one, or
+/// a directory has replaced the file.
 ///
 /// # Errors
 /// When git or the disk fails.

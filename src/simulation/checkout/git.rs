@@ -30,7 +30,7 @@ const SETTINGS: &str = include_str!("gitconfig");
 
 /// The last option before the command.
 const GIT_DIR: &str = "--git-dir=";
-/// Memory limit in bytes, without mapped files, for an answer of a remote, which is enough for a million branches, or for a copy.
+/// Memory limit of a query of a remote (enough for a million branches) or a checkout, in bytes, without mapped files.
 pub const LITTLE_MEMORY: u64 = 512 << 20;
 /// Largest memory limit of a git process, in bytes.
 const MAX_MEMORY: u64 = 2 << 30;
@@ -42,7 +42,7 @@ const NICENESS: i32 = 10;
 const MAX_ANSWER: u64 = 64 * 1024 * 1024;
 
 impl Git {
-    /// Prepares git for the server whose run has this folder.
+    /// Prepares git. `run` is the directory of this run of the server.
     pub fn new(run: &Path, config: Arc<SimulationConfig>) -> Self {
         let include = config.git_config.as_ref().map(|ExpandedPath(file)| {
             let file = std::path::absolute(file).unwrap_or_else(|_| file.clone());
@@ -55,14 +55,14 @@ impl Git {
         Self { settings, mark: run.to_owned(), config }
     }
 
-    /// Writes the file of settings, unless it is there.
+    /// Writes the file of settings, unless it exists.
     fn write_settings(&self) -> std::io::Result<()> {
         let (file, text) = &self.settings;
         if std::fs::exists(file)? {
             return Ok(());
         }
         std::fs::create_dir_all(&self.mark)?;
-        // Others that start at once never see half of it.
+        // Concurrent git processes never see half of it.
         let new = self.mark.join(format!("gitconfig-{:08x}", rand::random::<u32>()));
         std::fs::write(&new, text)?;
         std::fs::rename(&new, file)
@@ -120,7 +120,7 @@ impl Git {
     }
 }
 
-/// How long a remote may be silent, and packing a cached repository hold a fetch up.
+/// Timeout of a remote that sends nothing, and of packing a cached repository, for which the next fetch waits.
 pub fn stall_timeout(config: &SimulationConfig) -> Duration {
     config.timing.checkout / 4
 }

@@ -13,7 +13,7 @@ use crate::simulation::process::InstanceDir;
 pub struct Project {
     /// The world to open.
     pub world: WorldFile,
-    /// What it takes of the disk, in bytes.
+    /// Its size, in bytes.
     pub size: u64,
     /// The URL that it was checked out from.
     pub(super) url: ProjectUrl,
@@ -34,7 +34,7 @@ pub struct WorldFile {
 }
 
 impl Project {
-    /// What tells this project from others: its repository, its commit, and its folder there.
+    /// Identifies the project by its repository, its commit and its directory.
     pub fn identity(&self) -> String {
         format!("{} {} {}", self.url.repository(), self.revision.commit, self.revision.folder)
     }

@@ -2,7 +2,7 @@
 //! allow.
 //!
 //! Redirects are off in git. On a redirect, a traced `git ls-remote` yields the `Location` header, and the world is
-//! resolved there: so the lists, and git's settings for proxies, certificates and passwords, apply to each step.
+//! resolved there, so that the lists, and git's settings for proxies, certificates and passwords, apply to each step.
 
 use url::Url;
 
@@ -43,7 +43,7 @@ async fn location(repository: &Repository) -> Option<String> {
     let mut call = repository.call(&["ls-remote", "--quiet", "--", REMOTE, "HEAD"]);
     let trace = ["GIT_TRACE_CURL", "GIT_TRACE_CURL_NO_DATA"];
     call.spec.environment.extend(trace.map(|name| (name.into(), "1".into())));
-    // It fails again, since the Git host sends it elsewhere.
+    // It fails again, because redirects are off.
     repository.git.run(call, on_line).await.ok();
     location
 }

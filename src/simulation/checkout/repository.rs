@@ -19,25 +19,25 @@ use crate::simulation::process::{Run, remove_tree};
 
 /// A cached repository. It is not evicted from the cache until this is dropped.
 pub struct Repository {
-    /// Its folder.
+    /// Its directory.
     pub path: PathBuf,
     /// The remote, with the last requested spelling of its URL.
     pub remote: Mutex<Remote>,
     /// Runs its commands.
     pub git: Arc<Git>,
-    /// Whether it may have grown since it is in use.
+    /// Whether a fetch or a checkout may have enlarged it.
     pub has_grown: AtomicBool,
-    /// Is told of that when it is in use no more.
+    /// Notified on drop if the repository has grown.
     growth: Arc<Notify>,
     /// Held by the task that changes the repository.
     lock: Arc<tokio::sync::Mutex<()>>,
-    /// Limits concurrent queries of the remote: a class may want as many worlds of one repository.
+    /// Limits concurrent queries of the remote: a class may request many worlds of one repository at once.
     queries: Semaphore,
     /// The fetches in progress, by the arguments of git.
     fetches: SingleFlight<Vec<String>, Result<(), CheckoutError>>,
 }
 
-/// What arguments of git call the remote. git keeps note of what a partial history lacks only for remotes that have a name.
+/// The name of the remote in git's arguments. git records what a partial history lacks only for named remotes.
 pub const REMOTE: &str = "origin";
 /// Number of concurrent queries of a remote for one repository.
 const MAX_QUERIES: usize = 4;
@@ -56,7 +56,7 @@ impl Repository {
         self.configured(&[url], arguments)
     }
 
-    /// A git command on this repository with these settings alone, each as `name=value`: it can't ask the remote.
+    /// A git command on this repository with only these settings, each as `name=value`, and without the remote's URL.
     pub fn configured(&self, settings: &[String], arguments: &[impl AsRef<OsStr>]) -> Run {
         self.git.command((&self.path, self.remote.lock().protocol), settings, arguments)
     }
@@ -67,7 +67,7 @@ impl Repository {
     /// When git fails.
     pub async fn read(&self, arguments: &[impl AsRef<OsStr>]) -> Result<Vec<u8>, CheckoutError> {
         let mut call = self.call(arguments);
-        // Missing objects must not be fetched, as git would do in a history.
+        // git must not fetch missing objects, as it would in a history.
         let none = [("GIT_ALLOW_PROTOCOL", "none"), ("GIT_NO_LAZY_FETCH", "1")];
         call.spec.environment.extend(none.map(|(name, value)| (name.into(), value.into())));
         self.git.run(call, |_| ()).await
@@ -102,7 +102,7 @@ impl Repository {
             // A larger write ends git with SIGXFSZ, which must not leave a core dump.
             call.limits.extend([(Resource::Core, 0), (Resource::Fsize, this.git.config.project_size << 20)]);
             this.git.run(call, on_line).await?;
-            // Packs it for some time at most. Only the next fetch waits for that.
+            // Packs the repository, within a timeout. Only the next fetch waits for that.
             tokio::spawn(async move {
                 let _guard = guard;
                 let call = Run { time: stall_timeout(&this.git.config), ..this.call(&["gc", "--auto", "--quiet"]) };
@@ -115,12 +115,12 @@ impl Repository {
         self.fetches.join(key, progress, fetch).await
     }
 
-    /// Asks the remote. Returns its answer.
+    /// Queries the remote. Returns its answer.
     ///
     /// # Errors
     /// When git fails.
     pub async fn ask(&self, arguments: &[impl AsRef<OsStr>]) -> Result<String, CheckoutError> {
-        // It is never closed.
+        // The semaphore is never closed.
         let _permit = self.queries.acquire().await.ok();
         let mut call = self.call(arguments);
         call.limits.push((Resource::Data, LITTLE_MEMORY));
@@ -128,11 +128,11 @@ impl Repository {
         Ok(String::from_utf8_lossy(&answer).into_owned())
     }
 
-    /// Creates the bare repository unless it exists. Else removes what a killed git has left.
+    /// Creates the bare repository if it does not exist, otherwise removes what a killed git has left.
     async fn create(&self) -> Result<(), CheckoutError> {
         let path = self.path.clone();
         let is_there = blocking(move || {
-            // The last folder that git makes of a new repository. A git that was killed before has left locks.
+            // The last directory that `git init` creates: without it, git was killed before.
             let is_there = path.join("objects/pack").is_dir();
             if is_there {
                 remove_leftovers(&path);

@@ -1,4 +1,4 @@
-//! The directory `cacheDir`, and the cached repositories in it: `git/NAME` is a bare repository, and its mtime is the last use.
+//! The directory `cacheDir` and the cached repositories in it: `git/NAME` is bare, and its mtime is its last use.
 //!
 //! Above `cacheSize`, repositories not in use are evicted, least recently used first.
 
@@ -20,7 +20,7 @@ use crate::simulation::process::{disk_usage, remove_tree};
 
 /// The directory `cacheDir`, which only one server may use: locked until this is dropped or the process exits.
 pub struct CacheDir {
-    /// The folder itself, without links.
+    /// Its canonical path.
     pub folder: PathBuf,
     _lock: File,
 }
@@ -31,7 +31,7 @@ pub struct RepositoryCache {
     git: Arc<Git>,
     /// The repositories in use.
     in_use: Mutex<HashMap<PathBuf, Weak<Repository>>>,
-    /// Signals that a repository has grown, and is in use no more.
+    /// Signals that a repository has grown, and is no longer in use.
     growth: Arc<Notify>,
     _dir: CacheDir,
 }
@@ -99,7 +99,7 @@ impl RepositoryCache {
         let folder = self.folder.clone();
         blocking(move || {
             std::fs::create_dir_all(folder)?;
-            // It may not be there yet.
+            // It may not exist yet.
             File::open(&path).and_then(|folder| folder.set_modified(SystemTime::now())).ok();
             Ok(())
         })
@@ -131,7 +131,7 @@ impl RepositoryCache {
             if total <= budget {
                 return;
             }
-            // What a killed server leaves of it is evicted like a repository.
+            // If the server is killed meanwhile, the rest is later evicted like a repository.
             let removed = path.with_extension(rand::random::<u64>().to_string());
             {
                 // New users wait for the lock, and then create the repository again.

@@ -28,11 +28,11 @@ pub enum TrustSource {
     AnyCommit,
 }
 
-/// Asks the remote for all branches and tags.
+/// Lists all branches and tags of the remote.
 pub const LIST_TIPS: [&str; 6] = ["ls-remote", "--quiet", "--heads", "--tags", "--", REMOTE];
 
-/// The commit that a URL names by its full hash: then nobody need be asked what it is. `allow_any` tells whether any will
-/// do, or only one that is in a branch or tag.
+/// The commit that a URL names by its full hash, which needs no query of the remote. With `allow_any` it need not be in
+/// a branch or tag.
 pub fn commit_of(world: &ProjectUrl, allow_any: bool) -> Option<Revision> {
     let Reading { reference, folder } = world.candidates().into_iter().next()?;
     let trust = if allow_any { TrustSource::AnyCommit } else { TrustSource::Url };
@@ -43,7 +43,7 @@ fn is_hash(text: &str) -> bool {
     text.len() == 40 && text.bytes().all(|byte| byte.is_ascii_hexdigit())
 }
 
-/// Fetches all branches and tags: only their commits where the remote can do that, else everything.
+/// Fetches all branches and tags: only their commits if the remote supports that, otherwise everything.
 pub fn fetch_history() -> Vec<String> {
     fetch(&["--filter=tree:0", "--prune"], &["+refs/heads/*:refs/heads/*", "+refs/tags/*:refs/tags/*"])
 }
@@ -54,7 +54,7 @@ fn fetch(options: &[&str], references: &[&str]) -> Vec<String> {
     [&["fetch"], options, &common, references].concat().into_iter().map(str::to_owned).collect()
 }
 
-/// Asks the remote for all branches and tags that a URL may mean.
+/// Lists the branches and tags of the remote that a URL may mean.
 pub fn search_arguments(world: &ProjectUrl) -> Vec<String> {
     let names = world.candidates().into_iter().flat_map(|reading| full_names(&reading));
     ["ls-remote", "--quiet", "--", REMOTE].map(str::to_owned).into_iter().chain(names).collect()
@@ -64,7 +64,7 @@ fn full_names(reading: &Reading) -> [String; 2] {
     [format!("refs/heads/{}", reading.reference), format!("refs/tags/{}", reading.reference)]
 }
 
-/// What the remote has of what was asked for: the longest names first, branches before tags.
+/// Parses the answer to [`search_arguments`]: what the remote has, the longest names first, branches before tags.
 pub fn found(world: &ProjectUrl, answer: &str) -> Vec<Revision> {
     let known: Vec<(&str, &str)> = answer.lines().filter_map(|line| line.split_once('\t')).collect();
     let readings = world.candidates().into_iter().rev();
@@ -83,8 +83,8 @@ pub fn found(world: &ProjectUrl, answer: &str) -> Vec<Revision> {
 }
 
 impl Revision {
-    /// Its reference in the cached repository. A commit that was fetched only because `anyCommit` is set has a name apart, so that it does not
-    /// run once that is off.
+    /// Its reference in the cached repository. A commit that only `anyCommit` allows has a separate one, so that it
+    /// does not run once that key is off.
     pub fn reference(&self) -> String {
         let kind = if self.trust == TrustSource::AnyCommit { "any" } else { "fleet" };
         format!("refs/{kind}/{}", self.commit)
@@ -95,7 +95,7 @@ impl Revision {
         fetch(&["--depth=1"], &[&format!("+{}:{}", self.commit, self.reference())])
     }
 
-    /// Asks for an entry of the repository, and for all that is directly in the folders above the project's.
+    /// Lists an entry of the repository, and everything directly in the directories above the project's.
     pub fn list_arguments(&self, path: &str) -> Vec<String> {
         let root = (!self.folder.is_empty()).then_some(".".to_owned());
         let above = self.folder.match_indices('/').filter_map(|(end, _)| Some(format!("{}/", self.folder.get(..end)?)));
@@ -103,8 +103,8 @@ impl Revision {
         fixed.into_iter().chain(root).chain(above).collect()
     }
 
-    /// Reads the answer: the files directly in the folders above the project's, each path ended by a zero byte, if there is
-    /// a file at `path`.
+    /// Parses the answer: the files directly in the directories above the project's, each path ended by a zero byte;
+    /// `None` if there is no file at `path`.
     pub fn files_above(&self, answer: &[u8], path: &str) -> Option<Vec<u8>> {
         let is_file = |entry: &&[u8]| entry.starts_with(b"100") || entry.starts_with(b"120");
         let files = answer.split(|byte| *byte == 0).filter(is_file);

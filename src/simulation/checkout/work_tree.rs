@@ -46,7 +46,7 @@ pub fn checkout_command(
     Ok(call)
 }
 
-/// Writes a project of at most so many MiB with git, with its large files if git-lfs is there; `on_line` receives git's
+/// Checks a project of at most `limit` MiB out, with its large files if git-lfs is installed; `on_line` receives git's
 /// progress lines. Blocks its thread.
 ///
 /// # Errors
@@ -92,7 +92,7 @@ pub async fn write(
     })
 }
 
-/// Settings with which a checkout loads large files from where the repository is, whatever the repository says.
+/// Settings that make a checkout load large files from the repository's remote, whatever the repository configures.
 fn lfs_settings(remote: &Remote) -> Vec<String> {
     let location = &remote.location;
     let url = match remote.protocol {

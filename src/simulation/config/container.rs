@@ -11,7 +11,7 @@ keys! {
 #[serde(rename_all = "camelCase", default, deny_unknown_fields)]
 pub struct ContainerSettings {
     /// The image of Webots for a world whose project has no Dockerfile. `{version}` is that of the world, such as R2023b,
-    /// `{ubuntu}` the Ubuntu that the image of that version has. Default: `cyberbotics/webots.cloud:{version}-ubuntu{ubuntu}`.
+    /// `{ubuntu}` the Ubuntu version of its image. Default: `cyberbotics/webots.cloud:{version}-ubuntu{ubuntu}`.
     pub image: String = "cyberbotics/webots.cloud:{version}-ubuntu{ubuntu}".to_owned(),
     /// The image of the editor that a project may request. Default: that of the original.
     pub editor_image: String = "benjamindeleze/theia-test:test3".to_owned(),
@@ -33,7 +33,7 @@ pub struct ContainerSettings {
     /// Directories of the machine that are mounted in containers, as `FOLDER:PATH` or `FOLDER:PATH:ro`. Default: none.
     #[serde(deserialize_with = "one_or_many")]
     pub mounts: Vec<String> = Vec::new(),
-    /// Images that are built at a time. Default: 3.
+    /// Images that are built or pulled at a time. Default: 3.
     #[serde(deserialize_with = "whole::<1, 1000, _, _>")]
     pub builds: usize = 3,
     /// Days after which an image that this server has built is removed, unless a container uses it. Default: 14.

@@ -35,19 +35,19 @@ impl fmt::Display for IsolationSetting {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum SandboxNetwork {
-    /// One of each simulation's own, or the server does not start.
+    /// A separate one for each simulation; the server does not start without it.
     Own,
     /// The machine's.
     Shared,
-    /// One of each simulation's own where pasta works, otherwise the machine's.
+    /// A separate one for each simulation if pasta works, otherwise the machine's.
     #[default]
     Auto,
-    /// One of each simulation's own, without the internet. Clients reach Webots all the same.
+    /// A separate one for each simulation, without the internet. Clients still reach Webots.
     Closed,
 }
 
 impl SandboxNetwork {
-    /// Whether the administrator relies on it.
+    /// Whether the administrator requires a separate network for each simulation.
     pub fn is_demanded(self) -> bool {
         matches!(self, Self::Own | Self::Closed)
     }

@@ -23,7 +23,7 @@ pub struct Remote {
 }
 
 impl Remote {
-    /// What is the same for every spelling of the repository: Git hosts ignore case, and git's ending.
+    /// A key that is the same for every spelling of the repository: Git hosts ignore case and the ending `.git`.
     pub fn key(&self) -> String {
         if self.protocol == "file" {
             return self.location.clone();
@@ -45,7 +45,7 @@ impl Mirrors {
         self.0.iter().filter(|(prefix, _)| prefix.covers(world)).max_by_key(|(prefix, _)| prefix.depth())
     }
 
-    /// The same world where its repository is cloned from this URL; nothing where none would be, from the same Git host.
+    /// The same world in the repository that is fetched from this URL; `None` if no URL on its Git host leads to that.
     pub fn moved(&self, world: &ProjectUrl, location: &str) -> Option<ProjectUrl> {
         let mirror = self.mirror(world).map(|(prefix, replacement)| (prefix.as_str(), replacement.as_str()));
         let (prefix, base) = mirror.unwrap_or((GITHUB, GITHUB));
@@ -56,7 +56,7 @@ impl Mirrors {
         (self.remote(&moved)?.key() == there.key()).then_some(moved)
     }
 
-    /// Where the repository of a world is cloned from; nothing for a Git host that is neither GitHub nor in a mirror.
+    /// The remote of a world's repository; `None` for a Git host that is neither GitHub nor mirrored.
     pub fn remote(&self, world: &ProjectUrl) -> Option<Remote> {
         let Some((prefix, replacement)) = self.mirror(world) else {
             let location = format!("{GITHUB}/{}.git", escaped(world.repository_segments()));

@@ -1,4 +1,4 @@
-//! The keys `limits` and `gpus`: what one simulation may take of the machine.
+//! The keys `limits` and `gpus`: the resources that one simulation may use.
 
 use serde::{Deserialize, Serialize};
 
@@ -37,7 +37,7 @@ pub struct ResourceLimits {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum GpuUse {
-    /// What drivers choose, which is the first; containers get all.
+    /// The first, which drivers choose by themselves; containers get all.
     #[default]
     First,
     /// The one with the least load when it starts.

@@ -40,11 +40,11 @@ pub struct SimulationConfig {
     /// Whether a reverse proxy rewrites ports in URLs: HOST/PORT, not HOST:PORT. Default: true.
     pub port_rewrite: bool = true,
     /// How clients reach this server and its simulations through one reverse proxy: a URL with the placeholders
-    /// `{host}` (that is `server`) and `{port}`. Default: none, and they are reached under their own addresses.
+    /// `{host}` (that is `server`) and `{port}`. Default: none, so that each has its own address.
     pub public_url: Option<PublicUrl> = None,
     /// How clients reach the streams of simulations: at the ports of their Webots, or through this server. Default: `direct`.
     pub streaming: Streaming = Streaming::default(),
-    /// Folder of `simulation/output.log`, `simulation/monitor.csv` and the instances' output. Default: `log`.
+    /// Directory of `simulation/output.log`, `simulation/monitor.csv` and the instances' output. Default: `log`.
     pub log_dir: ExpandedPath = ExpandedPath("log".into()),
     /// Log to standard output. Default: false.
     pub debug: bool = false,
@@ -99,11 +99,11 @@ pub struct SimulationConfig {
     /// because a class sits behind one address.
     #[serde(deserialize_with = "optional_whole::<1, 1_000_000, _, _>")]
     pub max_clients_per_address: Option<usize> = None,
-    /// Limit of slots per client address; as many of its clients may wait. Default: all, because a class sits
+    /// Limit of slots per client address; the same number of its clients may wait. Default: all, because a class sits
     /// behind one address.
     #[serde(deserialize_with = "optional_whole::<1, 10_000, _, _>")]
     pub max_places_per_address: Option<usize> = None,
-    /// Limit of slots per user (`userHeader`); as many of its clients may wait. Default: all.
+    /// Limit of slots per user (`userHeader`); the same number of the user's clients may wait. Default: all.
     #[serde(deserialize_with = "optional_whole::<1, 10_000, _, _>")]
     pub max_places_per_user: Option<usize> = None,
     /// The header in which a reverse proxy of `trustedProxies` sends the user's name, such as `X-Forwarded-User`.
@@ -126,8 +126,7 @@ pub struct SimulationConfig {
     /// Where repositories are fetched from instead of their URL: {URL prefix: replacement}. Default: none.
     pub git_mirrors: Mirrors = Mirrors::default(),
     /// File of settings for git, in git's own format: a proxy, certificates, credentials. They add to those of the
-    /// machine.
-    /// Default: none.
+    /// machine. Default: none.
     pub git_config: Option<ExpandedPath> = None,
     /// Directory of cached repositories and of the projects of running simulations. Default: `cache`.
     pub cache_dir: ExpandedPath = ExpandedPath("cache".into()),
@@ -179,14 +178,14 @@ impl SimulationConfig {
         self.gpus == GpuUse::Spread && (self.container.gpu || !self.docker)
     }
 
-    /// The displays of the GPUs, where Webots opens its windows on them.
+    /// The displays of the GPUs, if Webots opens its windows on them.
     pub fn displays_of_gpus(&self) -> &[String] {
         let in_container = self.container.display == ContainerDisplay::Virtual;
         let is_virtual = if self.docker { in_container } else { self.xvfb };
         if self.spreads() && !is_virtual { &self.displays } else { &[] }
     }
 
-    /// The display on which a Webots opens its window that has this GPU, if it has one.
+    /// The display for the window of a Webots with this GPU, or without a GPU of its own.
     pub fn display_on(&self, gpu: Option<u32>) -> String {
         let own = self.displays_of_gpus().get(gpu.unwrap_or_default() as usize);
         display::effective(own.or(self.display.as_ref()))

@@ -36,7 +36,7 @@ pub struct Timing {
     /// Time for which a simulation waits for a disconnected client; 0: not at all. Default: 60.
     #[serde(with = "seconds_or_zero")]
     pub absence: Duration = Duration::from_mins(1),
-    /// Timeout of open connections and simulations when the server stops. Default: 9.
+    /// Timeout of simulations when the server stops. Default: 9.
     #[serde(with = "seconds")]
     pub stop: Duration = Duration::from_secs(9),
     /// Interval between two attempts to announce the server. Default: 5.

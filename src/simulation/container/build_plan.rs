@@ -52,9 +52,9 @@ pub struct ProjectPaths {
 
 /// Arguments of the Dockerfile of a participant's controller.
 const PARTICIPANT: [&str; 2] = ["WEBOTS_CONTROLLER_URL=participant", "DEFAULT_CONTROLLER=participant"];
-/// The Dockerfile of a project with a Makefile that has none.
+/// The Dockerfile for a project that has a Makefile, but no Dockerfile.
 const DOCKERFILE: &str = include_str!("../../../config/simulation/docker/Dockerfile.default");
-/// The Dockerfile of a competition's controllers that have none.
+/// The Dockerfile for the controllers of a competition if they have none.
 const CONTROLLER_DOCKERFILE: &str = include_str!("../../../config/simulation/docker/Dockerfile.controller");
 /// The launcher of a participant's controller.
 const LAUNCHER: &str = "remote_controller_launcher.py";
@@ -108,8 +108,8 @@ impl ProjectPaths {
     }
 }
 
-/// The Dockerfile of a competition's controllers. Writes the launcher to the paths from which this one and the
-/// project's can copy it.
+/// The Dockerfile of a competition's controllers. Writes the launcher to the directories from which this Dockerfile
+/// and the project's can copy it.
 fn competition(project: &Path) -> Result<String, String> {
     let controllers = inside(project, Path::new("controllers"))?;
     for folder in [project, &controllers] {
@@ -140,7 +140,7 @@ pub fn inside(project: &Path, folder: &Path) -> Result<PathBuf, String> {
 /// `controller "<extern>"` in the world.
 ///
 /// # Errors
-/// When the file can't be read or written: the project's fault if it is no text, or its image has closed or replaced it.
+/// When the file can't be read or written. The project is the cause if it is not a text, or its image denies access.
 fn open_participant(world: &Path) -> Result<(), StartError> {
     let open = || {
         let text = std::fs::read_to_string(world)?.replace("controller \"participant\"", "controller \"<extern>\"");

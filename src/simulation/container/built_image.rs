@@ -1,9 +1,9 @@
-//! An image that this server has built: how its containers start, and what they may change of it.
+//! An image that this server has built: how its containers start, and which of its files they may change.
 //!
 //! Simulations run as the server's user, so that the server can read, measure and remove what they write, and so that
 //! no program in a directory of this machine ever runs as root. Official images of Webots keep assets and settings in
-//! the home directory of root, so each container begins with a home directory that has what that of the image's own
-//! user has.
+//! the home directory of root, so each container starts with a home directory that has the files of the home of the
+//! image's own user.
 
 use std::path::Path;
 use std::time::Duration;
@@ -19,7 +19,7 @@ use crate::shared::text::one_line;
 use crate::simulation::checkout::{Project, outgrown};
 use crate::simulation::process::remove_tree;
 
-/// An image: its name, and the configuration of its programs, as Docker tells it.
+/// An image: its name, and the configuration of its programs, as Docker reports it.
 #[derive(Debug, Default, Deserialize)]
 #[serde(rename_all = "PascalCase", default)]
 pub struct BuiltImage {
@@ -74,8 +74,8 @@ impl BuiltImage {
 }
 
 /// Copies a directory of an image to `to`, where containers can change it: the build may have created files in it. `to` is
-/// created or replaced, by a temporary directory of the project's instance. `name` is the compose project, which the
-/// container for this is named after; `size` the limit, in MiB.
+/// created or replaced, through a temporary directory of the project's instance. `name` is the compose project, from
+/// which the name of the temporary container derives; `size` is the limit in MiB.
 ///
 /// # Errors
 /// Why not, as text for the client.

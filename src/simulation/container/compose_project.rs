@@ -25,7 +25,7 @@ pub struct ContainerRequest {
     pub port: u16,
     /// The GPU that it was given; without one, it gets all.
     pub gpu: Option<Gpu>,
-    /// Webots and its arguments, but for the world, which is the last.
+    /// Webots and its arguments, without the world, which comes last.
     pub command: Vec<String>,
 }
 
@@ -49,7 +49,7 @@ pub struct ComposeProject {
 /// The access that containers can have to the GPUs of this machine.
 #[derive(Debug)]
 pub struct GpuAccess {
-    /// Whether Docker can give out NVIDIA GPUs.
+    /// Whether Docker can give containers NVIDIA GPUs.
     pub nvidia: bool,
     /// The groups of the devices of other GPUs; `None` if there are no such GPUs.
     pub groups: Option<BTreeSet<u32>>,
@@ -66,7 +66,7 @@ const VIRTUAL_DISPLAY: [&str; 2] = ["xvfb-run", "--auto-servernum"];
 /// The directory with the sockets of the machine's displays.
 const DISPLAYS: &str = "/tmp/.X11-unix";
 
-/// The program by which Docker gives out NVIDIA GPUs: part of NVIDIA's container toolkit.
+/// The program by which Docker gives containers NVIDIA GPUs: part of NVIDIA's container toolkit.
 const NVIDIA_HOOK: &str = "nvidia-container-runtime-hook";
 /// A device of NVIDIA's driver.
 const NVIDIA: &str = "/dev/nvidiactl";
@@ -85,7 +85,7 @@ impl ComposeProject {
         let network = json!({ "default": { "external": true, "name": self.config.container.network.name() } });
         let project = json!({ "services": services, "networks": network });
         let file = self.request.project.instance.path().join("compose.json");
-        // Compose would replace what looks like a variable.
+        // Without this, compose would expand variables.
         std::fs::write(&file, project.to_string().replace('$', "$$"))?;
         let options = ["--project-name", &self.name, "--file", &file.to_string_lossy()].map(str::to_owned);
         Ok((options.into(), services.into_keys().collect()))
@@ -96,12 +96,12 @@ impl ComposeProject {
         self.request.project.instance.path().join("ipc")
     }
 
-    /// The services. An editor sees nothing of the project but its directory; a controller also has that of Webots.
+    /// The services. An editor mounts only its directory of the project; a controller also the exchange with Webots.
     fn services(&self, paths: &ProjectPaths) -> BTreeMap<&'static str, Service> {
         let (config, port, access) = (&self.config, self.request.port, GpuAccess::find());
         let mount = |folder: &Path, to: &str| format!("{}:{to}", folder.display());
         let published = |outside: u16, to: u16| json!([format!("{}:{outside}:{to}", config.bind_of_containers())]);
-        // Webots up to R2023a uses the first one, later ones make directories for users and ports in the second one.
+        // Webots up to R2023a uses the first path; later versions create directories per user and port in the second.
         let exchange =
             || [format!("/tmp/webots-{port}"), "/tmp/webots".to_owned()].map(|to| mount(&self.exchange(), &to));
         let service = |name, image: &str, volumes, environment: &[(&'static str, String)]| {
@@ -120,7 +120,7 @@ impl ComposeProject {
         let mut services = BTreeMap::from([(WEBOTS, webots)]);
         if let Some(image) = &self.controller {
             let participant = mount(&paths.edited, &format!("/usr/local/{}", self.yml.folder));
-            // webots-controller finds Webots by its port, and takes to Webots' console what the participant prints.
+            // webots-controller finds Webots by its port, and forwards the participant's output to Webots' console.
             let environment = [
                 ("PORT", port.to_string()),
                 ("WEBOTS_CONTROLLER_URL", "participant".to_owned()),
@@ -129,7 +129,7 @@ impl ComposeProject {
             ];
             let volumes = exchange().into_iter().chain([participant]).collect();
             let mut controller = service(CONTROLLER, &image.name, volumes, &environment);
-            // A program that sees a terminal prints each line at once.
+            // With a terminal, programs flush their output after each line.
             controller.insert("tty", json!(true));
             controller.insert("entrypoint", json!(image.entrypoint()));
             controller.insert("command", json!(image.command()));
@@ -155,7 +155,7 @@ impl ComposeProject {
 }
 
 impl GpuAccess {
-    /// Looks for the GPUs.
+    /// Detects the GPUs.
     pub fn find() -> Self {
         let group = |file: std::fs::DirEntry| Some(file.metadata().ok()?.gid());
         let groups = std::fs::read_dir(DRI).ok().map(|files| files.flatten().filter_map(group).collect());
@@ -187,7 +187,7 @@ fn protected(
         ("security_opt", json!([format!("no-new-privileges:{}", !settings.new_privileges)])),
         ("user", json!(format!("{}:{}", nix::unistd::getuid(), nix::unistd::getgid()))),
         ("tmpfs", json!(in_memory)),
-        // What a browser's engine inside of Webots needs.
+        // The browser engine inside Webots needs it.
         ("shm_size", json!("256m")),
         ("mem_limit", json!(memory)),
         ("memswap_limit", json!(memory)),
@@ -196,7 +196,7 @@ fn protected(
         ("logging", json!({ "driver": "none" })),
         // Reaps orphans and forwards signals.
         ("init", json!(true)),
-        // The daemon would run it, at the interval of the image.
+        // The daemon would run the health check of the image, at an interval that the image chooses.
         ("healthcheck", json!({ "disable": true })),
     ]);
     service.extend(limits.cores.map(|cores| ("cpus", json!(cores))));
@@ -224,7 +224,7 @@ fn protected(
             service.insert("group_add", json!(groups.iter().map(u32::to_string).collect::<Vec<_>>()));
         }
         if access.nvidia {
-            // An image may ask for all by this variable.
+            // An image may request all GPUs by this variable.
             environment.extend(gpu.map(|gpu| ("NVIDIA_VISIBLE_DEVICES", gpu.id.clone())));
             let (key, value) = gpu.map_or(("count", json!("all")), |gpu| ("device_ids", json!([gpu.id])));
             let devices = json!({ "driver": "nvidia", key: value, "capabilities": ["gpu"] });

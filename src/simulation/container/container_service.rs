@@ -43,7 +43,7 @@ const ALONE: &str = "com.docker.network.bridge.enable_icc=false";
 const CREATE_TIMEOUT: Duration = Duration::from_mins(2);
 
 impl ContainerService {
-    /// Opens the service on the thread of this runtime. `run` is the directory of this run of the server. Removes what
+    /// Opens the service on the current runtime. `run` is the directory of this run of the server. Removes what
     /// an earlier run has left. Blocks for a moment.
     ///
     /// # Errors
@@ -111,7 +111,7 @@ impl ContainerService {
         let compose = ComposeProject { name, request, yml, image, controller, config };
         let (written, ComposeProject { yml, .. }) = spawn_blocking(move || (compose.write(), compose)).await?;
         let (options, services) = written?;
-        // More concurrent runs would only be slower. It is never closed.
+        // More concurrent runs would only be slower. The semaphore is never closed.
         let turn = self.turns.acquire().await.ok();
         progress("Creating network and containers".to_owned());
         let up = ["up", "--no-start", "--no-build"].map(str::to_owned);
@@ -144,7 +144,7 @@ async fn join_network(docker: &Docker, name: &str) -> Result<(), DockerError> {
     let interface = format!("com.docker.network.bridge.name={name}");
     let create = ["network", "create", "--driver", "bridge", "--opt", &interface, "--opt", ALONE, name];
     match docker.run(&create, SHORT_TIMEOUT).await {
-        // Two that are created at the same time would have the same interface, which Docker refuses.
+        // Of two concurrent creations Docker refuses the second, because both name the same interface.
         Err(DockerError::Failed { message, .. })
             if message.contains("already exists") || message.contains("have same bridge name") =>
         {

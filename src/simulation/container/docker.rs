@@ -59,9 +59,9 @@ pub enum StartError {
 pub const SHORT_TIMEOUT: Duration = Duration::from_secs(30);
 /// Timeout of the daemon's answer.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
-/// How lines begin that follow the reason: which containers were not started, and where to find help.
+/// Prefixes of the lines after the reason: which containers were not started, and where to find help.
 const AFTER_REASON: [&str; 3] = ["Error: failed to start containers", "See 'docker", "Run 'docker"];
-/// How a message begins that says that nobody listens.
+/// Parts of messages, in lower case, which say that the daemon can't be reached.
 const NO_DAEMON: [&str; 4] = [
     "cannot connect to the docker daemon",
     "couldn't connect to docker daemon",
@@ -169,7 +169,7 @@ fn name_of(command: &[OsString]) -> String {
     words.map(|word| word.to_string_lossy()).collect::<Vec<_>>().join(" ")
 }
 
-/// Keeps a line that a command prints if it may be why that fails: the last one, or the one that tells of no daemon.
+/// Keeps a printed line if it may be the reason of a failure: the last one, or the first one about a missing daemon.
 fn note(reason: &mut String, line: &str) {
     let line = line.trim();
     if !line.is_empty() && !AFTER_REASON.iter().any(|begin| line.starts_with(begin)) && !has_no_daemon(reason) {
@@ -197,7 +197,7 @@ fn result(command: String, ran: Result<Ran, RunError>, reason: String) -> Result
     }
 }
 
-/// The cause if Docker fails with the containers of a simulation. `is_projects` tells whether the project has defined
+/// The cause if Docker fails with the containers of a simulation. `is_projects`: whether the project has defined
 /// one of their images: then the project is the cause, unless the disk is full.
 pub fn blame(is_projects: bool, error: DockerError) -> StartError {
     match &error {

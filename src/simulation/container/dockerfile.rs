@@ -7,17 +7,17 @@ use crate::shared::text::excerpt;
 /// A Dockerfile that this server builds.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Dockerfile {
-    /// Its text, in which every stage has the label of its owner, and the last one opens the home of its user.
+    /// Its text, in which every stage has the label of its owner, and the last one makes the home of its user readable.
     pub text: String,
-    /// What its stages begin with, as it stands after each `FROM`.
+    /// The base images of its stages, as written after each `FROM`.
     pub bases: Vec<String>,
 }
 
 /// The label of everything that this server has built, also of leftovers of failed builds.
 pub const LABEL: &str = "webots-fleet.owner";
-/// The last instruction: the server's user may read what the image's own user has at home, such as the assets and settings of
-/// Webots in `/root`. A file whose mode changes is copied into a layer of the image, so that only those change that have to.
-/// Users other than root may not change the mode of all.
+/// The last instruction: lets the server's user read the home of the image's own user, such as the assets and settings
+/// of Webots in `/root`. It changes only the modes that it must, because each changed file is copied into a layer. It
+/// fails only for root, because other users can't change the modes of all files.
 const OPEN_HOME: &str = concat!(
     r#"RUN ["/bin/sh","-c","[ ! -d \"$HOME\" ] || [ \"$HOME\" = / ] || find \"$HOME\" -xdev "#,
     r#"\\( -type d ! -perm -5 -o -type f ! -perm -4 \\) -exec chmod a+rX {} + || [ $(id -u) != 0 ]"]"#,
@@ -48,7 +48,7 @@ impl Dockerfile {
             found.text.push('\n');
             let words = line.trim();
             if words.is_empty() || words.starts_with('#') {
-                // It changes the character by which lines are continued. Docker knows two.
+                // This directive would change the line continuation character from backslash to backtick.
                 let comment = words.trim_start_matches('#').trim_start().to_lowercase();
                 if comment.starts_with("escape") && comment.contains('`') {
                     return Err(wrong(number, line, "the escape character has to be \\"));
@@ -75,7 +75,7 @@ impl Dockerfile {
             return Err(wrong(first, &instruction, "the file ends within it"));
         }
         found.text.push_str(OPEN_HOME);
-        // What the project says of it does not count. Writing to a string can't fail.
+        // This overrides a label of the project. Writing to a string can't fail.
         writeln!(found.text, "LABEL {LABEL}={owner}").ok();
         Ok(found)
     }
@@ -86,8 +86,8 @@ impl Dockerfile {
         let keyword = words.next().unwrap_or_default().to_uppercase();
         let mut words: Vec<&str> = words.skip_while(|word| word.starts_with("--")).collect();
         match keyword.as_str() {
-            // The classic builder's parser recognizes them, though, and may take other lines for instructions than this
-            // check does.
+            // The classic builder's parser recognizes here-documents all the same, and may take other lines for
+            // instructions than this check does.
             "RUN" | "ADD" | "COPY" if instruction.contains("<<") => return Err(NO_HERE_DOCUMENT),
             "VOLUME" => return Err(NO_VOLUME),
             "ADD" => {

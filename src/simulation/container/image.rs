@@ -21,7 +21,7 @@ use crate::simulation::process::DiskRoom;
 /// The images of this server.
 pub struct Images {
     docker: Docker,
-    /// Who has built them.
+    /// The owner in their labels.
     pub owner: ResourceOwner,
     config: Arc<SimulationConfig>,
     /// Limits concurrent builds.
@@ -31,17 +31,16 @@ pub struct Images {
 
 /// How a Dockerfile names the image of the world's version of Webots.
 const DEFAULT_BASE: [&str; 2] = ["$WEBOTS_DEFAULT_IMAGE", "${WEBOTS_DEFAULT_IMAGE}"];
-/// Formats of what is asked of an image: its id, which differs from those of later images of the same name, and the
-/// configuration of its programs.
+/// Formats of `docker image inspect`: the id, which differs from those of later images of the same name, and the
+/// configuration of the image's programs.
 const ID: &str = "{{.Id}}";
 const CONFIG: &str = "{{json .Config}}";
 /// The largest number of steps that Webots' page understands: each number has one digit.
 const STEPS: u64 = 9;
-/// Time between two removals of old images, and after one that failed: Docker prunes for one at a time, also of other servers.
+/// Interval between two prunings, and after a failed one: Docker runs one at a time, also of other servers.
 const PRUNE_INTERVAL: Duration = Duration::from_mins(5);
 const RETRY_INTERVAL: Duration = Duration::from_secs(5);
-/// How old an image is at least that is removed because the disk is full, in hours: one that was just built has no container
-/// yet.
+/// Minimum age of an image that is removed because the disk is full, in hours: a newly built one has no container yet.
 const MIN_AGE: u64 = 1;
 
 impl Images {
@@ -82,8 +81,8 @@ impl Images {
         build.arguments.push(format!("WEBOTS_DEFAULT_IMAGE={webots}"));
         let mut parts = [vec![build.dockerfile.text.clone()], build.arguments.clone()].concat();
         parts.extend(build.folder.into_iter().flat_map(|folder| [project.identity(), folder.to_owned()]));
-        // An image's name stays the same when the image is updated, so its id is part of the key. A base that is not here
-        // yet has none: the build fetches it.
+        // An image's name stays the same when the image is updated, so its id is part of the key. A base that is not
+        // here yet has no id: the build fetches it.
         for base in &build.dockerfile.bases {
             let is_default = DEFAULT_BASE.contains(&base.as_str());
             parts.extend(if is_default {
@@ -99,7 +98,7 @@ impl Images {
         Ok(BuiltImage::read(name, &config)?)
     }
 
-    /// Makes an image by this job unless it exists. Returns what Docker says of it in this format.
+    /// Makes an image by this job unless it exists. Returns what Docker reports about it in this format.
     async fn made<F: Future<Output = Result<(), StartError>> + Send + 'static>(
         &self,
         name: &str,
@@ -123,7 +122,7 @@ impl Images {
         build: ImageBuild,
         sender: watch::Sender<String>,
     ) -> Result<(), StartError> {
-        // What has no step of a project takes seconds.
+        // A build without steps of a project takes seconds.
         let _permit = if build.folder.is_some() { Some(self.permit(&sender).await?) } else { None };
         let ImageBuild { dockerfile, folder, arguments } = build;
         let (instance, root) = (project.instance.path().to_owned(), project.folder.clone());
@@ -155,7 +154,7 @@ impl Images {
         done.map_err(|error| not_built(&step, error))
     }
 
-    /// Waits until it may be built.
+    /// Waits until another image may be built or pulled.
     async fn permit(&self, sender: &watch::Sender<String>) -> Result<SemaphorePermit<'_>, StartError> {
         if let Ok(permit) = self.builds.try_acquire() {
             return Ok(permit);
@@ -167,7 +166,7 @@ impl Images {
         permit.ok_or_else(|| StartError::Server(why()))
     }
 
-    /// What Docker says of an image in this format; `None` if it does not exist.
+    /// What Docker reports about an image in this format; `None` if it does not exist.
     async fn inspect(&self, image: &str, format: &str) -> Result<Option<String>, StartError> {
         match self.docker.run(&["image", "inspect", "--format", format, image], SHORT_TIMEOUT).await {
             Ok(found) => Ok(Some(found.trim().to_owned())),
@@ -176,8 +175,8 @@ impl Images {
         }
     }
 
-    /// Removes the old images that this server has built and that no container uses, and what builds that failed have left.
-    /// Docker keeps the base images: it knows ours by their label. Never returns.
+    /// Removes old images that this server has built and no container uses, and leftovers of failed builds. Images
+    /// without this server's label stay, such as base images. Never returns.
     pub async fn remove_old(self: Arc<Self>) {
         let reserve = self.config.disk_reserve;
         loop {
@@ -202,7 +201,7 @@ fn scaled(line: &str) -> Option<String> {
     Some(format!("Step {step}/{} : {instruction}", of.min(STEPS)))
 }
 
-/// Why a configured image can't be pulled: the world's version has none, or this server can't have it.
+/// Why a configured image can't be pulled: the world's version has none, or this server can't get it.
 fn not_pulled(image: &str, error: DockerError) -> StartError {
     match error {
         DockerError::Failed { message, .. } if is_unknown(&message) => no_image(image),
@@ -232,7 +231,7 @@ fn no_image(image: &str) -> StartError {
     ))
 }
 
-/// Whether a registry reports that there is no such image, or Docker that there can be none of this name.
+/// Whether a registry reports that there is no such image, or Docker that its name is invalid.
 fn is_unknown(message: &str) -> bool {
     let words =
         ["not found", "pull access denied", "manifest unknown", "repository does not exist", "invalid reference"];

@@ -1,7 +1,7 @@
-//! What a server has in Docker: the containers of its simulations, which have no networks and no named volumes of their own.
+//! What a server has in Docker: the containers of its simulations, without networks or named volumes of their own.
 //!
-//! The names of its compose projects, which those of their containers begin with, have a common prefix, so that the resources
-//! of a crashed server are found again.
+//! The name of a container begins with that of its compose project. The names of a server's compose projects have a
+//! common prefix, so that the containers of a crashed server are found again.
 
 use std::path::Path;
 use std::time::Duration;
@@ -12,24 +12,24 @@ use tokio::runtime::Handle;
 
 use super::docker::{DockerError, SHORT_TIMEOUT, blocking};
 
-/// The owner of compose projects and images: a server, or one run of it. Their names have a common prefix: that of the owner
-/// is 12 hexadecimal digits; of a run also `-` and 8 more.
+/// The owner of compose projects and images: a server, or one run of it. Their names contain the owner:
+/// 12 hexadecimal digits for a server, and `-` and 8 more for a run.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ResourceOwner(pub String);
 
-/// The name of a compose project. Dropping it removes its containers, as soon as Docker can.
+/// The name of a compose project. Dropping it removes the project's containers, as soon as Docker can.
 #[derive(Debug)]
 pub struct ProjectGuard {
     /// The name; unique on this machine.
     pub name: String,
-    /// The runtime that removes them.
+    /// The runtime that removes the containers.
     pub runtime: Handle,
 }
 
-/// How containers are removed, whatever they do.
+/// The arguments that remove containers, running or not.
 pub const REMOVE: [&str; 3] = ["rm", "--force", "--volumes"];
-/// Attempts to remove the containers of a project before they are left to the next start, how many have to succeed, since
-/// Docker may still be creating one, and the pause before each.
+/// Attempts to remove the containers of a project before they are left to the next start; how many must succeed,
+/// because Docker may still be creating one; and the pause before each.
 const TRIES: usize = 60;
 const LOOKS: usize = 3;
 const PAUSE: Duration = Duration::from_secs(2);
@@ -95,8 +95,7 @@ pub fn digest(text: &[u8]) -> String {
     digest.iter().fold(String::new(), |text, byte| format!("{text}{byte:02x}"))
 }
 
-/// Removes all containers of an owner: at the start, and for a process that watches over the server's end. What is left is
-/// removed by the next start. Blocks.
+/// Removes all containers of an owner. The next start removes what is left. Blocks.
 pub fn sweep_all(owner: &ResourceOwner) {
     sweep(&owner.prefix()).ok();
 }

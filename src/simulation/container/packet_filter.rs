@@ -1,4 +1,4 @@
-//! Checks that the packet filter is loaded, which keeps containers off this machine and private addresses:
+//! Checks that the packet filter is loaded, which keeps containers from this machine and private addresses:
 //! `deploy/nftables/containers.nft`.
 
 use std::path::Path;
@@ -10,7 +10,7 @@ use crate::simulation::process::{ExitReason, Ran, Run};
 const TABLE: &str = "webots_fleet";
 /// The table that keeps others from the streams that this server relays.
 const STREAMS: &str = "webots_streams";
-/// Asks for the unit that loads it.
+/// Checks the unit that loads it.
 const UNIT: &[&str] = &["systemctl", "is-active", "--quiet", "webots-fleet-packet-filter.service"];
 /// Timeout of the `nft` or `systemctl` call.
 const TIMEOUT: Duration = Duration::from_secs(5);

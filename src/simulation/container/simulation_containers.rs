@@ -96,7 +96,7 @@ impl SimulationContainers {
         self.restart.as_ref().map(|(request, _)| Arc::clone(request))
     }
 
-    /// Why Webots' container has ended, given the end of the program `docker`; nothing if Docker knows no more.
+    /// Why Webots' container has ended, given how the program `docker` has; `None` if Docker knows no more.
     pub async fn cause(&self, ended: ExitReason) -> Option<Cause> {
         let ExitReason::Code(code) = ended else { return None };
         let webots = self.container(WEBOTS);

@@ -1,4 +1,4 @@
-//! The resource usage of the containers of simulations, from `docker stats` once for all.
+//! The resource usage of the containers of simulations, from one call of `docker stats`.
 
 use std::collections::BTreeMap;
 
@@ -6,11 +6,11 @@ use super::docker::{SHORT_TIMEOUT, blocking};
 use super::owned_resources::ResourceOwner;
 use crate::simulation::machine::Usages;
 
-/// Measures the simulations of an owner: those on these ports, whose processes are named for each. Blocks for two
-/// seconds, which `docker stats` takes.
+/// Measures the simulations of an owner. `roots` has their root processes by port, which are the keys of the result.
+/// Blocks for two seconds, which `docker stats` takes.
 pub fn measure(owner: &ResourceOwner, roots: &BTreeMap<u16, i32>) -> Usages {
     let format = "{{.Name}}\t{{.CPUPerc}}\t{{.MemUsage}}";
-    // Of all that run: one that is named and has ended meanwhile would fail all.
+    // Without names of containers: the whole command would fail if one of them had just ended.
     let printed = blocking(&["stats", "--no-stream", "--format", format], SHORT_TIMEOUT);
     let mut all = Usages::new();
     for (name, cpu, memory) in printed.unwrap_or_default().lines().filter_map(columns) {
@@ -22,7 +22,7 @@ pub fn measure(owner: &ResourceOwner, roots: &BTreeMap<u16, i32>) -> Usages {
     all
 }
 
-/// The container, its use of the processors and its memory in a line of `docker stats`.
+/// The container, its CPU usage in percent and its memory in a line of `docker stats`.
 fn columns(line: &str) -> Option<(&str, f64, u64)> {
     let (name, rest) = line.split_once('\t')?;
     let (cpu, memory) = rest.split_once('\t')?;

@@ -103,8 +103,8 @@ pub fn text_of(path: &Path) -> Result<Option<String>, String> {
     }
 }
 
-/// What the value of `dockerCompose` requests, such as `theia:webots-project/controllers`; `None` for what nobody may
-/// request.
+/// What the value of `dockerCompose` requests, such as `theia:webots-project/controllers`; `None` if that is not
+/// allowed.
 fn request(value: &str) -> Option<(ProjectKind, String)> {
     let value = value.split_once(" #").map_or(value, |(value, _comment)| value).trim();
     let value = value.trim_matches(['"', '\'']);

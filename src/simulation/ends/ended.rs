@@ -56,7 +56,8 @@ impl EndReason {
         Self::ALL.iter().find(|(reason, _)| *reason == self).map_or("", |(_, label)| label)
     }
 
-    /// Whether its cause may have to be found, so that its output is kept for longer. A failed checkout has no output.
+    /// Whether an administrator may have to find its cause, so that its events are kept even without output. A failed
+    /// checkout does not count.
     pub fn is_abnormal(self) -> bool {
         matches!(self, Self::NoWebots | Self::Crashed | Self::Hung | Self::Limit | Self::Fault)
     }
@@ -85,7 +86,7 @@ pub struct End {
 /// A simulation that has ended.
 #[derive(Debug, Clone)]
 pub struct Ended {
-    /// What pages showed of it last.
+    /// Its last snapshot.
     pub simulation: Simulation,
     /// Its client.
     pub client: Peer,
@@ -98,7 +99,7 @@ pub struct Ended {
 }
 
 impl Ended {
-    /// Whether its output is kept for a while.
+    /// Whether its output and events are kept in a file.
     pub fn has_output(&self) -> bool {
         self.simulation.log.is_some() || self.how.reason.is_abnormal()
     }

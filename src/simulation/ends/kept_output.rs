@@ -25,7 +25,7 @@ pub fn output_file(logs: &Path, id: &str) -> Option<PathBuf> {
     if !SimulationId::is_like(id) {
         return None;
     }
-    // A process that outlives its simulation may write another file.
+    // The kept file comes first: a process that outlives its simulation may create the other one again.
     let files = [ENDED, FOLDER_OF_RUNNING].map(|folder| logs.join(folder).join(format!("{id}.log")));
     files.into_iter().find(|file| file.is_file())
 }
@@ -42,7 +42,7 @@ pub(super) fn keep(logs: &Path, ended: &Ended) -> io::Result<()> {
         return Ok(());
     }
     fs::create_dir_all(logs.join(ENDED))?;
-    // There is no output of what was never launched.
+    // A simulation that was never launched has no output.
     fs::rename(&log, &kept).ok();
     let mut file = File::options().create(true).append(true).open(kept)?;
     write!(file, "\n\nWhat has happened:\n\n{}\n", ended.events.join("\n"))
@@ -83,7 +83,7 @@ pub fn last_lines(file: &Path, most: u64) -> io::Result<String> {
     let mut bytes = Vec::new();
     file.take(most).read_to_end(&mut bytes)?;
     let text = String::from_utf8_lossy(&bytes);
-    // A cut text begins in the middle of a line.
+    // A text that was cut begins in the middle of a line.
     let whole = if skipped > 0 { text.split_once('\n').map_or("", |(_, rest)| rest) } else { &text };
     Ok(whole.to_owned())
 }
