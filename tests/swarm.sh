@@ -132,7 +132,7 @@ class() { # CLIENTS OVER STAY REAL_TIME ARGUMENT...
 # machine is. Nothing of another class is there any more. $clients is to be waited for.
 full_class() { # CLIENTS
     within 60 everywhere run_simulations 0
-    class "$1" 1s 20s 0.01 &
+    class "$1" 1s 12s 0.01 &
     clients=$!
     within 60 everywhere run_simulations "$1"
 }
