@@ -9,6 +9,8 @@ use crate::inside::Inside;
 use crate::support::until;
 
 pub async fn a_simulation_ends_at_its_time_limit_in_any_state() {
+    // At level `none`, what hides lives as long as the server.
+    needs!("bwrap");
     for stage in [Stage::Launching, Stage::Idle, Stage::Running, Stage::Stopping] {
         let inside = Inside::new(stage, |config| {
             config.timeout = 5;
