@@ -14,31 +14,32 @@
 //! | [`session::mail`] | notices: to whom (`smtp`, one address, from the key `administrator` in `config/session_config`) and how (`channel`), what is in them (`notice_text`), when they are sent (`outbox`) |
 //! | [`session::fleet`] | the registry and the monitors of simulation servers |
 //! | [`session::web`] | routes, pages, `/status`, Prometheus metrics (gauges in `metrics`, counters in `app`) and the WebSocket of the session server |
-//! | [`simulation::process`] | process trees: how they start and end (`process_group`; leftovers of a dead server: `process_tree`, `guardian`); directories of simulations |
+//! | [`simulation::process`] | process trees: how they start and end (`process_group`: SIGTERM, grace period, SIGKILL; leftovers of a dead server: `process_tree`, `guardian`); directories of simulations |
 //! | [`simulation::machine`] | readings of the machine (`sensors`) and its GPUs (`gpus`), the load and `monitor.csv` (`load_monitor`); which GPU a simulation gets (`spread`) |
-//! | [`simulation::checkout`] | worlds checked out with git; `timing.checkout` limits a whole checkout (`checkout_service`) and a stalled fetch (`git`), `projectSize` its size; `config/mirrors` has the address of each Git host |
+//! | [`simulation::checkout`] | worlds checked out with git; `timing.checkout` limits a whole checkout (`checkout_service`), each git command, and by a quarter of it a silent remote (`git`); `projectSize` limits its size; the simulation server's `config/mirrors` has GitHub's address and the mirrors of others |
 //! | `simulation::isolation` | how a simulation is launched: its level of isolation (`launcher`), the variables that it inherits, limits; the control group that ends with it (`cgroup`) |
-//! | [`simulation::container`] | simulations in containers: what a project requests, its image, its compose project (its GPU and user, too) |
+//! | [`simulation::container`] | simulations in containers: what a project requests, its image, its compose project (`compose_project`, with its GPU and user) |
 //! | [`simulation::ends`] | how simulations have ended: counter, table, their logs (`kept_output`) |
-//! | [`simulation::webots`] | one running Webots: its command line and GPU (`launch_spec`), its log (path and size in `launched`, its lines in `output`), its end (`launched`) |
+//! | [`simulation::webots`] | one running Webots: its command line and GPU (`launch_spec`), its log (path and size in `launched`, its lines in `output`), the wait for its end (`launched`) |
 //! | [`simulation::client`] | a client's WebSocket (`web_client`), the session of its simulation, which sends it nearly all messages (`session`; `start`: before Webots runs, with the choice of the GPU) |
 //! | [`simulation::sessions`] | how a connection is attached to its session, and how a client resumes it |
 //! | [`simulation::slots`] | the slots that clients wait for: leases, the queue and the shares of addresses and users (`slot_pool`), the streams of simulations and the tokens that identify them (`stream`) |
 //! | `simulation::relay` | a stream between a client and the port of its Webots |
 //! | `simulation::web` | routes, pages, `/status` and Prometheus metrics of the simulation server (gauges in `metrics`, counters in `app` and `ends`) |
 //!
-//! The HTML of pages is in `templates/session` and `templates/simulation` (`monitor.html`: the head of
-//! the monitor's table, `row.html`: a row), their styles (`style.css`) and scripts in `templates/assets`.
+//! The HTML of pages is in `templates/session` and `templates/simulation` (`monitor.html`: the head of the monitor's
+//! table, `row.html`: a row), their styles (`style.css`) and scripts in `templates/assets`. A column of `monitor.csv`
+//! appears in the charts (`charts.js` groups them by unit); the figures above are in `glance.html`.
 //!
-//! Each server also has a directory `config` (every key; time limits in `timing`), its `app` (start and end) and its
-//! `state` (what its routes share). Files of `simulation` are the [`protocol`](simulation::protocol) with the texts of
-//! all messages to clients (except the reason in an error, which its cause defines), the `snapshot` of all simulations,
-//! the `simulation_id`, the `client_identity`, the `announcer` (key `notify`), `preflight` (`--check`) and `readiness`
-//! (`/health`).
-//! The programs are in `src/bin`.
-//! Modules import only from layers below them, in the order that `tests/project/layering.rs` lists. `session` and
-//! `simulation` never see each other. A child never names its parent. The parent gives it a `Recipient` for the child's
-//! events, which the child's file defines.
+//! Each server also has a directory `config` (every key: `session_config`, `simulation_config`; time limits: `timing`;
+//! `docs/configuration.md` lists all), its `app` (start and end) and its `state` (what its routes share). Files of
+//! `simulation` are the [`protocol`](simulation::protocol) with the texts of messages to clients (except the reason in
+//! an error and the progress of a start, which their causes define: a checkout's is in `checkout/steps`), the
+//! `snapshot` of all simulations, the `simulation_id`, the `client_identity`, the `announcer` (key `notify`),
+//! `preflight` (`--check`) and `readiness` (`/health`). The programs are in `src/bin`. Modules import only from layers
+//! below them, in the order that `tests/project/layering.rs` lists. `session` and `simulation` never see each other. A
+//! child never names its parent. The parent gives it a `Recipient` for the child's events, which the child's file
+//! defines.
 //!
 //! # Who talks to whom
 //!
