@@ -35,11 +35,8 @@ const MAX_ERROR_LENGTH: usize = 120;
 
 /// Resolves names to simulation servers, all at the same time.
 pub async fn look_up_all(names: Vec<PublicAddress>) -> Vec<(PublicAddress, LookupResult)> {
-    let lookups = names.into_iter().map(|name| async {
-        let found = servers(&name).await;
-        (name, found)
-    });
-    join_all(lookups).await
+    let found = join_all(names.iter().map(servers)).await;
+    names.into_iter().zip(found).collect()
 }
 
 async fn servers(name: &PublicAddress) -> LookupResult {

@@ -16,7 +16,8 @@ pub struct Disk {
     /// `diskReserve`, in MiB.
     reserve: u64,
     room: DiskRoom,
-    /// Room that the disk has lost since the start, in bytes. Room that becomes free again is not subtracted.
+    /// Room that the disk has lost since the start, in bytes. Room that becomes free again is not subtracted, and what ended
+    /// simulations had taken is added.
     pub lost: u64,
     /// Free room in bytes, and its time: when a simulation was last ended for the reserve, or the maximum since then.
     relieved: Option<(u64, Instant)>,
@@ -32,7 +33,7 @@ pub struct DiskUse {
     first: u64,
     allowed: u64,
     /// What it takes at least, in bytes.
-    taken: u64,
+    pub taken: u64,
     /// Whether its processes hide their open files.
     hides: bool,
     /// The room that the disk had lost at the last count.

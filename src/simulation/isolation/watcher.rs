@@ -83,7 +83,10 @@ impl Table {
                 Err(RecvTimeoutError::Timeout) => {}
                 Err(RecvTimeoutError::Disconnected) => return,
             }
-            self.all.retain(|one| one.end.as_ref().is_some_and(|end| !end.is_closed()));
+            // Its directory is removed. What others write meanwhile must not hide behind the room that this frees.
+            for gone in self.all.extract_if(.., |one| one.end.as_ref().is_none_or(oneshot::Sender::is_closed)) {
+                self.disk.lost += gone.taken;
+            }
             if let Some(least) = self.disk.look()
                 && (self.end_grown_most(least) || least == 0)
             {
