@@ -1,4 +1,4 @@
-//! The tests from outside: built programs, real sockets, processes and files. They are one crate so that they are linked
+//! The black-box tests: built programs, real sockets, processes and files. One crate, so that they are linked only
 //! once; `cargo test --test integration proxy::` runs one part.
 
 #![allow(

@@ -1,4 +1,4 @@
-//! A lab's own certificate authority.
+//! A certificate authority that only the test's programs trust.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -8,7 +8,7 @@ use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use rustls::{ClientConfig, ServerConfig};
 
-/// An authority, with its certificate in a file.
+/// An authority, and its certificate in a file.
 pub struct Authority {
     issuer: CertifiedIssuer<'static, KeyPair>,
     folder: tempfile::TempDir,
@@ -21,7 +21,7 @@ pub struct Certificate {
 }
 
 impl Certificate {
-    /// One for `localhost` that has signed itself, and may sign others or not.
+    /// A self-signed certificate for `localhost`, with or without the right to sign others.
     pub fn self_signed(folder: &Path, name: &str, signs_others: bool) -> Self {
         let mut params = CertificateParams::new(["localhost".to_owned()]).unwrap();
         params.is_ca = if signs_others { IsCa::Ca(BasicConstraints::Unconstrained) } else { IsCa::ExplicitNoCa };
@@ -37,7 +37,7 @@ impl Certificate {
         files
     }
 
-    /// How a server encrypts that has it.
+    /// TLS settings of a server with this certificate.
     pub fn server(&self) -> Arc<ServerConfig> {
         let chain = vec![CertificateDer::from_pem_file(&self.chain).unwrap()];
         let key = PrivateKeyDer::from_pem_file(&self.key).unwrap();
@@ -58,7 +58,7 @@ impl Authority {
         Self { issuer, folder }
     }
 
-    /// Its own certificate, for `SSL_CERT_FILE`.
+    /// The authority's own certificate, for `SSL_CERT_FILE`.
     pub fn file(&self) -> PathBuf {
         self.folder.path().join("authority.pem")
     }
@@ -68,7 +68,7 @@ impl Authority {
         self.issue_as(names, |_| {})
     }
 
-    /// A certificate with something special about it.
+    /// A certificate with changed parameters.
     pub fn issue_as(&self, names: &[&str], change: impl FnOnce(&mut CertificateParams)) -> Certificate {
         let names: Vec<String> = names.iter().map(|&name| name.to_owned()).collect();
         let mut params = CertificateParams::new(names).unwrap();
@@ -80,7 +80,7 @@ impl Authority {
     }
 }
 
-/// How a browser encrypts that trusts this authority alone.
+/// TLS settings of a client that trusts only this authority.
 pub fn trusting(authority: &Path) -> Arc<ClientConfig> {
     let mut roots = rustls::RootCertStore::empty();
     roots.add(CertificateDer::from_pem_file(authority).unwrap()).unwrap();

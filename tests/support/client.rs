@@ -1,4 +1,4 @@
-//! A web client: a WebSocket on which texts are awaited with a deadline.
+//! A web client: a WebSocket that waits for texts with a deadline.
 
 use std::time::Duration;
 
@@ -13,15 +13,14 @@ use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 
 use super::SOON;
 
-/// A WebSocket, and all texts that came on it.
+/// A WebSocket, and all texts received on it.
 #[derive(Debug)]
 pub struct Client {
     socket: WebSocketStream<MaybeTlsStream<TcpStream>>,
-    /// Every text that came.
     pub heard: Vec<String>,
 }
 
-/// Something that came on a WebSocket.
+/// What was received on a WebSocket.
 #[derive(Debug)]
 pub enum Heard {
     Text(String),
@@ -29,19 +28,18 @@ pub enum Heard {
 }
 
 impl Client {
-    /// Connects.
     pub async fn connect(url: &str) -> Self {
         Self::try_connect(url).await.unwrap_or_else(|error| panic!("{url}: {error}"))
     }
 
-    /// Connects to a server that may not be there.
+    /// Connects to a server that may be down.
     pub async fn try_connect(url: &str) -> Result<Self, String> {
         let connecting = actix_rt::time::timeout(SOON, tokio_tungstenite::connect_async(url)).await;
         let connected = connecting.map_err(|error| error.to_string())?;
         connected.map(|(socket, _)| Self::new(socket)).map_err(|error| error.to_string())
     }
 
-    /// Takes over a connection.
+    /// Uses an open connection.
     pub fn new(socket: WebSocketStream<MaybeTlsStream<TcpStream>>) -> Self {
         Self { socket, heard: Vec::new() }
     }
@@ -64,17 +62,17 @@ impl Client {
         client
     }
 
-    /// A client whose simulation is ready and that can come back to it, and its token.
+    /// A client with a ready simulation that it can resume, and the token for that.
     pub async fn resumable(server: &super::program::Server) -> (Self, String) {
         Self::connect(&server.websocket("/client")).await.start_resumable().await
     }
 
-    /// A client that comes back with a token.
+    /// A client that resumes a simulation with a token.
     pub async fn resuming(server: &super::program::Server, token: &str) -> Self {
         Self::connect(&server.websocket("/client")).await.resume(token).await
     }
 
-    /// Asks for the world of [`arm`](super::git::arm), to be able to come back; waits until it is ready, and for the token.
+    /// Requests the world of [`arm`](super::git::arm) as resumable; waits until it is ready, and for the token.
     pub async fn start_resumable(mut self) -> (Self, String) {
         self.send(&serde_json::json!({"start": {"url": super::git::arm(), "resumable": true}}).to_string()).await;
         self.until("webots:").await;
@@ -82,18 +80,18 @@ impl Client {
         (self, token)
     }
 
-    /// Comes back with a token.
+    /// Resumes a simulation.
     pub async fn resume(mut self, token: &str) -> Self {
         self.send(&serde_json::json!({ "resume": token }).to_string()).await;
         self
     }
 
-    /// The token that it is told next.
+    /// The next token that the server sends.
     pub async fn token(&mut self) -> String {
         self.until("resume: ").await.strip_prefix("resume: ").unwrap().to_owned()
     }
 
-    /// The same as through a web server, which says that the client has this address.
+    /// Like [`Client::start`], but through a web server that reports this client address.
     pub async fn start_from(server: &super::program::Server, address: &str, world: &str) -> Self {
         Self::from_address(server, address).await.unwrap().asking(world).await
     }
@@ -103,7 +101,7 @@ impl Client {
         Self::with_headers(&server.websocket("/client"), &[("x-forwarded-for", address)]).await
     }
 
-    /// Connects with these headers; where that is refused, the status of the answer.
+    /// Connects with these headers. If the server refuses, returns the status of its answer.
     pub async fn with_headers(url: &str, headers: &[(&'static str, &str)]) -> Result<Self, u16> {
         let mut request = url.into_client_request().unwrap();
         for (name, value) in headers {
@@ -116,14 +114,14 @@ impl Client {
         }
     }
 
-    /// A viewer, once it has seen the scene.
+    /// A viewer that has received the scene.
     pub async fn with_scene(mut self) -> Self {
         self.send("x3d").await;
         self.until("scene load completed").await;
         self
     }
 
-    /// A viewer that has let the simulation run.
+    /// A viewer that has started the simulation.
     pub async fn with_running_scene(self) -> Self {
         let mut viewer = self.with_scene().await;
         viewer.send("real-time:-1").await;
@@ -131,20 +129,19 @@ impl Client {
         viewer
     }
 
-    /// The next simulated time that a viewer is told, in milliseconds.
+    /// The next simulated time that the viewer receives, in milliseconds.
     pub async fn time(&mut self) -> f64 {
         let update = self.until("application/json:").await;
         let update: serde_json::Value = serde_json::from_str(update.trim_start_matches("application/json:")).unwrap();
         update["time"].as_f64().unwrap()
     }
 
-    /// The id of its simulation, once it was told.
+    /// The id of its simulation, from the texts received so far.
     pub fn id(&self) -> &str {
         let told = self.heard.iter().find_map(|text| text.strip_prefix("session: "));
         told.unwrap_or_else(|| panic!("no id in {:#?}", self.heard))
     }
 
-    /// Sends a text.
     pub async fn send(&mut self, text: &str) {
         self.socket.send(Message::text(text)).await.unwrap();
     }
@@ -154,7 +151,7 @@ impl Client {
         self.socket.send(Message::text(text)).await.map_err(|error| error.to_string())
     }
 
-    /// Asks for a reset of a controller; returns the answer.
+    /// Requests a reset of a controller; returns the answer.
     pub async fn reset(&mut self, controller: &str) -> String {
         self.send(&serde_json::json!({ "reset controller": controller }).to_string()).await;
         loop {
@@ -165,23 +162,23 @@ impl Client {
         }
     }
 
-    /// Sends a text in so many frames.
+    /// Sends a text in one frame per piece.
     pub async fn send_pieces(&mut self, pieces: &[&[u8]]) {
         for (number, piece) in pieces.iter().enumerate() {
             let kind = if number == 0 { Data::Text } else { Data::Continue };
             let frame = Frame::message(piece.to_vec(), OpCode::Data(kind), number + 1 == pieces.len());
             self.socket.send(Message::Frame(frame)).await.unwrap();
-            // What controls a connection may come in between.
+            // Control frames may come between the fragments of a message.
             self.socket.send(Message::Ping(vec![1].into())).await.unwrap();
         }
     }
 
-    /// Sends bytes that are no text.
+    /// Sends a binary message.
     pub async fn send_binary(&mut self, content: &[u8]) {
         self.socket.send(Message::binary(content.to_vec())).await.unwrap();
     }
 
-    /// The next text, or the end.
+    /// The next text, or the end of the connection.
     pub async fn next(&mut self) -> Heard {
         match actix_rt::time::timeout(SOON, self.read()).await {
             Ok(heard) => heard,
@@ -189,7 +186,7 @@ impl Client {
         }
     }
 
-    /// The next text, or the end, if one comes within this time.
+    /// The next text or the end of the connection, if it comes within this time.
     pub async fn next_within(&mut self, time: Duration) -> Option<Heard> {
         actix_rt::time::timeout(time, self.read()).await.ok()
     }
@@ -208,8 +205,8 @@ impl Client {
         }
     }
 
-    /// The next text that begins with this; what comes before it is passed over. The id of a simulation is no answer: it
-    /// comes before them.
+    /// The next text that begins like this; skips others. An empty beginning does not match the id of a simulation,
+    /// which precedes all answers.
     pub async fn until(&mut self, beginning: &str) -> String {
         let is_id = |text: &str| beginning.is_empty() && text.starts_with("session: ");
         loop {
@@ -221,12 +218,12 @@ impl Client {
         }
     }
 
-    /// The next text that begins with this, which an image may have to be built for on a busy machine.
+    /// Like [`Client::until`], with a longer timeout: a busy machine may have to build an image first.
     pub async fn patiently(&mut self, beginning: &str) -> String {
         self.within(beginning, Duration::from_secs(90)).await
     }
 
-    /// The next text that begins with this, which may take so long.
+    /// Like [`Client::until`], with this timeout.
     pub async fn within(&mut self, beginning: &str, time: Duration) -> String {
         let heard = async {
             loop {
@@ -241,7 +238,7 @@ impl Client {
         heard.unwrap_or_else(|_| panic!("{beginning:?} did not come"))
     }
 
-    /// The close code that ends the connection; `None` where it just broke.
+    /// The close code that ends the connection; `None` if it ended without one.
     pub async fn closed(&mut self) -> Option<u16> {
         loop {
             if let Heard::Closed(frame) = self.next().await {
@@ -250,13 +247,13 @@ impl Client {
         }
     }
 
-    /// Whether nothing comes for so long.
+    /// Whether nothing is received for this long.
     pub async fn is_silent(&mut self, time: Duration) -> bool {
         self.next_within(time).await.is_none()
     }
 
-    /// Closes with this code, and waits for the answer as browsers do: a connection that is dropped before with something
-    /// unread is reset, and the server may not see the code.
+    /// Closes with this code, and waits for the close frame of the server as browsers do. Dropping a socket with unread
+    /// data resets the connection, and the server may not see the code.
     pub async fn close_with(mut self, code: u16) {
         let frame = CloseFrame { code: CloseCode::from(code), reason: "".into() };
         let closing = async {
@@ -267,23 +264,23 @@ impl Client {
         actix_rt::time::timeout(SOON, closing).await.expect("the closing handshake");
     }
 
-    /// Leaves in order.
+    /// Closes without a code.
     pub async fn leave(mut self) {
         self.socket.close(None).await.ok();
     }
 }
 
-/// What a client that asks for a world is told in the end.
+/// The error that ends a client's request for a world.
 pub async fn outcome(server: &super::program::Server, world: &str) -> String {
     let mut client = Client::start(server, world).await;
     let told = client.patiently("loading: Error:").await;
-    // The words and the code agree in whether another server may take the client.
+    // The text and the code agree on whether the client may try another server.
     let code = if told.contains(". Connect again: the session server") { 1013 } else { 1000 };
     assert_eq!(client.closed().await, Some(code), "{told}");
     told
 }
 
-/// Has a client ask for a world, who is told these words in the end.
+/// Checks that a request for a world ends with an error that contains these words.
 pub async fn is_told(server: &super::program::Server, world: &str, words: &str) {
     let told = outcome(server, world).await;
     assert!(told.contains(words), "{world}: {words:?} is not in {told}");

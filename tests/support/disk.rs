@@ -1,4 +1,4 @@
-//! Disks that are full or can't be written, in a view of the file system that only this test and what it starts have.
+//! Full and read-only disks, in a mount namespace of this test and the programs that it starts.
 
 use std::fs::File;
 use std::io::Write;
@@ -7,21 +7,21 @@ use std::path::{Path, PathBuf};
 use nix::mount::{MntFlags, MsFlags, mount, umount2};
 use nix::sched::{CloneFlags, unshare};
 
-/// What is mounted from here on is seen by this thread and its children alone, and is gone with them. Without the rights
-/// for that, the faults of disks are not possible.
+/// Later mounts are visible only to this thread and its children, and vanish with them. Without the privileges for
+/// that, tests of disk faults are not possible.
 pub fn hide_mounts_from_others() {
     if unshare(CloneFlags::CLONE_NEWNS).is_ok() {
         mount(None::<&str>, "/", None::<&str>, MsFlags::MS_REC | MsFlags::MS_PRIVATE, None::<&str>).unwrap();
     }
 }
 
-/// A disk of so many MiB at a folder.
+/// Mounts a disk of this many MiB; returns whether that worked.
 pub fn small_disk(folder: &Path, size: u32) -> bool {
     std::fs::create_dir_all(folder).unwrap();
     mount(Some("small"), folder, Some("tmpfs"), MsFlags::empty(), Some(&*format!("size={size}m"))).is_ok()
 }
 
-/// A file that takes all room of a disk.
+/// A file that fills up a disk.
 pub struct Full(PathBuf);
 
 impl Full {
@@ -41,17 +41,17 @@ impl Drop for Full {
     }
 }
 
-/// A folder that can't be written.
+/// A read-only folder.
 pub struct ReadOnly(PathBuf);
 
 impl ReadOnly {
-    /// An empty one is found in its place.
+    /// An empty folder, mounted over this one.
     pub fn empty(folder: &Path) -> Option<Self> {
         mount(Some("nothing"), folder, Some("tmpfs"), MsFlags::MS_RDONLY, None::<&str>).ok()?;
         Some(Self(folder.to_owned()))
     }
 
-    /// All that it holds can still be read.
+    /// The folder itself, still readable.
     pub fn at(folder: &Path) -> Option<Self> {
         mount(Some(folder), folder, None::<&str>, MsFlags::MS_BIND, None::<&str>).ok()?;
         let this = Self(folder.to_owned());

@@ -1,10 +1,10 @@
-//! Real git repositories in a folder of the test, as a forge would have them.
+//! Real git repositories in a folder of the test, in place of a Git host.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-/// A folder of bare repositories: `repositories/lab/arm` is what `https://github.com/lab/arm` is mirrored to.
+/// A folder of bare repositories: `repositories/lab/arm` is the mirror of `https://github.com/lab/arm`.
 pub struct Forge {
     folder: tempfile::TempDir,
 }
@@ -29,7 +29,7 @@ impl Forge {
         self.folder.path()
     }
 
-    /// Adds these files to a branch, which is made from `main` if need be; gives back the commit's hash.
+    /// Commits these files to a branch, which is created from `main` if necessary; returns the commit's hash.
     pub fn commit(&self, repository: &str, branch: &str, files: &[(&str, &str)]) -> String {
         let bare = self.bare(repository);
         let mut stream =
@@ -56,7 +56,7 @@ impl Forge {
         String::from_utf8(output.stdout).unwrap().trim().to_owned()
     }
 
-    /// A repository, which is made if need be.
+    /// A repository, created if necessary.
     fn bare(&self, repository: &str) -> PathBuf {
         let bare = self.folder.path().join(repository);
         if !bare.exists() {
@@ -66,7 +66,7 @@ impl Forge {
         bare
     }
 
-    /// A checkout of a branch, to change at will before [`Forge::commit_work_tree`].
+    /// A checkout of a branch, to change before [`Forge::commit_work_tree`].
     pub fn work_tree(&self, repository: &str, branch: &str) -> PathBuf {
         let (bare, work) = (self.bare(repository), self.folder.path().join(".work").join(repository));
         if !work.exists() {
@@ -81,7 +81,7 @@ impl Forge {
         work
     }
 
-    /// Commits and pushes whatever the checkout holds.
+    /// Commits and pushes everything in the checkout.
     pub fn commit_work_tree(&self, repository: &str, branch: &str) -> String {
         let work = self.folder.path().join(".work").join(repository);
         git(&work, &["add", "--all"]);
@@ -90,7 +90,7 @@ impl Forge {
         git(&work, &["rev-parse", "HEAD"]).trim().to_owned()
     }
 
-    /// Adds a commit to `main` with so many bytes that can't be packed.
+    /// Adds a commit to `main` with this many bytes that git can't compress.
     pub fn commit_noise(&self, repository: &str, bytes: usize) {
         let mut noise = vec![0; bytes];
         rand::fill(&mut noise[..]);
@@ -98,7 +98,7 @@ impl Forge {
         self.commit_work_tree(repository, "main");
     }
 
-    /// Tags what a branch has.
+    /// Tags the head of a branch.
     pub fn tag(&self, repository: &str, name: &str, branch: &str) {
         git(&self.bare(repository), &["tag", "--annotate", "--message", "test", name, branch]);
     }
@@ -120,12 +120,12 @@ pub fn arm() -> String {
     arm_at("main")
 }
 
-/// The URL of that world in a branch, tag or commit.
+/// The URL of that world at a branch, tag or commit.
 pub fn arm_at(reference: &str) -> String {
     world("lab/arm", reference, "worlds/a.wbt")
 }
 
-/// Runs git in a folder; gives back what it prints.
+/// Runs git in a folder; returns its output.
 pub fn git(folder: &Path, arguments: &[&str]) -> String {
     let fixed = ["-c", "user.name=Test", "-c", "user.email=test@localhost", "-c", "commit.gpgSign=false"];
     let output = Command::new("git").current_dir(folder).args(fixed).args(arguments).output().unwrap();

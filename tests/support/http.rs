@@ -6,7 +6,7 @@ use awc::http::header::HeaderMap;
 
 use super::SOON;
 
-/// An answer as a whole.
+/// A complete response.
 #[derive(Debug)]
 pub struct Answer {
     pub status: StatusCode,
@@ -31,17 +31,17 @@ impl Answer {
 /// The password of administrators in tests.
 pub const PASSWORD: &str = "open sesame";
 
-/// Asks for a page with the password.
+/// Gets a page with the administrator's password.
 pub async fn get_as_administrator(url: &str) -> Answer {
     get_with_password(url, PASSWORD).await
 }
 
-/// Asks for a page with any password.
+/// Gets a page with this password.
 pub async fn get_with_password(url: &str, password: &str) -> Answer {
     read(client().get(url).basic_auth("admin", password)).await.unwrap()
 }
 
-/// Posts a body, with a password where there is one. Returns the status.
+/// Posts a body, with a password if one is given. Returns the status.
 pub async fn post(url: &str, password: Option<&str>, body: &str) -> u16 {
     let request = client().post(url);
     let request = match password {
@@ -51,12 +51,12 @@ pub async fn post(url: &str, password: Option<&str>, body: &str) -> u16 {
     request.send_body(body.to_owned()).await.unwrap().status().as_u16()
 }
 
-/// Asks for a page.
+/// Gets a page.
 pub async fn get(url: &str) -> Answer {
     try_get(url).await.unwrap_or_else(|error| panic!("{url}: {error}"))
 }
 
-/// Asks for a page of a server that may not be there.
+/// Gets a page from a server that may be down.
 pub async fn try_get(url: &str) -> Result<Answer, String> {
     read(client().get(url)).await
 }

@@ -1,4 +1,4 @@
-//! A small HTTP server in a thread, for what a test wants to be asked or to answer by itself.
+//! Small HTTP servers in threads, for answers that come from a test itself.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpListener;
@@ -6,30 +6,29 @@ use std::sync::Arc;
 
 use rustls::{ServerConfig, ServerConnection, StreamOwned};
 
-/// A request.
 pub struct Request {
     pub head: String,
     pub content: Vec<u8>,
 }
 
 impl Request {
-    /// What was asked for, as it was sent.
+    /// The request target as sent.
     pub fn path(&self) -> &str {
         self.head.split(' ').nth(1).unwrap_or_default()
     }
 
-    /// The value of a header, whose name is written in small letters; empty where there is none.
+    /// The value of a header, whose name is given in lower case; empty if it is missing.
     pub fn header(&self, name: &str) -> &str {
         let headers = self.head.lines().filter_map(|line| line.split_once(": "));
         headers.filter(|(other, _)| other.to_lowercase() == name).map(|(_, value)| value).next().unwrap_or_default()
     }
 }
 
-/// Answers each request with a status and a content, until the test program ends or there is no answer.
+/// Answers one request after another with a status and a body, until `answer` returns `None`.
 pub fn listen(listener: TcpListener, mut answer: impl FnMut(Request) -> Option<(u16, &'static str)> + Send + 'static) {
     std::thread::spawn(move || {
         for connection in listener.incoming().flatten() {
-            // Who breaks off is not answered.
+            // The client broke off its request.
             let Some(request) = read(&connection) else { continue };
             let Some((status, content)) = answer(request) else { return };
             write(&connection, &format!("{status} -"), content.as_bytes());
@@ -37,7 +36,7 @@ pub fn listen(listener: TcpListener, mut answer: impl FnMut(Request) -> Option<(
     });
 }
 
-/// Answers requests side by side, encrypted where there is a certificate: with a status and headers, and a content.
+/// Answers requests in parallel with a status, headers and a body; over TLS if there is a certificate.
 pub fn serve<A>(listener: TcpListener, certificate: Option<Arc<ServerConfig>>, answer: A)
 where
     A: Fn(&Request) -> Option<(String, Vec<u8>)> + Clone + Send + 'static,

@@ -1,10 +1,11 @@
-//! What the black-box tests stand on: the built programs on free ports, git repositories, clients, deadlines.
+//! Tools of the black-box tests: the built programs on free ports, git repositories, clients, deadlines.
 //!
-//! Everything that a test starts ends with it, and a test that fails prints the logs of what it had started.
+//! Everything that a test starts ends with it. A failed test prints the logs of the programs that it started.
 
 #![allow(dead_code, unused_imports, unused_macros, reason = "each test crate uses its own part of this")]
 
-/// Leaves a test, or a part that then has nothing, where a program is missing that it needs, and says so. Where CI is set it fails: everything is tested there.
+/// Skips a test, or a part of it that then returns `nothing`, and says so if a program is missing. Fails if CI is set:
+/// CI tests everything.
 macro_rules! needs {
     ($program:literal $(, $nothing:expr)?) => {
         if !$crate::support::is_there($program) {
@@ -46,10 +47,10 @@ use std::time::{Duration, Instant};
 
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
 
-/// How long anything may take that should happen soon. Far more than it needs: the machine may be busy.
+/// Timeout for what should happen soon. Far more than necessary, because the machine may be busy.
 pub const SOON: Duration = Duration::from_secs(20);
 
-/// Whether a program is there that a test needs, see `needs`.
+/// Whether a program that a test needs is installed, see `needs`.
 pub fn is_there(program: &str) -> bool {
     let is_there = which::which(program).is_ok();
     if !is_there {
@@ -66,13 +67,13 @@ pub fn open_folder() -> tempfile::TempDir {
     folder
 }
 
-/// Makes a program of a script for bash.
+/// Writes an executable bash script.
 pub fn make_program(path: &Path, script: &str) {
     std::fs::write(path, format!("#!/usr/bin/env bash\n{script}\n")).unwrap();
     std::fs::set_permissions(path, PermissionsExt::from_mode(0o755)).unwrap();
 }
 
-/// A folder with a shared library of this name, made of a file below `tests`.
+/// A folder with a shared library of this name, built from a source file below `tests`.
 pub fn shared_library(source: &str, name: &str) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests").join(source);
@@ -82,7 +83,7 @@ pub fn shared_library(source: &str, name: &str) -> tempfile::TempDir {
     folder
 }
 
-/// A folder with links to these programs alone, for PATH.
+/// A folder with links to these programs only, for PATH.
 pub fn programs(names: &[&str]) -> tempfile::TempDir {
     let (folder, paths) = (open_folder(), std::env::var_os("PATH").unwrap());
     for name in names {
@@ -93,33 +94,33 @@ pub fn programs(names: &[&str]) -> tempfile::TempDir {
     folder
 }
 
-/// Says that a test, or a part of it, is left out here, and why. Not by a macro: what those print is shown for tests that fail
-/// only.
+/// Reports that a test or a part of it is skipped, and why. Not with `eprintln!`: its output is shown only if the test
+/// fails.
 pub fn skip(why: &str) {
     let test = std::thread::current().name().unwrap_or_default().to_owned();
     std::io::stderr().write_all(format!("SKIPPED, for {why}: {test}\n").as_bytes()).unwrap();
 }
 
-/// Whether a condition comes to hold before long.
+/// Whether a condition becomes true within [`SOON`].
 pub async fn holds_soon(mut condition: impl AsyncFnMut() -> bool) -> bool {
     let begin = Instant::now();
     while !condition().await {
         if begin.elapsed() > SOON {
             return false;
         }
-        // What is waited for long is asked for less often: each question costs a busy machine time.
+        // Checks become rarer during a long wait, because each costs a busy machine time.
         let pause = (begin.elapsed() / 10).clamp(Duration::from_millis(10), Duration::from_millis(100));
         actix_rt::time::sleep(pause).await;
     }
     true
 }
 
-/// Waits until a condition holds, and says what was waited for when it never does.
+/// Waits until a condition holds; fails with this description if it never does.
 pub async fn until(what: &str, condition: impl AsyncFnMut() -> bool) {
     assert!(holds_soon(condition).await, "waited in vain until {what}");
 }
 
-/// Lets this process, and all that it starts, open as many files as the system allows.
+/// Raises the limit of open files of this process, and of all that it starts, to the highest allowed.
 pub fn raise_file_limit() {
     let (_, most) = getrlimit(Resource::RLIMIT_NOFILE).unwrap();
     setrlimit(Resource::RLIMIT_NOFILE, most, most).unwrap();

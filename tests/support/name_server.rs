@@ -1,4 +1,5 @@
-//! A real DNS server, dnsmasq, on an address of its own. It knows what a test says, and asks nobody.
+//! A real DNS server, dnsmasq, on an address of its own. It knows only the names that a test sets, and forwards no
+//! query.
 
 use std::net::{IpAddr, Ipv4Addr, TcpStream, UdpSocket};
 use std::process::{Child, Command, Stdio};
@@ -13,21 +14,21 @@ use super::{SOON, skip};
 /// The port of name servers in `/etc/resolv.conf`.
 const PORT: u16 = 53;
 
-/// The server. It ends with this value.
+/// The server. It is killed when this value is dropped.
 pub struct NameServer {
     child: Option<Child>,
     folder: tempfile::TempDir,
     address: Ipv4Addr,
 }
 
-/// How to get a view of the file system of one's own, if that is allowed here: for root, or with a user of one's own.
+/// The command that creates a mount namespace, if this machine allows it: for root, or in a user namespace.
 fn own_mounts() -> Option<&'static str> {
     let works =
         |command: &&str| Command::new("sh").args(["-c", &format!("{command} true")]).output().unwrap().status.success();
     ["unshare --mount", "unshare --mount --map-root-user"].into_iter().find(works)
 }
 
-/// An address of the loopback for a name server of this process alone; `None` where it can't have the port.
+/// A loopback address for a name server of this process alone; `None` if this process may not use the port.
 pub fn free_address() -> Option<Ipv4Addr> {
     static LAST: AtomicU8 = AtomicU8::new(0);
     let process = u8::try_from(std::process::id() % 250).unwrap();
@@ -35,14 +36,14 @@ pub fn free_address() -> Option<Ipv4Addr> {
         let address = Ipv4Addr::new(127, 53, process, LAST.fetch_add(1, Ordering::Relaxed) + 1);
         match UdpSocket::bind((address, PORT)) {
             Ok(_) => return Some(address),
-            // Another process of the same number modulo 250 has it.
+            // A process with the same id modulo 250 uses it.
             Err(error) if error.kind() == std::io::ErrorKind::AddrInUse => {}
             Err(_) => return None,
         }
     }
 }
 
-/// A shell script after which a server finds its name server at this address, `None` where that can't be.
+/// A shell script that makes a server use the name server at this address; `None` if that is not possible.
 pub fn asking(address: Ipv4Addr, folder: &std::path::Path) -> Option<String> {
     let file = folder.join("resolv.conf");
     std::fs::write(&file, format!("nameserver {address}\noptions timeout:1 attempts:1\n")).unwrap();
@@ -51,7 +52,7 @@ pub fn asking(address: Ipv4Addr, folder: &std::path::Path) -> Option<String> {
 }
 
 impl NameServer {
-    /// Starts one that knows no name; `None` where this machine does not allow it, which it says.
+    /// Starts a server that knows no names. Returns `None`, and reports why, if this machine does not allow it.
     pub fn start() -> Option<Self> {
         needs!("dnsmasq", None);
         let Some(address) = free_address().filter(|_| own_mounts().is_some()) else {
@@ -65,17 +66,17 @@ impl NameServer {
         Some(server)
     }
 
-    /// Starts it at its address, after it was ended.
+    /// Starts it at its address again.
     pub fn start_again(&mut self) {
         let user = nix::unistd::User::from_uid(nix::unistd::getuid()).unwrap().unwrap();
         let mut command = Command::new("dnsmasq");
-        // What its answers say of themselves: that they hold for ten minutes, as those of Docker Swarm do.
+        // Its answers have a TTL of ten minutes, as those of Docker Swarm do.
         command.args(["--keep-in-foreground", "--conf-file=/dev/null", "--no-resolv", "--no-hosts", "--local-ttl=600"]);
         command.args(["--bind-interfaces", "--local=/test/", "--pid-file="]);
         command.arg(format!("--listen-address={}", self.address)).arg(format!("--user={}", user.name));
         command.arg(format!("--addn-hosts={}", self.folder.path().join("hosts").display()));
         self.child = Some(command.stdin(Stdio::null()).spawn().unwrap());
-        // Before it is there, a signal would end it.
+        // A signal before it listens would end it.
         let deadline = Instant::now() + SOON;
         while TcpStream::connect((self.address, PORT)).is_err() {
             assert!(Instant::now() < deadline, "dnsmasq does not listen");
@@ -83,25 +84,25 @@ impl NameServer {
         }
     }
 
-    /// A shell script for [`Builder::before`](super::program::Builder::before), after which a server asks this one.
+    /// A shell script for [`Builder::before`](super::program::Builder::before) that makes a server use this name
+    /// server.
     pub fn asked(&self) -> String {
         asking(self.address, self.folder.path()).unwrap()
     }
 
-    /// Has a name lead to these addresses, and knows no other.
+    /// Resolves this name to these addresses, and no other name.
     pub fn set(&self, name: &str, addresses: &[IpAddr]) {
         let lines: String = addresses.iter().map(|address| format!("{address} {name}\n")).collect();
         std::fs::write(self.folder.path().join("hosts"), lines).unwrap();
         self.signal(Signal::SIGHUP);
     }
 
-    /// Sends it a signal.
     pub fn signal(&self, signal: Signal) {
         let child = self.child.as_ref().unwrap();
         kill(Pid::from_raw(i32::try_from(child.id()).unwrap()), signal).unwrap();
     }
 
-    /// Ends it.
+    /// Kills it.
     pub fn end(&mut self) {
         if let Some(mut child) = self.child.take() {
             child.kill().unwrap();

@@ -1,16 +1,15 @@
-//! A network that only this test and what it starts have, and in which packets can be lost.
+//! A network namespace of this test and the programs that it starts, which can lose packets.
 
 use std::process::{Command, Stdio};
 
 use nix::sched::{CloneFlags, unshare};
 
-/// The network.
 #[derive(Clone, Copy)]
 pub struct Network(());
 
 impl Network {
-    /// Gives this thread, and what it starts, a network of its own. Nothing where that is not allowed, or packets can't be
-    /// filtered.
+    /// Moves this thread, and what it starts, into a new network namespace. `None` if that is not allowed, or if
+    /// packets can't be filtered.
     pub fn hide_from_others() -> Option<Self> {
         let trial =
             "ip link set lo up && iptables -A INPUT -p tcp -m statistic --mode random --probability 0.5 -j DROP";
@@ -22,7 +21,8 @@ impl Network {
         Some(Self(()))
     }
 
-    /// Loses this share of the packets from and to these ports (`PORT` or `FIRST:LAST`), until what is returned is dropped.
+    /// Loses this share of the packets from and to these ports (`PORT` or `FIRST:LAST`) until the returned value is
+    /// dropped.
     pub fn lose(self, share: f64, ports: &[String]) -> Lost {
         for ports in ports {
             for side in ["--sport", "--dport"] {
@@ -35,7 +35,7 @@ impl Network {
     }
 }
 
-/// Packets are lost.
+/// Packets get lost until this value is dropped.
 pub struct Lost;
 
 impl Drop for Lost {

@@ -7,13 +7,13 @@ pub fn page(name: &str) -> String {
     std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("docs").join(name)).unwrap()
 }
 
-/// What a page says below a heading such as `## Kubernetes`.
+/// The text below a heading such as `## Kubernetes`.
 pub fn section(page: &str, heading: &str) -> String {
     let (_, rest) = page.split_once(&format!("\n{heading}\n")).unwrap_or_else(|| panic!("there is no {heading}"));
     rest.split("\n## ").next().unwrap().to_owned()
 }
 
-/// The blocks of a page in this language, without the indentation of the list that they are in.
+/// The code blocks of a page in this language, without the indentation of a surrounding list.
 pub fn blocks(page: &str, language: &str) -> Vec<String> {
     let (mut blocks, mut inside) = (Vec::new(), None);
     for line in page.lines() {
@@ -34,7 +34,7 @@ pub fn blocks(page: &str, language: &str) -> Vec<String> {
     blocks
 }
 
-/// The lines of a page that are commands by their indentation.
+/// The lines of a page that are commands because they are indented.
 pub fn commands(page: &str) -> Vec<String> {
     let mut is_block = false;
     let mut found = Vec::new();

@@ -1,4 +1,5 @@
-//! Blocks of free ports, and dead ones. Simulation servers need ports in a row, and test each for being free on all addresses.
+//! Blocks of free ports, and closed ports. Simulation servers need consecutive ports, and check on all addresses that
+//! each is free.
 
 use std::fs::File;
 use std::net::{Ipv4Addr, TcpListener};
@@ -6,13 +7,13 @@ use std::net::{Ipv4Addr, TcpListener};
 use nix::fcntl::{Flock, FlockArg};
 use tokio::net::TcpSocket;
 
-/// Below the ports that the system gives to outgoing connections, and below those that the demo simulator is tested at.
+/// Below the system's ports for outgoing connections, and below those that the tests of the demo simulator use.
 const FIRST: u16 = 10_000;
 const LAST: u16 = 21_000;
 
-/// The first of `count` free ports in a row, which no other test of this user is given until all others were.
+/// The first of `count` consecutive free ports. Other tests of this user get these ports only after all others.
 pub fn block(count: u16) -> u16 {
-    // The port that is given next is in a file that the processes of all tests lock.
+    // The next port is in a file that the processes of all tests lock.
     let path = std::env::temp_dir().join(format!("webots-fleet-test-ports-{}", nix::unistd::getuid()));
     let file = File::options().create(true).truncate(false).read(true).write(true).open(&path).unwrap();
     let _locked = Flock::lock(file, FlockArg::LockExclusive).map_err(|(_, error)| error).unwrap();
@@ -25,7 +26,7 @@ pub fn block(count: u16) -> u16 {
     first
 }
 
-/// A port on which nobody listens, nor can anybody until the first value is dropped.
+/// A port on which no program listens, or can listen until the first value is dropped.
 pub fn dead_port() -> (TcpSocket, u16) {
     let socket = TcpSocket::new_v4().unwrap();
     socket.bind(([127, 0, 0, 1], 0).into()).unwrap();

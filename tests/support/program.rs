@@ -16,7 +16,7 @@ use super::{holds_soon, http, ports, raise_file_limit};
 /// A server that was started for one test. It is killed with the test, and its log is printed if the test fails.
 pub struct Server {
     child: Child,
-    /// Where its configuration, log and cache are.
+    /// Directory of its configuration, log and cache.
     pub folder: PathBuf,
     /// Its port on the loopback.
     pub port: u16,
@@ -37,7 +37,7 @@ pub struct Builder {
     parts: Option<(Forge, Webots)>,
 }
 
-/// A session server that watches these simulation servers (`HOST:PORT`).
+/// A session server that monitors these simulation servers (`HOST:PORT`).
 pub fn session_server(simulation_servers: &[String]) -> Builder {
     let port = ports::block(1);
     let config = serde_json::json!({
@@ -47,35 +47,35 @@ pub fn session_server(simulation_servers: &[String]) -> Builder {
     Builder::new(env!("CARGO_BIN_EXE_session-server"), config, port)
 }
 
-/// A simulation server with so many places, which starts this program as Webots and allows worlds of
+/// A simulation server with this many slots, which starts this program as Webots and allows worlds of
 /// `https://github.com/lab`, taken from the folder `repositories`.
 pub fn simulation_server(webots: &Path, repositories: &Path, places: u16) -> Builder {
-    // Webots may take one of the ten ports that follow its own.
+    // Webots may use one of the ten ports after its own.
     let port = ports::block(places + 12);
     let config = serde_json::json!({
         "server": "localhost", "ssl": false, "portRewrite": false, "bind": "127.0.0.1", "port": port, "debug": true,
         "webots": webots, "maxConnections": places, "allowedRepositories": ["https://github.com/lab"],
         "gitMirrors": {"https://github.com/": format!("file:{}", repositories.display())},
-        // The stand-in for Webots may be built in somebody's home.
+        // The demo simulator may be in a home, which sandboxes hide.
         "environment": ["DEMO_SIMULATOR_BIND"], "sandbox": {"readable": [env!("CARGO_BIN_EXE_demo-simulator")]},
     });
     Builder::new(env!("CARGO_BIN_EXE_simulation-server"), config, port).env("DEMO_SIMULATOR_BIND", "127.0.0.1")
 }
 
-/// A simulation server with a forge of its own that has `lab/arm`, and with the demo simulator.
+/// A simulation server with the demo simulator and a forge of its own that has `lab/arm`.
 pub fn demo_server(places: u16) -> Builder {
     server_of(Webots::launcher(), places)
 }
 
-/// The same with this Webots.
+/// Like [`demo_server`], with this Webots.
 pub fn server_of(webots: Webots, places: u16) -> Builder {
     let forge = Forge::with_arm();
     let builder = simulation_server(&webots.path(), forge.path(), places);
     Builder { parts: Some((forge, webots)), ..builder }
 }
 
-/// One with one place, whose simulation comes to a state, as servers call it, and stays there; in `checkingout` as long as the
-/// listener is there, which never answers.
+/// A server with one slot, whose simulation reaches a state, as servers call it, and stays there. In `checkingout` it
+/// waits for an answer of the returned listener, which never comes.
 pub fn server_that_is(state: &str) -> (Builder, Option<TcpListener>) {
     let builder = server_of(Webots::that_is(state), 1);
     if state != "checkingout" {
@@ -89,59 +89,58 @@ pub fn server_that_is(state: &str) -> (Builder, Option<TcpListener>) {
 impl Builder {
     fn new(program: &'static str, config: Value, port: u16) -> Self {
         let name = program.rsplit('/').next().unwrap();
-        // Nobody's display: one that other tests start and end would come into sandboxes, and vanish from them.
+        // An unused display: sandboxes would otherwise get one that other tests start and end.
         let environment = vec![("DISPLAY".to_owned(), ":59000".to_owned())];
         Self { program, name, config, port, environment, folder: None, before: None, parts: None }
     }
 
-    /// The forge that a server of [`server_of`] has to itself.
     pub fn forge(&self) -> &Forge {
         &self.parts.as_ref().unwrap().0
     }
 
-    /// Sets a key of the configuration; `a.b` is a key of a part.
+    /// Sets a key of the configuration; `a.b` is the key `b` in the object `a`.
     pub fn set(mut self, key: &str, value: impl Into<Value>) -> Self {
         let pointer = key.split('.').fold(&mut self.config, |place, part| &mut place[part]);
         *pointer = value.into();
         self
     }
 
-    /// Has a session server send mails to an SMTP server on this machine.
+    /// Makes a session server send mails to an SMTP server on this machine.
     pub fn mails_to(self, port: u16) -> Self {
         let addressed = self.set("administrator", "admin@example.org").set("mailSender", "fleet@example.org");
         addressed.set("mailServer", "127.0.0.1").set("mailServerPort", port)
     }
 
-    /// Sets a variable of the environment.
+    /// Sets an environment variable.
     pub fn env(mut self, name: &str, value: &str) -> Self {
         self.environment.push((name.to_owned(), value.to_owned()));
         self
     }
 
-    /// Uses this port, to follow another server at its place.
+    /// Uses this port, for example to replace another server.
     pub fn port(mut self, port: u16) -> Self {
         self.port = port;
         self.set("port", port)
     }
 
-    /// Uses a folder that outlives the server, to start another one in it.
+    /// Uses a folder that outlives the server, so that another server can start in it.
     pub fn folder(mut self, folder: &Path) -> Self {
         self.folder = Some(folder.to_owned());
         self
     }
 
-    /// Lets the server open so many files.
+    /// Limits the open files of the server.
     pub fn files(self, most: u32) -> Self {
         self.before(&format!("ulimit -n {most}"))
     }
 
-    /// Has a shell do this, which then becomes the server.
+    /// Runs this in a shell that then becomes the server.
     pub fn before(mut self, script: &str) -> Self {
         self.before = Some(script.to_owned());
         self
     }
 
-    /// Writes the configuration into a folder; returns the file.
+    /// Writes the configuration into a folder; returns the path of the file.
     pub fn write(&mut self, folder: &Path) -> PathBuf {
         for (key, name) in [("logDir", "log"), ("cacheDir", "cache")] {
             if self.config.get(key).is_none() && (key == "logDir" || self.name == "simulation-server") {
@@ -155,7 +154,7 @@ impl Builder {
 
     /// Writes the configuration and starts the program, without waiting for it.
     pub fn spawn(mut self) -> Server {
-        // Tests with a thousand connections run beside others.
+        // Some tests with a thousand connections run in parallel with others.
         raise_file_limit();
         let temporary = self.folder.is_none().then(|| tempfile::tempdir().unwrap());
         let folder = self.folder.take().unwrap_or_else(|| temporary.as_ref().unwrap().path().to_owned());
@@ -176,8 +175,8 @@ impl Builder {
         Server { child, folder, port: self.port, name: self.name, _temporary: temporary, _parts: self.parts }
     }
 
-    /// Starts the program, which has to end with this exit code and a line that says why. Beside it there is only the log, and
-    /// nothing where the code is that of a wrong configuration. Gives back the line.
+    /// Starts the program, which must end with this exit code and one error line. It may print log lines too, but none
+    /// if the code is that of a wrong configuration. Returns the error line.
     pub async fn refused(self, code: i32) -> String {
         let mut server = self.spawn();
         assert_eq!(server.ended().await, Some(code), "{}", server.log());
@@ -201,12 +200,11 @@ impl Builder {
 }
 
 impl Server {
-    /// The forge that a server of [`server_of`] has to itself.
+    /// The forge of a server of [`server_of`].
     pub fn forge(&self) -> &Forge {
         &self._parts.as_ref().unwrap().0
     }
 
-    /// The folder of its cache.
     pub fn cache(&self) -> PathBuf {
         self.folder.join("cache")
     }
@@ -216,28 +214,25 @@ impl Server {
         format!("127.0.0.1:{}", self.port)
     }
 
-    /// The URL of a path.
     pub fn url(&self, path: &str) -> String {
         format!("http://{}{path}", self.address())
     }
 
-    /// The WebSocket URL of a path.
     pub fn websocket(&self, path: &str) -> String {
         format!("ws://{}{path}", self.address())
     }
 
-    /// The process id.
     pub fn pid(&self) -> i32 {
         i32::try_from(self.child.id()).unwrap()
     }
 
-    /// The processes that it has started, and that are not lost to others.
+    /// The direct child processes.
     pub fn children(&self) -> Vec<i32> {
         let all = procfs::process::all_processes().unwrap().flatten();
         all.filter(|one| one.stat().is_ok_and(|stat| stat.ppid == self.pid())).map(|one| one.pid()).collect()
     }
 
-    /// The child that ends the simulations when the server is gone.
+    /// The child process that ends the simulations if the server dies.
     pub fn guardian(&self) -> i32 {
         let words = |pid: &i32| procfs::process::Process::new(*pid).and_then(|one| one.cmdline()).unwrap_or_default();
         self.children().into_iter().find(|pid| words(pid).get(1).is_some_and(|word| word == "guard")).unwrap()
@@ -248,69 +243,69 @@ impl Server {
         kill(Pid::from_raw(self.pid()), signal).unwrap();
     }
 
-    /// Asks the server to end, which it does in order.
+    /// Sends SIGTERM, and checks that the server exits with code 0.
     pub async fn stops(&mut self) {
         self.signal(Signal::SIGTERM);
         assert_eq!(self.ended().await, Some(0));
     }
 
-    /// What it tells programs.
+    /// `/status`, parsed.
     pub async fn status(&self) -> Value {
         http::get(&self.url("/status")).await.json()
     }
 
-    /// The simulations that it has.
+    /// The simulations in `/status`.
     pub async fn simulations(&self) -> Vec<Value> {
         self.status().await["simulations"].as_array().unwrap().clone()
     }
 
-    /// Waits until so many simulations wait for their clients.
+    /// Waits until this many simulations wait for their clients to resume them.
     pub async fn until_away(&self, count: usize) {
         let are_away =
             async || self.simulations().await.iter().filter(|one| one["awayUntil"].is_u64()).count() == count;
         super::until(&format!("{count} are away"), are_away).await;
     }
 
-    /// What it tells Prometheus.
+    /// The text of `/metrics`.
     pub async fn metrics(&self) -> String {
         http::get(&self.url("/metrics")).await.text()
     }
 
-    /// What it tells visitors.
+    /// The HTML of `/monitor`.
     pub async fn monitor(&self) -> String {
         http::get(&self.url("/monitor")).await.text()
     }
 
-    /// Whether it is ready: the code, and why not.
+    /// The status code and the text of `/health`.
     pub async fn health(&self) -> (u16, String) {
         let answer = http::try_get(&self.url("/health")).await.unwrap();
         (answer.status.as_u16(), answer.text())
     }
 
-    /// Waits until the server has ended by itself; gives back its exit code.
+    /// Waits until the server has ended; returns its exit code.
     pub async fn ended(&mut self) -> Option<i32> {
         let ends = holds_soon(async || self.child.try_wait().unwrap().is_some()).await;
         assert!(ends, "{} does not end", self.name);
         self.child.wait().unwrap().code()
     }
 
-    /// What the server has printed until now.
+    /// What the server has printed so far.
     pub fn log(&self) -> String {
         std::fs::read_to_string(self.folder.join("output.txt")).unwrap_or_default()
     }
 
-    /// The file with the output of a simulation that runs.
+    /// The output file of a running simulation.
     pub fn output_file(&self, client: &super::client::Client) -> PathBuf {
         self.folder.join(format!("log/simulation/instances/{}.log", client.id()))
     }
 
-    /// Has a session server take other values of these keys; null takes a key away.
+    /// Makes a session server reload its configuration with these keys changed.
     pub fn reload(&self, keys: Value) {
         self.rewrite_config(|config| config.as_object_mut().unwrap().extend(keys.as_object().unwrap().clone()));
         self.signal(Signal::SIGHUP);
     }
 
-    /// Writes another configuration into the server's file.
+    /// Changes the server's configuration file.
     pub fn rewrite_config(&self, change: impl FnOnce(&mut Value)) {
         let file = self.folder.join("config.json");
         let mut config: Value = serde_json::from_str(&std::fs::read_to_string(&file).unwrap()).unwrap();

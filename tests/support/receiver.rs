@@ -1,4 +1,4 @@
-//! A web server that takes what is posted to it, and answers as a test says.
+//! A web server that records what is posted to it, and answers as a test demands.
 
 use std::net::TcpListener;
 use std::sync::Arc;
@@ -25,7 +25,7 @@ pub struct Receiver {
 }
 
 impl Receiver {
-    /// One that speaks plainly, or with a certificate.
+    /// Starts a server over HTTP, or over TLS if there is a certificate.
     pub fn start(certificate: Option<&Certificate>) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let port = listener.local_addr().unwrap().port();
@@ -40,17 +40,17 @@ impl Receiver {
         receiver
     }
 
-    /// Answers so from now on: the status, and headers after a line break.
+    /// Sets the answer from now on: the status, and headers after a line break.
     pub fn answer(&self, answer: &str) {
         *self.answer.lock() = answer.to_owned();
     }
 
-    /// All that was posted.
+    /// All requests so far.
     pub fn posted(&self) -> Vec<Posted> {
         self.posted.lock().clone()
     }
 
-    /// The texts of the first so many requests, once they have come.
+    /// The texts of the requests, once at least this many have arrived.
     pub async fn texts(&self, count: usize) -> Vec<String> {
         until(&format!("{count} were posted"), async || self.posted().len() >= count).await;
         let text = |posted: &Posted| posted.body["text"].as_str().unwrap().to_owned();

@@ -7,27 +7,26 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::watch;
 
-/// What the link does.
+/// What the link does with data.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Mood {
-    /// Hands everything on.
+    /// Forwards everything.
     Open,
-    /// Hands everything on so much later.
+    /// Forwards everything after this delay.
     Slow(Duration),
-    /// Takes connections and hands on nothing: packets are lost.
+    /// Accepts connections but forwards nothing, as if packets got lost.
     Silent,
     /// Breaks every connection.
     Cut,
 }
 
-/// The link.
 pub struct Relay {
     pub port: u16,
     mood: Arc<watch::Sender<Mood>>,
 }
 
 impl Relay {
-    /// Forwards what comes to a port of its own to another.
+    /// Forwards a port of its own to this port.
     pub async fn to(port: u16) -> Self {
         let listener = TcpListener::bind(("127.0.0.1", 0)).await.unwrap();
         let own = listener.local_addr().unwrap().port();
@@ -54,7 +53,6 @@ impl Relay {
         Self { port: own, mood }
     }
 
-    /// Changes what the link does.
     pub fn set(&self, mood: Mood) {
         self.mood.send_replace(mood);
     }

@@ -9,17 +9,17 @@ use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
 
 use super::SOON;
 
-/// An SMTP server. It ends with this value.
+/// An SMTP server. It is killed when this value is dropped.
 pub struct Smtp {
     child: Child,
     events: UnboundedReceiver<Value>,
-    /// Everything it told so far.
+    /// Every event that it has reported so far.
     pub told: Vec<Value>,
     pub port: u16,
 }
 
 impl Smtp {
-    /// Starts one with these options of `smtp_server.py`.
+    /// Starts a server with these options of `smtp_server.py`.
     pub async fn start(options: &[&str]) -> Self {
         let mut child = Command::new(python())
             .arg(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/support/smtp_server.py"))
@@ -39,12 +39,11 @@ impl Smtp {
         server
     }
 
-    /// The next mail that arrives.
     pub async fn mail(&mut self) -> Mail {
         Mail(self.wait_for("mail").await)
     }
 
-    /// Waits until it tells this, and gives back what.
+    /// Waits until it reports an event with this key; returns the value.
     pub async fn wait_for(&mut self, key: &str) -> Value {
         let end = tokio::time::Instant::now() + SOON;
         loop {
@@ -59,14 +58,14 @@ impl Smtp {
         }
     }
 
-    /// Waits until it is this often that it told this.
+    /// Waits until it has reported an event with this key this many times.
     pub async fn wait_for_times(&mut self, key: &str, times: usize) {
         while self.count(key) < times {
             self.wait_for(key).await;
         }
     }
 
-    /// How often it told this, as far as it was read.
+    /// The number of events with this key so far.
     pub fn count(&mut self, key: &str) -> usize {
         while let Ok(event) = self.events.try_recv() {
             self.told.push(event);
@@ -74,7 +73,7 @@ impl Smtp {
         self.told.iter().filter(|event| event.get(key).is_some()).count()
     }
 
-    /// The commands so far, as `NAME` or, where encrypted, `NAME*`.
+    /// The SMTP commands so far, as `NAME`, or `NAME*` if they were encrypted.
     pub fn commands(&mut self) -> Vec<String> {
         self.count("command");
         let commands = self.told.iter().filter(|event| event.get("command").is_some());

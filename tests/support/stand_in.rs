@@ -1,4 +1,4 @@
-//! A session server, a simulation server and Webots in one, which say what a test has them say.
+//! A stand-in for a session server, a simulation server and Webots in one, which answers as a test demands.
 
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -12,19 +12,19 @@ use tokio_tungstenite::tungstenite::Message;
 
 use super::authority::Certificate;
 
-/// What is said. `{}` stands for `HOST:PORT`.
+/// The answers. `{}` stands for `HOST:PORT`.
 #[derive(Clone)]
 pub struct Script {
-    /// The answers of `/session`, one after the other; the last one again and again.
+    /// The answers of `/session` in order; the last one is repeated.
     pub session: Vec<&'static str>,
-    /// The texts on `/client`; then comes `.` again and again.
+    /// The texts on `/client`; after them, `.` is sent repeatedly.
     pub client: Vec<&'static str>,
-    /// The texts on `/webots`; then time passes.
+    /// The texts on `/webots`; after them, updates with the simulated time.
     pub webots: Vec<&'static str>,
 }
 
 impl Default for Script {
-    /// A simulation that runs.
+    /// A running simulation.
     fn default() -> Self {
         Self {
             session: vec!["ws://{}"],
@@ -50,14 +50,14 @@ struct Part {
 }
 
 impl StandIn {
-    /// One that speaks plainly.
+    /// Starts a stand-in over HTTP.
     pub async fn start(script: Script) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = listener.local_addr().unwrap().to_string();
         Self::serve(script, listener, address)
     }
 
-    /// One that is reached through TLS alone, with this certificate for `localhost`.
+    /// Starts a stand-in that is reachable only over TLS, with this certificate for `localhost`.
     pub async fn start_behind_tls(script: Script, certificate: &Certificate) -> Self {
         let (listener, door) =
             (TcpListener::bind("127.0.0.1:0").await.unwrap(), TcpListener::bind("127.0.0.1:0").await.unwrap());
@@ -68,7 +68,7 @@ impl StandIn {
             while let Ok((socket, _)) = door.accept().await {
                 let acceptor = acceptor.clone();
                 actix_rt::spawn(async move {
-                    // Who does not trust the certificate breaks off.
+                    // A client that does not trust the certificate closes the connection.
                     let Ok(mut outside) = acceptor.accept(socket).await else { return };
                     let mut inside = TcpStream::connect(behind).await.unwrap();
                     tokio::io::copy_bidirectional(&mut outside, &mut inside).await.ok();
@@ -89,7 +89,7 @@ impl StandIn {
         Self { address, asked }
     }
 
-    /// The paths that were asked for which begin so, in their order.
+    /// The requested paths that begin like this, in order.
     pub fn asked(&self, begin: &str) -> Vec<String> {
         self.asked.lock().unwrap().iter().filter(|path| path.starts_with(begin)).cloned().collect()
     }

@@ -1,19 +1,19 @@
-//! Times what the programs do on a machine that other tests keep busy.
+//! Measures how long the programs take on a machine that other tests keep busy.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-/// How long the thread sleeps that notices when this machine lets nobody run.
+/// Sleep of the thread that detects when this machine runs no thread of ours.
 const NAP: Duration = Duration::from_millis(10);
 
-/// Time, less that in which this machine let us wait for a processor.
+/// Measures time without the time in which this process waited for a processor.
 pub struct Stopwatch {
     /// In microseconds.
     held_up: Arc<AtomicU64>,
 }
 
-/// A time that is being taken.
+/// A running measurement.
 pub struct Lap<'watch> {
     watch: &'watch Stopwatch,
     begin: Instant,
@@ -21,7 +21,7 @@ pub struct Lap<'watch> {
 }
 
 impl Stopwatch {
-    /// Begins to watch the machine, until this value is dropped.
+    /// Watches the machine until this value is dropped.
     pub fn start() -> Self {
         let held_up = Arc::new(AtomicU64::new(0));
         let shared = Arc::downgrade(&held_up);
@@ -36,7 +36,7 @@ impl Stopwatch {
         Self { held_up }
     }
 
-    /// Begins to take a time.
+    /// Starts a measurement.
     pub fn lap(&self) -> Lap<'_> {
         Lap { watch: self, begin: Instant::now(), held_up: self.held_up() }
     }
@@ -47,17 +47,17 @@ impl Stopwatch {
 }
 
 impl Lap<'_> {
-    /// How much of the time since the beginning the machine let us wait.
+    /// The part of the time since the start in which this process waited for a processor.
     pub fn held_up(&self) -> Duration {
         self.watch.held_up() - self.held_up
     }
 
-    /// All of that time.
+    /// The time since the start.
     pub fn wall(&self) -> Duration {
         self.begin.elapsed()
     }
 
-    /// What is left of it without.
+    /// The time since the start, without [`Lap::held_up`].
     pub fn elapsed(&self) -> Duration {
         self.wall().saturating_sub(self.held_up())
     }

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-/// The shell's word for the demo simulator.
+/// The demo simulator, quoted for the shell.
 pub const DEMO: &str = concat!("'", env!("CARGO_BIN_EXE_demo-simulator"), "'");
 
 /// A folder with an executable script called `webots`.
@@ -11,22 +11,22 @@ pub struct Webots {
 }
 
 impl Webots {
-    /// A script with this text below `#!/usr/bin/env bash`.
+    /// A script with this text after `#!/usr/bin/env bash`.
     pub fn script(text: &str) -> Self {
         let folder = super::open_folder();
         super::make_program(&folder.path().join("webots"), text);
         Self { folder }
     }
 
-    /// The launcher of the real Webots: it starts the simulator as its child, hands SIGTERM on, and waits.
+    /// A launcher like that of the real Webots: it starts the simulator as its child, forwards SIGTERM, and waits.
     pub fn launcher() -> Self {
         Self::script(&format!(
             "trap 'kill -TERM $child' TERM INT\n{DEMO} \"$@\" &\nchild=$!\nwait $child\ncode=$?\ntrap - TERM INT\nwait $child 2>/dev/null\nexit $code"
         ))
     }
 
-    /// One whose simulation comes to a state, as servers call it, and stays there. One that is to be stopping ignores SIGTERM
-    /// and has a child that hides.
+    /// A Webots whose simulation reaches a state, as servers call it, and stays there. In `stopping` it ignores SIGTERM
+    /// and has a child in another session.
     pub fn that_is(state: &str) -> Self {
         let demo = format!("export DEMO_SIMULATOR_BIND=127.0.0.1; {DEMO} \"$@\" &");
         Self::script(&match state {
@@ -42,7 +42,7 @@ impl Webots {
     }
 }
 
-/// The processes that carry the mark of an instance of a server whose cache is in this folder: pid and command line.
+/// The processes marked as part of a simulation of a server whose cache is in this folder: pid and command line.
 pub fn instances_below(folder: &Path) -> Vec<(i32, String)> {
     let folder = folder.canonicalize().unwrap();
     let mark = std::ffi::OsStr::new("WEBOTS_FLEET_INSTANCE");
@@ -56,7 +56,7 @@ pub fn instances_below(folder: &Path) -> Vec<(i32, String)> {
         .collect()
 }
 
-/// The folders of simulations in a cache.
+/// The instance directories in a cache.
 pub fn instance_folders_in(cache: &Path) -> Vec<PathBuf> {
     let inside = |folder: PathBuf| std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
     let runs = inside(cache.join("runs"));

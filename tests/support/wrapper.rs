@@ -1,4 +1,4 @@
-//! A program that stands before the real one in the path: it notes each call, and can misbehave.
+//! A wrapper that comes before the real program in PATH: it records each call, and can misbehave.
 
 use super::make_program;
 
@@ -8,12 +8,12 @@ pub struct Wrapper {
 }
 
 impl Wrapper {
-    /// One of git, which runs this script before each call; `$REAL` is the real git.
+    /// A wrapper of git that runs this script before each call; `$REAL` is the real git.
     pub fn git(script: &str) -> Self {
         Self::of("git", script)
     }
 
-    /// One of another program.
+    /// A wrapper of this program.
     pub fn of(program: &str, script: &str) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let paths = std::env::var_os("PATH").unwrap();
@@ -25,18 +25,18 @@ impl Wrapper {
         Self { folder }
     }
 
-    /// The variable PATH with the wrapper first.
+    /// The value of PATH with the wrapper first.
     pub fn path(&self) -> String {
         format!("{}:{}", self.folder.path().display(), std::env::var("PATH").unwrap())
     }
 
-    /// The arguments of each call until now.
+    /// The arguments of each call so far.
     pub fn calls(&self) -> Vec<String> {
         let text = std::fs::read_to_string(self.folder.path().join("calls")).unwrap_or_default();
         text.lines().map(str::to_owned).collect()
     }
 
-    /// How many calls have this in their arguments.
+    /// The number of calls whose arguments contain this.
     pub fn count(&self, words: &str) -> usize {
         self.calls().iter().filter(|call| call.contains(words)).count()
     }
