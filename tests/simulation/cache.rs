@@ -1,4 +1,4 @@
-//! The cache of repositories: its budget, what is damaged, and whose it is.
+//! The cache of repositories: its size limit, damage, and its owner.
 
 use std::path::Path;
 use std::time::Duration;
@@ -24,14 +24,13 @@ async fn the_cache_keeps_to_its_budget() {
         actix_rt::time::sleep(Duration::from_millis(20)).await;
     }
     assert!(has("lab/one") && has("lab/two") && has("lab/three"));
-    // One that was there already grows: it counts too, and the one that was used least recently goes.
+    // A cached repository grows: this counts too, and the least recently used repository is evicted.
     forge.commit_noise("lab/one", 600_000);
     ask("lab/one").await;
     until("the oldest is gone", async || !has("lab/two")).await;
     assert!(has("lab/one") && has("lab/three"));
 }
 
-/// Breaks a cached repository.
 type Damage = fn(&Path);
 
 #[actix_rt::test]
@@ -60,7 +59,7 @@ async fn a_damaged_cache_heals() {
         damage(&cached(&server)[0]);
         healed(name, "opened [WorldInfo").await;
     }
-    // Locks that a killed git has left.
+    // Lock files of a killed git.
     for (mark, lock) in [("next", "shallow.lock"), ("last", "refs/fleet/COMMIT.lock")] {
         let commit = server.forge().commit("lab/arm", "main", &[("worlds/a.wbt", &world_text(mark))]);
         std::fs::write(cached(&server)[0].join(lock.replace("COMMIT", &commit)), "").unwrap();
@@ -68,7 +67,7 @@ async fn a_damaged_cache_heals() {
     }
     assert_eq!(cached(&server).len(), 1, "what was broken is gone");
     for folder in ["cache/runs", "cache/git", "cache"] {
-        // The server may still be writing into it.
+        // The server may still be writing into the folder.
         until("it is removed", async || std::fs::remove_dir_all(server.folder.join(folder)).is_ok()).await;
         healed(folder, "opened [last]").await;
         let run = std::fs::read_dir(server.folder.join("cache/runs")).unwrap().next().unwrap().unwrap().path();
@@ -79,7 +78,7 @@ async fn a_damaged_cache_heals() {
 fn cut_packs(repository: &Path) {
     let files = std::fs::read_dir(repository.join("objects/pack")).unwrap().flatten().map(|entry| entry.path());
     for pack in files.filter(|path| path.extension().is_some_and(|extension| extension == "pack")) {
-        // It can't be written.
+        // Packs are read-only.
         std::fs::remove_file(&pack).unwrap();
         std::fs::write(&pack, "PACK").unwrap();
     }
@@ -99,7 +98,7 @@ async fn a_repository_in_use_is_evicted_after_its_last_user() {
     let server = builder.set("cacheSize", 1).start().await;
     let mut user = Client::start(&server, &arm()).await;
     user.until("loading: Step 8/9 : checking main out").await;
-    // Others come and go.
+    // Other repositories are fetched and evicted.
     is_told(&server, &world("lab/leg", "main", "worlds/a.wbt"), "opened [leg]").await;
     until("the other has gone", async || !has(&server, "lab-leg")).await;
     assert!(has(&server, "lab-arm"), "it is in use");

@@ -1,4 +1,4 @@
-//! Checkouts: what a URL names, what is cached, and what an evil repository can't do.
+//! Checkouts: what a URL refers to, what is cached, and what a malicious repository can't do.
 
 use std::path::Path;
 
@@ -158,14 +158,14 @@ async fn a_repository_can_run_nothing() {
     git(&work, &["add", "--all"]);
     git(&work, &["update-index", "--add", "--cacheinfo", "160000,0123456789012345678901234567890123456789,m"]);
     forge.commit_work_tree("lab/arm", "main");
-    // Hooks and filters of the forge's own repository.
+    // Hooks and filters in the bare repository of the forge.
     let bare = forge.path().join("lab/arm");
     std::fs::create_dir(bare.join("hooks")).unwrap();
     for hook in ["post-checkout", "pre-auto-gc", "reference-transaction"] {
         std::fs::write(bare.join("hooks").join(hook), format!("#!/bin/sh\n{}\n", touch(hook))).unwrap();
         git(&bare, &["config", "filter.evil.smudge", &touch("smudge")]);
     }
-    // Settings of the user as whom the server runs.
+    // Settings of the user that runs the server.
     let home = trap.path().join("home");
     std::fs::create_dir_all(home.join(".config/git")).unwrap();
     std::fs::write(home.join(".config/git/attributes"), "*.wbt text eol=crlf\n").unwrap();
@@ -192,7 +192,7 @@ async fn equal_checkouts_are_joined_and_cached() {
     assert_eq!((count("ls-remote"), count("init"), count("fetch"), count("checkout")), (1, 1, 1, 5));
     outcome(&server, &arm()).await;
     assert_eq!((count("ls-remote"), count("fetch"), count("checkout")), (2, 1, 6));
-    // Only what has changed is fetched.
+    // Only changes are fetched.
     forge.commit_noise("lab/arm", 1 << 20);
     outcome(&server, &arm()).await;
     let before = size_of(&server.folder.join("cache/git"));
@@ -209,7 +209,7 @@ async fn progress_moves_in_percent() {
     );
     let server = server_of(reader(), 1).env("PATH", &wrapper.path()).start().await;
     let mut client = Client::start(&server, &arm()).await;
-    // Of a step, Webots' page reads one digit before the slash and one after it.
+    // Webots' page reads only one digit before and one after the slash of a step.
     client.until("loading: Step 1/9 : looking for").await;
     for (step, percent) in [(2, 10), (3, 35), (5, 60), (6, 85)] {
         let words =
@@ -227,8 +227,8 @@ async fn a_kill_in_the_middle_of_a_fetch_harms_no_later_start() {
     forge.commit_noise("lab/arm", 3 << 20);
     let folder = tempfile::tempdir().unwrap();
     let start = || simulation_server(&webots.path(), forge.path(), 2).folder(folder.path());
-    // Half a pack, then nothing more. It is said again and again: of what comes close together clients hear the newest only,
-    // and what git has started may still say something.
+    // git stops after half a pack. The line is repeated because clients receive only the newest of lines that follow
+    // closely, and the processes that git has started may still print some.
     let slow = Wrapper::git(
         "case \"$*\" in *fetch*) \"$REAL\" \"$@\" & sleep 0.03; kill -STOP $!; \
          while echo 'halted: 50%' >&2; do sleep 0.2; done; exit;; esac",

@@ -1,4 +1,4 @@
-//! Commits by their hash: those of branches and tags, and nothing that a forge has from elsewhere.
+//! Commits by their hash: those of branches and tags, and no others that a Git host has.
 
 use super::opened::{cached, reader, world_text};
 use crate::support::git::git;
@@ -14,7 +14,7 @@ async fn any_commit_of_a_branch_or_tag_runs() {
     forge.tag("lab/arm", "v1", "side");
     let bare = forge.path().join("lab/arm");
     git(&bare, &["update-ref", "-d", "refs/heads/side"]);
-    // One forge sends commits alone when it is asked to, the other does not know how.
+    // One forge can send commits without their files, the other can't.
     for can_filter in ["true", "false"] {
         git(&bare, &["config", "uploadpack.allowFilter", can_filter]);
         let wrapper = Wrapper::git("");
@@ -31,8 +31,7 @@ async fn any_commit_of_a_branch_or_tag_runs() {
         assert_eq!(objects.contains(" blob "), can_filter == "false", "{objects}");
         let fetches = || wrapper.calls().iter().filter(|call| call.contains(" fetch ")).count();
         assert_eq!(fetches(), 4, "three commits, and the history once: {:#?}", wrapper.calls());
-        // What is known is not asked for again.
-        // A fetch is followed by gc, which nobody waits for.
+        // Known commits cause no further requests. The `gc` after a fetch runs in the background.
         let calls = || wrapper.calls().iter().filter(|call| !call.contains(" gc ")).count();
         let before = calls();
         assert!(run(&commits[0]).await.contains("opened [first]"));
@@ -56,7 +55,7 @@ async fn a_commit_of_no_branch_or_tag_runs_only_with_any_commit() {
     for can_filter in ["true", "false"] {
         git(&bare, &["config", "uploadpack.allowFilter", can_filter]);
         let none = "0123456789012345678901234567890123456789";
-        // What was allowed once is not allowed for ever.
+        // What was allowed once need not stay allowed.
         for any in [false, true, false] {
             let server = start(any).await;
             for hash in [proposed.as_str(), tree.trim(), none] {

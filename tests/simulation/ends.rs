@@ -1,4 +1,4 @@
-//! How simulations end: under one id in the messages, the log, `simulations.csv`, the counters, the monitor and the output.
+//! Ends of simulations: the same id in messages, log, `simulations.csv`, counters, monitor and output.
 
 use std::path::{Path, PathBuf};
 
@@ -7,7 +7,7 @@ use serde_json::Value;
 use crate::support::http::{PASSWORD, get_as_administrator};
 use crate::support::{Client, DEMO, Forge, Server, Webots, arm, http, server_of, simulation_server, until, world};
 
-/// A simulator that ends with an exit code, once that is in a file.
+/// A simulator that exits with the code in this file, once the file exists.
 fn ending(file: &Path) -> Webots {
     let begun = "printf 'begun\\nred \\033[31m text\\n\\377 no text\\n' >&2";
     let (demo, file) = (format!("{DEMO} \"$@\" >/dev/null 2>&1 &"), file.display());
@@ -15,20 +15,20 @@ fn ending(file: &Path) -> Webots {
     Webots::script(&format!("{begun}\n{demo}\n{ended}\nkill %1 2>/dev/null\nexit $(cat {file})"))
 }
 
-/// A server with one such simulator, its forge and the file.
+/// A server with one such simulator, and the file with its folder.
 async fn ending_server() -> (Server, tempfile::TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("code");
     (server_of(ending(&file), 1).set("isolation", "none").start().await, folder, file)
 }
 
-/// The lines of `simulations.csv`, without the first.
+/// The lines of `simulations.csv` without the header.
 fn lines(server: &Server) -> Vec<Vec<String>> {
     let text = std::fs::read_to_string(server.folder.join("log/simulation/simulations.csv")).unwrap_or_default();
     text.lines().skip(1).map(|line| line.split(',').map(str::to_owned).collect()).collect()
 }
 
-/// Waits for the line of a simulation, and returns its columns.
+/// Waits for the line of a simulation; returns its columns.
 pub async fn line(server: &Server, id: &str) -> Vec<String> {
     let find = || lines(server).into_iter().find(|line| line[0] == id);
     until("its end is in simulations.csv", async || find().is_some()).await;
@@ -83,25 +83,25 @@ async fn a_simulation_keeps_one_id() {
 async fn each_kind_of_end_is_told_as_such() {
     let (mut server, _folder, file) = ending_server().await;
     let start = async || Client::ready(&server).await;
-    // It ends in order.
+    // Webots exits normally.
     let mut finished = start().await;
     std::fs::write(&file, "0").unwrap();
     finished.until("loading: Webots has ended").await;
     assert_eq!(line(&server, finished.id()).await[10], "finished");
     std::fs::remove_file(&file).unwrap();
-    // Its client goes.
+    // Its client leaves.
     let gone = start().await;
     let id = gone.id().to_owned();
     gone.leave().await;
     assert_eq!(line(&server, &id).await[10], "left");
-    // Its world is not there: nothing is kept of it.
+    // Its world does not exist: no output is kept.
     let mut nowhere = Client::start(&server, &world("lab/arm", "main", "worlds/none.wbt")).await;
     nowhere.until("loading: Error:").await;
     let line_of_it = line(&server, nowhere.id()).await;
     assert_eq!(line_of_it[8..], ["", "", "no_checkout", "", ""], "{line_of_it:?}");
     let output = server.url(&format!("/output?id={}", nowhere.id()));
     assert_eq!(http::get(&output).await.status.as_u16(), 404);
-    // A client that waits, and one that runs, while the server is stopped.
+    // The server stops while one client waits and another's simulation runs.
     let (running, mut waiting) = (start().await, Client::start(&server, &arm()).await);
     waiting.until("queue:").await;
     server.stops().await;

@@ -1,4 +1,4 @@
-//! Fetches into one cached repository: one at a time, each commit once, and for no longer than a checkout may take.
+//! Fetches into one cached repository: one at a time, each commit once, each within the time limit of a checkout.
 
 use std::time::Duration;
 
@@ -10,7 +10,7 @@ use crate::support::git::git;
 use crate::support::wrapper::Wrapper;
 use crate::support::{Client, Forge, arm, arm_at, is_told, simulation_server, until, world};
 
-/// A forge with `lab/arm`: each of these branches has two worlds that name it.
+/// A forge with `lab/arm`: each of these branches has two worlds with the branch's name.
 fn forge(branches: &[&str]) -> Forge {
     let forge = Forge::new();
     for branch in branches {
@@ -44,7 +44,7 @@ async fn a_fetch_that_hangs_delays_only_those_who_need_it() {
     until("it hangs", async || fetches(&slow) == 1).await;
     ask("main", "main").await;
     ask(&main, "main").await;
-    // The same commit is fetched once, by whatever name and for whatever world, also when the first has left.
+    // A commit is fetched once, whatever the reference and the world, also if the first client has left.
     let mut by_hash = Client::start(&server, &arm_at(&slow)).await;
     by_hash.until("loading: Step 2/9 : fetching https://github.com/lab/arm: halted").await;
     let mut heir = Client::start(&server, &world("lab/arm", "as-slow", "worlds/b.wbt")).await;
@@ -52,12 +52,12 @@ async fn a_fetch_that_hangs_delays_only_those_who_need_it() {
     stuck.send("nothing that is known").await;
     stuck.until("loading: Error:").await;
     until("it has gone", async || stages(&server).await.len() == 2).await;
-    // Who comes when most of its time has passed has time left after it.
+    // A client that comes late in a fetch has time left after it.
     actix_rt::time::sleep(Duration::from_secs(8)).await;
     let mut next = Client::start(&server, &arm_at("one")).await;
     next.until("loading: Step 2/9 : fetching https://github.com/lab/arm: waiting for another fetch").await;
     assert_eq!(fetches(&slow), 1);
-    // It ends with its time limit, for all who wait for it.
+    // The fetch ends at its time limit, for all clients that wait for it.
     let told = heir.until("loading: Error:").await;
     assert!(told.ends_with("Fetching https://github.com/lab/arm took longer than 18 seconds"), "{told}");
     let told = next.until("loading: Error:").await;
@@ -68,7 +68,7 @@ async fn a_fetch_that_hangs_delays_only_those_who_need_it() {
 #[actix_rt::test]
 async fn a_git_that_is_stopped_fails_once() {
     let forge = &forge(&["main"]);
-    // What each kind of command is for: to ask, to make the repository, to fetch, to list its files, to copy them.
+    // One command of each kind: query, create the repository, fetch, list the files, check them out.
     let kinds = ["ls-remote", "init", "fetch", "ls-tree", "checkout"].map(|command| async move {
         let (webots, marks) = (reader(), tempfile::tempdir().unwrap());
         let stop = format!(

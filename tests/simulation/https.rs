@@ -1,4 +1,4 @@
-//! Repositories over HTTPS, as from a real forge: git's own server behind TLS.
+//! Repositories over HTTPS, as from a real Git host: git's own server behind TLS.
 
 use std::io::Write;
 use std::net::TcpListener;
@@ -11,7 +11,7 @@ use crate::support::git::git;
 use crate::support::listener::{Request, serve};
 use crate::support::{Builder, Forge, Webots, arm, arm_at, is_told, simulation_server, world};
 
-/// A forge that is reached by HTTPS alone.
+/// A forge that is reachable only over HTTPS.
 struct Https {
     forge: Forge,
     port: u16,
@@ -19,8 +19,9 @@ struct Https {
 }
 
 impl Https {
-    /// Serves the forge's repositories; `/lab/dotted` only with `.git` behind it. What is below `/private` wants a password, `/away` is said to be at `elsewhere`,
-    /// and `/old-NAME` at NAME of the same owner or, where that has two dashes, at that of another.
+    /// Serves the forge's repositories. `/lab/dotted` is found only as `/lab/dotted.git`, paths that begin with
+    /// `/lab/private` need a password, `/lab/away` redirects to `elsewhere`, `/lab/old-NAME` to `/lab/NAME`, and
+    /// `/lab/old-OWNER--NAME` to `/OWNER/NAME`.
     fn new(forge: Forge, elsewhere: String) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let port = listener.local_addr().unwrap().port();
@@ -31,7 +32,7 @@ impl Https {
         Self { forge, port, authority }
     }
 
-    /// A simulation server that takes all repositories from here.
+    /// A simulation server that fetches all repositories from this forge.
     fn server(&self, webots: &Webots) -> Builder {
         let mirrors = serde_json::json!({"https://github.com/": format!("https://127.0.0.1:{}/", self.port)});
         simulation_server(&webots.path(), self.forge.path(), 2).set("gitMirrors", mirrors)
@@ -41,7 +42,7 @@ impl Https {
 fn answer(request: &Request, root: &Path, elsewhere: &str) -> Option<(String, Vec<u8>)> {
     let target = request.path();
     let (path, query) = target.split_once('?').unwrap_or((target, ""));
-    // Forges ignore case.
+    // Git hosts ignore case.
     let lowercase = path.to_lowercase();
     let path = lowercase.as_str();
     let is_known = request.header("authorization") == "Basic dTpw";
@@ -100,17 +101,17 @@ async fn a_forge_is_asked_over_https_and_followed_nowhere_else() {
         (arm(), "opened [new]"),
         ("https://www.GitHub.com/LAB/Arm.git/blob/main/worlds/a.wbt".to_owned(), "opened [new]"),
         (world("lab/none", "main", "worlds/a.wbt"), missing),
-        // Nobody is asked for a password.
+        // git asks no user for a password.
         (world("lab/private", "main", "worlds/a.wbt"), missing),
-        // Nobody is led elsewhere.
+        // Redirects to other hosts are not followed.
         (world("lab/away", "main", "worlds/a.wbt"), "https://github.com/lab/away has moved to another host"),
-        // A repository that has moved within its forge is found, also in several steps, and by its commits.
+        // A repository that has moved within its host is found, also after several moves, and so are its commits.
         (world("lab/old-arm", "main", "worlds/a.wbt"), "opened [new]"),
         (world("lab/old-old-old-arm", "main", "worlds/a.wbt"), "opened [new]"),
         (world("lab/dotted", "main", "worlds/a.wbt"), "opened [dotted]"),
         (world("lab/old-arm", &old, "worlds/a.wbt"), "opened [old]"),
         (world("lab/old-none", "main", "worlds/a.wbt"), "https://github.com/lab/none does not exist"),
-        // It is not where it would not be taken from by its own name, nor where nothing ends.
+        // It is not found if its new name is not allowed, or if it is redirected too often.
         (
             world("lab/old-lab--secret", "main", "worlds/a.wbt"),
             "from blocked repository: https://github.com/lab/secret",
@@ -125,7 +126,7 @@ async fn a_forge_is_asked_over_https_and_followed_nowhere_else() {
     assert!(plain.accept().is_err(), "a redirect was followed");
     let cached: Vec<_> = cached(&server).into_iter().filter(|folder| folder.join("HEAD").is_file()).collect();
     assert_eq!(cached.len(), 3, "two repositories and the history of one, in whatever spelling: {cached:?}");
-    // A forge whose certificate nobody trusts is none.
+    // Certificates of unknown authorities are refused.
     let server = https.server(&webots).start().await;
     is_told(&server, &arm(), "certificate").await;
 }

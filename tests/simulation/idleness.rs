@@ -1,4 +1,4 @@
-//! A simulation that stays paused ends; its client is told before, and may keep it. One that runs does not.
+//! A simulation that stays paused ends, unless its client keeps it; the client is warned. One that runs does not end.
 
 use std::time::{Duration, Instant};
 
@@ -8,7 +8,7 @@ use super::life::quick;
 use super::scene::nothing_left;
 use crate::support::{Client, arm, demo_server};
 
-/// In minutes: three seconds. Half of it before the end the client is told.
+/// In minutes: three seconds. The client is warned when half of it is left.
 const LIMIT: f64 = 0.05;
 const TOLD: &str = "idle: 2";
 const WHY: &str = "The simulation was paused for 0.05 minutes";
@@ -16,7 +16,7 @@ const WHY: &str = "The simulation was paused for 0.05 minutes";
 #[actix_rt::test]
 async fn a_paused_simulation_ends_unless_its_client_keeps_it() {
     let server = quick(demo_server(1)).set("idleTimeout", LIMIT).start().await;
-    // An old page, which sends nothing more.
+    // An old page that sends nothing more.
     let begin = Instant::now();
     let mut client = Client::start(&server, &arm()).await;
     assert_eq!(client.until("idle:").await, TOLD);
@@ -44,7 +44,7 @@ async fn who_runs_is_never_ended_for_it() {
     let server = quick(demo_server(1)).set("idleTimeout", LIMIT).start().await;
     let (mut client, _) = Client::resumable(&server).await;
     let mut viewer = Client::connect(&format!("ws://127.0.0.1:{}/", server.port + 1)).await.with_running_scene().await;
-    // Twice as long as it may be paused.
+    // Twice as long as a simulation may be paused.
     while viewer.time().await < 6000.0 {}
     client.until(".").await;
     assert!(!client.heard.iter().any(|text| text.starts_with("idle: 2")), "{:?}", client.heard);

@@ -1,4 +1,4 @@
-//! Files of a project that are kept in Git LFS.
+//! Project files in Git LFS.
 
 use std::path::Path;
 
@@ -25,7 +25,7 @@ async fn a_world_whose_large_files_are_missing_opens_without_them() {
 async fn the_size_of_large_files_is_bounded() {
     let (forge, webots) = (Forge::with_arm(), reader());
     forge.commit("lab/arm", "main", &[("meshes/a.dae", POINTER), (".gitattributes", ATTRIBUTES)]);
-    // A git-lfs that loads more and more for 12345 bytes.
+    // A git-lfs that loads far more than the 12345 bytes of its file.
     let wrapper = Wrapper::git("");
     let lfs = wrapper.path().split(':').next().map(|folder| Path::new(folder).join("git-lfs")).unwrap();
     let loads = "mkdir -p \"$GIT_DIR/lfs/tmp\"\nhead -c 5000000 /dev/zero >\"$GIT_DIR/lfs/tmp/a\"\nexec sleep 1000";

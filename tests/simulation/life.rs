@@ -1,4 +1,4 @@
-//! Leaving a simulation in every state and for every reason: nothing of it is left.
+//! Leaving a simulation in every state and for every reason: nothing of it remains.
 //!
 //! The states are those of [`ALL`]: connected, queued, checking out, launching, idle, running, stopping.
 //!
@@ -32,10 +32,10 @@ pub fn quick(builder: Builder) -> Builder {
 
 #[actix_rt::test]
 async fn a_client_that_leaves_in_any_way_leaves_nothing_behind() {
-    // All but the last, in which it has no client.
+    // All but the last, in which there is no client.
     for state in &ALL[..6] {
         for way in ["closes", "breaks", "is half open"] {
-            // A client that is not polled answers no pings, and its connection stays open.
+            // An unpolled client answers no pings, but its connection stays open.
             let silence = if way == "is half open" { 1.5 } else { 60.0 };
             let change = |builder| quick(builder).set("timing.ping", 0.1).set("timing.silence", silence);
             let mut scene = Scene::new(state, change).await;
@@ -49,7 +49,7 @@ async fn a_client_that_leaves_in_any_way_leaves_nothing_behind() {
                         other.leave().await;
                     }
                 }
-                // Dropped without a word.
+                // Dropped without a close frame.
                 "breaks" => drop((scene.client.take(), scene.other.take())),
                 _ if *state == "connected" => {
                     until("it is sent away", async || scene.server.log().contains("silent for too long")).await;
@@ -74,7 +74,7 @@ async fn a_server_that_stops_notifies_clients_and_leaves_nothing() {
         scene.server.signal(Signal::SIGTERM);
         if state == "stopping" {
             until("it stops", async || scene.server.log().contains("stopping")).await;
-            // It takes no new ones.
+            // It accepts no new clients.
             scene.client = Some(Client::start(&scene.server, &arm()).await);
         }
         for client in [&mut scene.client, &mut scene.other].into_iter().flatten() {
@@ -92,7 +92,7 @@ async fn a_server_that_stops_notifies_clients_and_leaves_nothing() {
 #[actix_rt::test]
 async fn a_server_that_is_killed_leaves_nothing_in_any_state() {
     for state in ALL {
-        // The simulation that is being stopped is seen so in time.
+        // The grace time is long enough to see the simulation stopping.
         let mut scene = Scene::new(state, |builder| quick(builder).set("timing.grace", 2.0)).await;
         scene.server.signal(Signal::SIGKILL);
         scene.server.ended().await;
@@ -105,12 +105,12 @@ async fn a_server_that_is_killed_leaves_nothing_in_any_state() {
 #[actix_rt::test]
 async fn what_a_killed_server_has_left_is_removed_at_the_next_start() {
     let mut scene = Scene::new("checkingout", quick).await;
-    // The guardian, which does it otherwise, is killed too.
+    // The guardian, which would clean up, is killed too.
     kill(Pid::from_raw(scene.server.guardian()), Signal::SIGKILL).unwrap();
     scene.server.signal(Signal::SIGKILL);
     scene.server.ended().await;
     assert_eq!(instance_folders(scene.folder.path()).len(), 1);
-    // A process is known by its mark.
+    // The server recognizes processes of simulations by this mark.
     let mark = instance_folders(scene.folder.path()).remove(0).canonicalize().unwrap();
     let mut orphan =
         std::process::Command::new("sleep").arg("1000").env("WEBOTS_FLEET_INSTANCE", mark).spawn().unwrap();
@@ -129,7 +129,7 @@ async fn a_client_is_told_how_webots_ended() {
         ("kill -SEGV $$", "loading: Error: Webots was ended by the signal SIGSEGV"),
     ];
     for (end, words) in table {
-        // It ends while it is launching, when it was ready, or while it runs.
+        // It ends while it launches, after it has become ready, or while it runs.
         let ready = |pace: &str| format!("{DEMO} \"$@\" &\nsleep 0.5; echo {pace}");
         for start in [String::new(), ready("pause"), ready("real-time")] {
             let webots = Webots::script(&format!("{start}\n{end}"));
@@ -142,7 +142,7 @@ async fn a_client_is_told_how_webots_ended() {
             }
             let told = client.heard.last().unwrap().clone();
             assert!(told.starts_with(words), "{told}");
-            // A Webots that ends before it listens is taken for the server's fault.
+            // If Webots ends before it listens, the server counts that as its own fault.
             let is_own = start.is_empty() && told.starts_with("loading: Error:");
             assert_eq!(client.closed().await, Some(if is_own { 1013 } else { 1000 }), "{told}");
             nothing_left(&server, 1).await;

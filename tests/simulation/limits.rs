@@ -1,4 +1,4 @@
-//! What is too large, or takes too much.
+//! Projects that are too large, or that take too much.
 
 use super::opened::{reader, size_of, world_text};
 use super::scene::nothing_left;
@@ -12,19 +12,19 @@ async fn sizes_are_limited() {
     let old = git(&forge.path().join("lab/arm"), &["rev-parse", "main"]);
     forge.commit_noise("lab/arm", 6 << 20);
     forge.commit("lab/zeros", "main", &[("worlds/a.wbt", &world_text("zeros")), ("zeros", &"0".repeat(6 << 20))]);
-    // A project beside it is small, but all of its commit is fetched.
+    // The project at the old commit is small, but a fetch by hash gets the whole history from this forge.
     let builder = simulation_server(&webots.path(), forge.path(), 2).set("projectSize", 1);
     let server = builder.set("cacheSize", 1).start().await;
     let told = outcome(&server, &arm()).await;
     assert!(told.ends_with("is larger than 1 MiB"), "{told}");
     let told = outcome(&server, &arm_at(old.trim())).await;
     assert_eq!(told, "loading: Error: https://github.com/lab/arm with its history is larger than 1 MiB");
-    // What was broken off leaves nothing.
+    // Cancelled fetches leave nothing.
     let cache = server.folder.join("cache/git");
     until("the cache is within its budget", async || size_of(&cache) < 1 << 20).await;
     let told = outcome(&server, &world("lab/zeros", "main", "worlds/a.wbt")).await;
     assert_eq!(told, "loading: Error: The project is larger than 1 MiB", "it is small only as it is packed");
-    // Small files without end: a folder that holds ten times one that holds ten times...
+    // Countless small files: a folder with ten entries for the same folder, which has ten entries itself, and so on.
     let work = forge.work_tree("lab/bomb", "main");
     std::fs::create_dir_all(work.join("worlds")).unwrap();
     std::fs::write(work.join("worlds/a.wbt"), WORLD).unwrap();
@@ -54,7 +54,7 @@ async fn sizes_are_limited() {
 #[actix_rt::test]
 async fn git_is_bounded_in_memory_and_in_what_it_writes() {
     let (forge, webots) = (Forge::with_arm(), reader());
-    // Small as it is listed, and four times as large as it is written.
+    // Small in git's listing, four times as large when checked out.
     let text = "0123456789\n".repeat(50_000);
     let attributes = "*.txt working-tree-encoding=UTF-32LE\n";
     let encoded: Vec<u8> = text.bytes().flat_map(|byte| [byte, 0, 0, 0]).collect();
@@ -66,7 +66,7 @@ async fn git_is_bounded_in_memory_and_in_what_it_writes() {
     assert_eq!(listed.trim(), text.len().to_string());
     let server = simulation_server(&webots.path(), forge.path(), 1).set("projectSize", 1).start().await;
     assert_eq!(outcome(&server, &arm()).await, "loading: Error: The project is larger than 1 MiB");
-    // The server sets it once git has been started.
+    // The server sets the limit after it has started git.
     let wrapper = Wrapper::git("until [ \"$(ulimit -d)\" -le 2097152 ] 2>/dev/null; do sleep 0.01; done");
     let server = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path()).start().await;
     is_told(&server, &arm(), "opened").await;

@@ -1,4 +1,4 @@
-//! The simulation server, seen from outside: the built program, real git, real processes, a stand-in for Webots.
+//! The simulation server as a black box: the built program, real git, real processes, a stand-in for Webots.
 
 mod cache;
 mod checkout;

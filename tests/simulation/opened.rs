@@ -1,10 +1,10 @@
-//! What the tests of checkouts share: a Webots that tells what it was given, and what is left on the disk.
+//! Shared by the tests of checkouts: a Webots that prints what it opens, and what is on the disk.
 
 use std::path::{Path, PathBuf};
 
 use crate::support::{Server, Webots};
 
-/// A Webots that tells which world it was given, and ends: its client hears the world's second line.
+/// A Webots that prints the second line and the path of its world, and fails: the error for its client has both.
 pub fn reader() -> Webots {
     Webots::script("for last; do :; done\necho \"opened [$(sed -n 2p \"$last\")] $last\"\nexit 1")
 }

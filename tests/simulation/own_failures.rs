@@ -1,5 +1,5 @@
-//! Starts that fail for a reason of the server's own: their clients are sent elsewhere, session servers prefer others, and
-//! no text for a client tells where something is on the machine.
+//! Starts that fail through the server's own fault: the clients are sent elsewhere, session servers prefer other
+//! servers, and no text for a client contains a path of the machine.
 
 use std::os::unix::fs::PermissionsExt;
 use std::path::PathBuf;
@@ -14,7 +14,7 @@ async fn failed_starts(server: &Server) -> u64 {
     server.status().await["failedStarts"].as_u64().unwrap()
 }
 
-/// A server whose Webots fails until there is a file.
+/// A server whose Webots fails until a file exists.
 async fn broken(places: u16) -> (Server, tempfile::TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
     let repaired = folder.path().join("repaired");
@@ -34,7 +34,7 @@ async fn a_start_that_fails_because_of_the_server_is_sent_elsewhere() {
         assert_eq!(failed_starts(&server).await, count);
         assert_eq!(line(&server, client.id()).await[10], "no_webots");
     }
-    // A world that is not there is not the server's fault.
+    // A missing world is not the server's fault.
     let mut client = Client::start(&server, &world("lab/arm", "main", "worlds/none.wbt")).await;
     client.until("loading: Error:").await;
     assert_eq!((client.closed().await, failed_starts(&server).await), (Some(1000), 3));
@@ -49,7 +49,7 @@ async fn a_start_that_fails_because_of_the_server_is_sent_elsewhere() {
 async fn a_black_hole_takes_a_handful_of_clients_and_not_a_class() {
     let (hole, _folder, repaired) = broken(12).await;
     let healthy = demo_server(12).start().await;
-    // What else runs on this machine must not close the fleet.
+    // Other load on this machine must not close the fleet.
     let servers = [healthy.address(), hole.address()];
     let session = session_server(&servers).set("loadThreshold", 1000).start().await;
     let status = async || session.status().await;
@@ -70,7 +70,7 @@ async fn a_black_hole_takes_a_handful_of_clients_and_not_a_class() {
                 break;
             }
         }
-        // Only a report tells the session server: until then the next clients would be sent there, too.
+        // The session server learns this only from reports: until the next one it would send clients there, too.
         let reported = async || {
             let instances = &status().await["servers"][1]["instances"];
             instances["arrivals"] == failures && instances["starting"] == 0
@@ -81,13 +81,13 @@ async fn a_black_hole_takes_a_handful_of_clients_and_not_a_class() {
     let page = status().await;
     assert!(page["servers"][1]["error"].as_str().is_some_and(|why| why.contains("others are preferred")), "{page}");
     assert!(session.log().contains("failed for a reason of its own; others are preferred"), "{}", session.log());
-    // Who comes by itself shows that it works again.
+    // A direct client shows that it works again.
     std::fs::write(&repaired, "").unwrap();
     Client::ready(&hole).await;
     until("it is as good as others", async || status().await["servers"][1]["error"].is_null()).await;
 }
 
-/// What a client hears of a start that fails.
+/// The texts that a client receives when its start fails.
 async fn heard(server: &Server, world: &str) -> Vec<String> {
     let mut client = Client::start(server, world).await;
     client.until("loading: Error:").await;
@@ -107,20 +107,20 @@ async fn no_text_for_a_client_holds_a_path_of_the_machine() {
         all.extend(heard(&server, &world(repository, place, "worlds/none.wbt")).await);
     }
     all.extend(heard(&server, "https://github.com/../etc/passwd").await);
-    // The repositories can't be read any more.
+    // The repositories become unreadable.
     let away = forge.path().with_extension("away");
     std::fs::rename(forge.path(), &away).unwrap();
     std::fs::write(forge.path(), "no folder").unwrap();
     all.extend(heard(&server, &world("lab/arm", "other", "worlds/arm.wbt")).await);
     std::fs::remove_file(forge.path()).unwrap();
     std::fs::rename(&away, forge.path()).unwrap();
-    // What was fetched is no repository any more.
+    // The cached repositories are broken.
     let cached = std::fs::read_dir(server.folder.join("cache/git")).unwrap().flatten().map(|entry| entry.path());
     for repository in cached.filter(|path| path.is_dir()) {
         std::fs::write(repository.join("config"), "[nonsense").unwrap();
     }
     all.extend(heard(&server, &arm()).await);
-    // Webots can't be run.
+    // Webots can't be executed.
     std::fs::set_permissions(webots.path(), std::fs::Permissions::from_mode(0o644)).unwrap();
     all.extend(heard(&server, &arm()).await);
     let temporary = std::env::temp_dir().to_str().unwrap().to_owned();

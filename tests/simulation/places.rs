@@ -1,4 +1,4 @@
-//! Places and the waiting line.
+//! Slots and the queue.
 
 use std::cell::{Cell, RefCell};
 use std::collections::BTreeSet;
@@ -11,7 +11,7 @@ use crate::support::{Client, arm, demo_server, until};
 #[actix_rt::test]
 async fn the_waiting_line_is_served_in_order_and_forgets_who_leaves() {
     let server = demo_server(2).set("waitingLine", 4).start().await;
-    // A class behind one address gets every free place and the whole line.
+    // A class behind one address gets all free slots and the whole queue.
     let start = async || Client::start_from(&server, "203.0.113.9", &arm()).await;
     let mut inside = Vec::new();
     for place in 1..=2 {
@@ -32,7 +32,7 @@ async fn the_waiting_line_is_served_in_order_and_forgets_who_leaves() {
     let words = "loading: Error: All 2 places of this simulation server are taken, and 4 clients are waiting already";
     assert!(told.starts_with(words), "{told}");
     assert_eq!(late.closed().await, Some(1000));
-    // Who leaves the line is forgotten at once, and only those behind are told.
+    // A client that leaves is removed from the queue at once, and only those behind it are notified.
     line.remove(1).leave().await;
     assert_eq!(line[1].until("queue:").await, "queue: 1");
     assert_eq!(line[2].until("queue:").await, "queue: 2");
@@ -40,7 +40,7 @@ async fn the_waiting_line_is_served_in_order_and_forgets_who_leaves() {
     let instances = server.status().await["instances"].clone();
     assert_eq!((instances["queued"].as_u64(), instances["places"].as_u64()), (Some(3), Some(2)));
     assert_eq!(instances["arrivals"].as_u64(), Some(7));
-    // The first in the line gets the place that becomes free, at its port.
+    // The first in the queue gets the next free slot, with its port.
     inside.remove(1).leave().await;
     assert_eq!(line[0].until("webots:").await, format!("webots:ws://localhost:{}", server.port + 2));
     assert_eq!(line[1].until("queue:").await, "queue: 0");
@@ -69,19 +69,20 @@ async fn one_address_leaves_places_and_a_part_of_the_line_to_others() {
         assert_eq!(client.until("").await, format!("queue: {ahead}"));
         line.push(client);
     }
-    // The addresses of a /64 are one.
+    // All addresses of a /64 count as one.
     let told = Client::start_from(&server, greedy_too, &arm()).await.until("").await;
     let words =
         "loading: Error: Clients of your address have 3 places of this simulation server, and 3 more are waiting";
     assert!(told.starts_with(words), "{told}");
-    // The fourth place is another's at once, though three wait; and so is the fourth place in the line.
+    // Another address gets the fourth slot at once, although three clients wait, and also the fourth place in the
+    // queue.
     let mut lucky = Client::start_from(&server, other, &arm()).await;
     assert_eq!(lucky.until("webots:").await, format!("webots:ws://localhost:{}", server.port + 4));
     let mut late = Client::start_from(&server, third, &arm()).await;
     assert_eq!(late.until("").await, "queue: 3");
     let told = Client::start_from(&server, other, &arm()).await.until("").await;
     assert!(told.starts_with("loading: Error: All 4 places of this simulation server are taken"), "{told}");
-    // Of the greedy one's places the next is for the first who waits; what another leaves is not for it.
+    // The next slot that the greedy address frees is for its first waiting client; slots of other addresses are not.
     lucky.leave().await;
     late.until("webots:").await;
     inside.remove(0).leave().await;
@@ -127,7 +128,7 @@ async fn a_crowd_is_served_to_the_last_one_and_no_two_share_a_place() {
         assert!(held.borrow_mut().insert(url.clone()), "{url} is another's");
         were_all_held.set(were_all_held.get() || held.borrow().len() == 3);
         until("all places are taken at once", async || were_all_held.get()).await;
-        // Before it leaves: the place is free then.
+        // Before it leaves, because leaving frees the slot.
         held.borrow_mut().remove(&url);
         client.leave().await;
         url

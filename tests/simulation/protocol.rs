@@ -1,4 +1,4 @@
-//! What clients and pages may ask, and what they are told.
+//! Requests of clients and pages, and their answers.
 
 use super::scene::stages;
 use crate::support::{Client, arm, arm_at, demo_server, http, instances_below, until, world};
@@ -28,7 +28,7 @@ async fn a_message_that_is_none_is_answered_in_words() {
         assert!(told.starts_with("loading: Error: ") && told.contains(words), "{text}: {told}");
         assert_eq!(client.closed().await, Some(1000));
     }
-    // What a client names is no HTML.
+    // Text from a client is not interpreted as HTML.
     let image = "%3Cimg%20src=x%20onerror=alert(1)%3E";
     for url in [
         world("lab/arm", "main", &format!("worlds/{image}.wbt")),
@@ -75,7 +75,7 @@ async fn messages_in_pieces_too_early_or_again_and_again_do_no_harm() {
     let server = demo_server(2).start().await;
     let text = serde_json::json!({"start": {"url": arm()}, "é": "é".repeat(3000)}).to_string();
     let mut client = Client::connect(&server.websocket("/client")).await;
-    // One that comes too early ends nothing.
+    // A reset that comes too early does not close the connection.
     let refused = "loading: Error: A controller can be reset only while a simulation runs";
     let reset = r#"{"reset controller": "c/c.py"}"#;
     client.send(reset).await;
@@ -92,7 +92,7 @@ async fn messages_in_pieces_too_early_or_again_and_again_do_no_harm() {
     client.send(&start).await;
     until("it is logged", async || server.log().contains("second simulation on one connection; ignored")).await;
     assert_eq!(stages(&server).await.len(), 1);
-    // Who asks without reading is sent away.
+    // A client that sends requests without reading is disconnected.
     for _ in 0..150 {
         client.send(&start).await;
     }
@@ -109,7 +109,7 @@ async fn connections_are_bounded() {
     assert_eq!(third().await.err(), Some(503));
     one.leave().await;
     until("there is room", async || third().await.is_ok()).await;
-    // One address leaves some to others.
+    // One address leaves some connections to others.
     let server = demo_server(1).set("maxClients", 4).start().await;
     let connect = async |address| Client::from_address(&server, address).await;
     let greedy = [connect("203.0.113.9").await, connect("203.0.113.9").await, connect("203.0.113.9").await];

@@ -1,4 +1,4 @@
-//! A server that can start no simulation says so and is not offered; one that is limited says that too.
+//! A server that can't start simulations reports that and gets no clients; one with limitations reports them too.
 
 use serde_json::Value;
 
@@ -6,7 +6,7 @@ use crate::support::{
     Forge, Server, Webots, arm, demo_server, http, is_told, session_server, simulation_server, until,
 };
 
-/// Whether the session server counts its only simulation server as one that works; a busy machine may make it full.
+/// Whether the session server considers its only simulation server working; on a busy machine it may be full.
 async fn works(session: &Server) -> bool {
     ["up", "full"].contains(&session.status().await["servers"][0]["state"].as_str().unwrap())
 }
@@ -42,7 +42,7 @@ async fn a_display_that_is_missing_is_a_problem_for_webots_itself() {
     until("it is told", async || server.health().await.0 == 503).await;
     assert!(server.health().await.1.contains("no display answers at :59"));
     is_told(&server, &arm(), "no display answers at :59").await;
-    // That of each GPU is needed.
+    // The display of each GPU is required.
     let displays = serde_json::json!([":59000", ":59001"]);
     let server = itself().set("gpus", "spread").set("displays", displays).start().await;
     until("the first is missing", async || server.health().await.1.contains("no display answers at :59000")).await;

@@ -27,18 +27,18 @@ async fn gpus_are_read_and_the_least_busy_one_counts() {
     assert_eq!(gpus[0]["memoryTotal"].as_u64(), Some(8 << 30));
     let load = async || http::get(&server.url("/load")).await.text().parse::<f64>().unwrap();
     let metrics = async || server.metrics().await;
-    // Where other tests leave the processor no rest, its load counts.
+    // If other tests use all processors, the load is that of the processors.
     let is_full = async || metrics().await.contains("\nwebots_machine_cpu_percent 100\n");
     let counts = async || (99.0..100.0).contains(&load().await) || is_full().await;
     until("the mean is that of the less busy GPU", counts).await;
     let metrics = metrics().await;
     assert!(metrics.contains("webots_machine_gpu_compute_percent{gpu=\"0\",name=\"Stand-in A\"} 100"), "{metrics}");
-    // Simulations are spread over them only where that is asked for.
+    // Simulations are spread over GPUs only if the configuration asks for it.
     let _client = Client::ready(&server).await;
     assert_eq!(given(&server).await, [(None, String::new(), ":91".to_owned())]);
 }
 
-/// The state of a server's GPUs: what is wrong with them.
+/// The `gpuProblem` on `/status`.
 async fn gpu_problem(server: &Server) -> Option<String> {
     server.status().await["gpuProblem"].as_str().map(str::to_owned)
 }
@@ -50,7 +50,7 @@ async fn gpus_that_are_lost_are_told_and_come_back() {
     for (variable, words, left) in [
         ("NVML_LOST", "1 of 2 GPUs don't answer", 1),
         ("NVML_ONE", "1 of 2 GPUs don't answer", 1),
-        // A driver that is loaded after the start, and unloaded.
+        // A driver that is loaded after the start and then unloaded.
         ("NVML_UNLOADED", "2 of 2 GPUs don't answer", 0),
     ] {
         let is_required = variable != "NVML_LOST";
@@ -119,7 +119,7 @@ async fn samples_are_written_with_the_columns_of_the_original() {
     }
 }
 
-/// What of the GPU each simulation of a server with four is told: its number on `/status`, and its variables.
+/// What each simulation gets: its GPU's number on `/status`, and its environment variables.
 async fn given(server: &Server) -> Vec<(Option<u64>, String, String)> {
     let simulations = server.simulations().await;
     let told = simulations.iter().map(|one| {
@@ -150,7 +150,7 @@ async fn simulations_are_spread_over_gpus_and_a_lost_one_gets_none() {
         .set("displays", serde_json::json!(displays));
     let server = four.start().await;
     until("GPUs are read", async || server.status().await["gpus"][3].is_object()).await;
-    // The first has the most memory in use, the third computes.
+    // GPU 0 has the most memory in use, GPU 2 computes.
     let mut clients = Vec::new();
     for _ in 0..4 {
         clients.push(Client::start(&server, &arm()).await);

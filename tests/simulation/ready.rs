@@ -1,4 +1,4 @@
-//! When Webots is ready, where, and when it is not.
+//! When Webots becomes ready, on which display, and what happens if it does not become ready.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -38,9 +38,9 @@ async fn a_webots_that_hangs_is_told_and_ended() {
     let words = "loading: Webots has given no sign of life for ";
     let told = client.until(words).await;
     let seconds = |words: &str| words.split(' ').next().and_then(|number| number.parse::<u64>().ok());
-    // One look later, where the machine held the server up.
+    // Later if the machine has delayed the server.
     let late = || begun.held_up().as_secs_f64().ceil() as u64;
-    // Six periods, and the time to the next look.
+    // Six heartbeats, and the time until the next check.
     assert!(
         told.strip_prefix(words).and_then(seconds).is_some_and(|seconds| (3..=3 + late()).contains(&seconds)),
         "{told}"
@@ -61,7 +61,7 @@ async fn a_webots_that_hangs_is_told_and_ended() {
 async fn webots_is_given_the_documented_command_line_and_a_display() {
     let (forge, webots) = (Forge::with_arm(), Webots::script("echo \"on [$DISPLAY]: $*\"\nexit 1"));
     let hidden = "--minimize --no-rendering ";
-    // The configured display, else the server's own, else the first.
+    // The configured display, else that of the server's environment, else `:0`.
     for (configured, environment, display, mode, hidden, stream) in [
         (Some(":57"), "export DISPLAY=:58", ":57", "x3d", hidden, "--stream"),
         (None, "export DISPLAY=:58", ":58", "w3d", hidden, "--stream"),
@@ -106,7 +106,7 @@ async fn paths_may_have_spaces_and_quotes() {
     }
 }
 
-/// The display that a simulator has printed.
+/// The display that a Webots has printed.
 async fn display_of(server: &Server, client: &Client) -> String {
     let printed = || {
         let text = std::fs::read_to_string(server.output_file(client)).unwrap_or_default();
@@ -120,11 +120,11 @@ async fn display_of(server: &Server, client: &Client) -> String {
 async fn each_webots_gets_a_virtual_display_of_its_own() {
     needs!("Xvfb");
     let _alone = display::alone().await;
-    // It tells which display it has, and fails without.
+    // It prints its display, and fails if there is none.
     let webots = Webots::script(&format!(
         "test -S /tmp/.X11-unix/X${{DISPLAY#:}} || exit 9\necho \"display $DISPLAY\"\n{DEMO} \"$@\" & wait"
     ));
-    // In a sandbox each has the same number.
+    // In sandboxes, all displays have the same number.
     let server = server_of(webots, 2).set("xvfb", true).set("isolation", "none").start().await;
     let (one, other) = (Client::ready(&server).await, Client::ready(&server).await);
     let (first, second) = (display_of(&server, &one).await, display_of(&server, &other).await);

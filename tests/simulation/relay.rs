@@ -1,4 +1,5 @@
-//! Streams through the server (`"streaming": "relay"`): its client has all of what Webots sends, and nobody else any of it.
+//! Streams through the server (`"streaming": "relay"`): the client receives all that Webots sends, and no other client
+//! does.
 
 use std::time::Duration;
 
@@ -17,7 +18,7 @@ use crate::support::http::{PASSWORD, get_as_administrator, get_with_password};
 use crate::support::network::Network;
 use crate::support::{Builder, Client, SOON, Server, Webots, arm, http, server_of, skip, until};
 
-/// The headers of who asks for a WebSocket.
+/// The headers of a WebSocket request.
 const UPGRADE: &str = "Host: localhost\r\nConnection: upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n\
     Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n";
 
@@ -29,12 +30,12 @@ async fn relaying(webots: Webots, change: impl FnOnce(Builder) -> Builder) -> Se
     change(builder).start().await
 }
 
-/// The same of the demo simulator.
+/// The same with the demo simulator.
 async fn relay(change: impl FnOnce(Builder) -> Builder) -> Server {
     relaying(Webots::launcher(), change).await
 }
 
-/// A simulation, and the path of its stream.
+/// A client with a simulation, and the path of its stream.
 async fn start(server: &Server) -> (Client, String) {
     let mut client = Client::connect(&server.websocket("/client")).await;
     client.send(&json!({"start": {"url": arm(), "resumable": true}}).to_string()).await;
@@ -52,12 +53,12 @@ async fn look_on(server: &Server, path: &str) -> Client {
     Client::connect(&server.websocket(path)).await
 }
 
-/// The status code that somebody gets who asks for a WebSocket.
+/// The status code of the answer to a WebSocket request.
 async fn refused(server: &Server, path: &str) -> u16 {
     Client::with_headers(&server.websocket(path), &[]).await.err().unwrap_or(101)
 }
 
-/// Sends these bytes, and returns what comes until the connection ends.
+/// Sends these bytes, and returns what is received until the connection ends.
 async fn raw(server: &Server, bytes: &str) -> String {
     let mut socket = TcpStream::connect(server.address()).await.unwrap();
     socket.write_all(bytes.as_bytes()).await.unwrap();
@@ -68,7 +69,7 @@ async fn raw(server: &Server, bytes: &str) -> String {
 
 type Socket<S> = WebSocketStream<S>;
 
-/// A Webots that this test plays, on a server that relays to it.
+/// A Webots whose side of the stream this test plays, on a server that relays to it.
 struct Played {
     server: Server,
     listener: TcpListener,
@@ -84,7 +85,7 @@ impl Played {
         Self { server: relaying(webots, change).await, listener }
     }
 
-    /// A WebSocket, and Webots' end of it.
+    /// Both ends of a stream: the client's and Webots'.
     async fn connect(&self, path: &str) -> (Socket<MaybeTlsStream<TcpStream>>, Socket<TcpStream>) {
         let config = WebSocketConfig::default().max_frame_size(Some(64 << 20));
         let url = self.server.websocket(path);
@@ -97,7 +98,7 @@ impl Played {
         (both.0.unwrap().0, both.1)
     }
 
-    /// Answers one request with these bytes, as Webots; gives back the head of the request.
+    /// Answers one request with these bytes, as Webots; returns the head of the request.
     async fn answer(&self, bytes: &[u8]) -> String {
         let (mut socket, _) = self.listener.accept().await.unwrap();
         let mut head = [0; 4096];
@@ -123,7 +124,7 @@ async fn a_simulation_and_its_files_are_reached_through_the_server() {
         let (client, path) = start(&server).await;
         let mut viewer = look_on(&server, &path).await.with_running_scene().await;
         viewer.until("application/json:").await;
-        // As Webots' page and as ours write it.
+        // The path as Webots' page writes it, and as ours does.
         look_on(&server, &format!("{path}/")).await.send("x3d;broadcast").await;
 
         let picture = http::get(&server.url(&format!("{path}/worlds/textures/a.png"))).await;
@@ -170,7 +171,7 @@ async fn all_frames_and_close_codes_pass_in_both_directions() {
     viewer.send(Message::Close(Some(frame(3000, "")))).await.unwrap();
     assert_eq!(next(&mut webots).await, Some(Message::Close(Some(frame(3000, "")))));
 
-    // One that just breaks is broken on the other side.
+    // A connection that breaks on one side is broken on the other.
     let (viewer, mut webots) = played.connect(&path).await;
     drop(viewer);
     assert_eq!(next(&mut webots).await, None);
@@ -201,7 +202,7 @@ async fn a_viewer_that_does_not_read_costs_nothing() {
         assert_eq!(next(&mut viewer).await, Some(Message::text("another")));
     }
     assert!(memory() < before + (16 << 20), "{} MiB more", (memory() - before) >> 20);
-    // The other way round.
+    // The other direction.
     let (mut flood, webots) = played.connect(&path).await;
     while let Ok(sent) = actix_rt::time::timeout(Duration::from_secs(2), flood.send(frame.clone())).await {
         sent.unwrap();
@@ -210,7 +211,7 @@ async fn a_viewer_that_does_not_read_costs_nothing() {
     }
     assert!(memory() < before + (16 << 20), "{} MiB more", (memory() - before) >> 20);
     drop(webots);
-    // And it has all of it, once it reads.
+    // It receives all of it once it reads.
     assert_eq!(next(&mut lazy).await, Some(frame));
 }
 
@@ -242,7 +243,7 @@ async fn streams_have_connections_of_their_own() {
     viewer.close(None).await.unwrap();
     while next(&mut webots).await.is_some() {}
     drop((viewer, webots));
-    // Without a key it is refused, but not for want of room.
+    // Without a key it is refused, but not for lack of room.
     let upgrade = format!("GET {path} HTTP/1.1\r\nHost: a\r\nConnection: upgrade, close\r\nUpgrade: websocket\r\n\r\n");
     until("there is room again", async || raw(&played.server, &upgrade).await.starts_with("HTTP/1.1 400 ")).await;
     client.leave().await;
@@ -297,13 +298,14 @@ async fn no_trick_leads_anywhere_else() {
         assert!(answer.starts_with(&format!("HTTP/1.1 {status} ")), "{shown}: {answer}");
         assert!(!shown.contains("/client") || answer.ends_with("Error: a request for this has no body."), "{answer}");
     }
-    // None of all that has reached Webots, nor what was named.
+    // None of these requests has reached Webots, or the address that they named.
     let reached = actix_rt::time::timeout(Duration::from_millis(200), async {
         tokio::select! { one = played.listener.accept() => one, one = other.accept() => one }
     });
     assert!(reached.await.is_err());
 
-    // The absolute form is that of a proxy's client; it leads to Webots, and so does what is hidden behind the first request.
+    // A request in absolute form, as clients of a proxy send it, goes to Webots; a second request behind it gets no
+    // answer.
     let absolute =
         format!("GET http://{elsewhere}{path}/a.png?x=1 HTTP/1.1\r\n{headers}X-Secret: y\r\nAuthorization: z\r\n\r\n");
     let second = format!("GET {path}/second.png HTTP/1.1\r\n{headers}\r\n");
@@ -331,7 +333,7 @@ async fn a_webots_that_does_not_answer_costs_its_client_an_error() {
         let (status, _) = tokio::join!(refused(&played.server, &path), played.answer(nonsense.as_bytes()));
         assert_eq!(status, 502, "{nonsense}");
     }
-    // One without a body ends with its head.
+    // An answer without a body ends with its head.
     let headers = "Host: localhost\r\nIf-None-Match: \"x\"\r\nConnection: close\r\n";
     let request = format!("GET {path}/a.png HTTP/1.1\r\n{headers}\r\n");
     let webots = played.answer(b"HTTP/1.1 304 Not Modified\r\nETag: \"x\"\r\n\r\n");
@@ -361,7 +363,7 @@ async fn a_token_is_valid_as_long_as_its_simulation() {
     until("the token is gone", async || refused(&server, &path).await == 404).await;
     assert_eq!(http::get(&server.url(&format!("{path}/worlds/textures/a.png"))).await.status, 404);
     assert_eq!(http::get(&server.url(&format!("{others}/worlds/textures/a.png"))).await.status, 200);
-    // Also where the next simulation has the same port.
+    // Also if the next simulation has the same port.
     let (_next, third) = start(&server).await;
     assert_eq!(refused(&server, &path).await, 404);
     assert_ne!(third, path);
@@ -391,13 +393,13 @@ async fn a_stranger_sees_no_port_and_steers_nobody() {
         assert_eq!(simulation["port"], if is_shown { json!(port) } else { Value::Null }, "{mode} {has_password}");
         let page = server.monitor().await;
         assert_eq!(page.contains(&format!(">{port}<")), is_shown, "{mode} {has_password}");
-        // A wrong password may be meant for another.
+        // Credentials may be meant for another service, so a wrong password is not refused.
         for (password, shown) in [("wrong", Value::Null), (PASSWORD, json!(port))].into_iter().filter(|_| has_password)
         {
             let answer = get_with_password(&server.url("/status"), password).await;
             assert_eq!((answer.status.as_u16(), &answer.json()["simulations"][0]["port"]), (200, &shown), "{password}");
         }
-        // An output is for administrators where there is a password.
+        // If there is a password, outputs are for administrators only.
         let url = server.url(&format!("/output?id={}", client.id()));
         client.leave().await;
         nothing_left(&server, 2).await;
@@ -412,7 +414,7 @@ async fn a_stranger_sees_no_port_and_steers_nobody() {
         assert!(server.log().contains(&port), "the log is the administrator's");
     }
 
-    // The prank, over the relay: with all that a stranger can learn, also one with a simulation of his own.
+    // An attack through the relay, with all that a stranger can learn, including the path of a stream of his own.
     let server = relay(|builder| builder).await;
     let (_victim, path) = start(&server).await;
     let (_stranger, own) = start(&server).await;
@@ -434,7 +436,7 @@ async fn a_stranger_sees_no_port_and_steers_nobody() {
 async fn pages_of_other_origins_start_nothing_and_get_no_stream() {
     let server = relay(|builder| builder.set("allowedOrigins", json!(["https://lab.org"]))).await;
     let (_client, path) = start(&server).await;
-    // Webots' own viewer runs in a frame without an origin.
+    // Webots' own viewer runs in a frame with an opaque origin.
     for (origin, may_start, allowed) in
         [("https://lab.org", true, true), ("null", false, true), ("https://evil.org", false, false)]
     {
@@ -449,7 +451,7 @@ async fn pages_of_other_origins_start_nothing_and_get_no_stream() {
     }
 }
 
-/// Opens the page on which an administrator watches the simulation of a client, and returns the path of its stream.
+/// Opens an administrator's watch page of a client's simulation, and returns the path of its stream.
 async fn watched_by(server: &Server, client: &Client) -> String {
     let url = server.url(&format!("/watch?id={}", client.id()));
     let answer = get_as_administrator(&url).await;
@@ -471,7 +473,7 @@ async fn an_administrator_watches_and_changes_nothing() {
         let path = watched_by(&server, &client).await;
         let mut watcher = look_on(&server, &path).await;
         assert_eq!(client.until("watched").await, "watched: 1");
-        // Before it has said that it only watches, nothing of it is heard either.
+        // Until it asks only to watch, its messages are ignored.
         for text in ["pause", "x3d", "robot:a:b;broadcast"] {
             watcher.send(text).await;
         }
@@ -488,7 +490,7 @@ async fn an_administrator_watches_and_changes_nothing() {
         watcher.until("application/json:").await;
         let files = server.url(&format!("{path}/worlds/textures/a.png"));
         assert_eq!(http::get(&files).await.status, 200);
-        // The token is for one connection, and leads nowhere after it.
+        // The token is for one connection, and invalid after it.
         assert_eq!(refused(&server, &path).await, 404);
         let mut second = look_on(&server, &watched_by(&server, &client).await).await;
         second.send("x3d;broadcast").await;

@@ -1,4 +1,4 @@
-//! Coming back: a client whose connection breaks finds its simulation again, and nobody else does.
+//! Resuming: a client whose connection breaks gets its simulation back, and no other client does.
 
 use std::time::{Duration, Instant};
 
@@ -15,7 +15,7 @@ use crate::support::{Builder, Client, Server, arm, demo_server, http, instances_
 const ENDED: &str = "loading: Error: this simulation has ended";
 const TAKEN_OVER: &str = "loading: Error: this simulation was taken over elsewhere";
 
-/// What somebody with this token is told who can't come back.
+/// The error for a client that can't resume with this token.
 async fn refused(server: &Server, token: &str) -> String {
     let mut client = Client::resuming(server, token).await;
     let told = client.until("").await;
@@ -34,7 +34,7 @@ async fn who_comes_back_finds_the_simulation_as_it_runs_at_each_level() {
         let mut viewer = Client::connect(&stream).await.with_running_scene().await;
         let before = server.simulations().await;
         let left = viewer.time().await;
-        // Both connections break, as with a reload.
+        // Both connections break, as in a reload of the page.
         drop((client, viewer));
         server.until_away(1).await;
         assert_eq!(server.simulations().await[0]["stage"], "running");
@@ -65,7 +65,7 @@ async fn who_comes_back_finds_the_simulation_as_it_runs_at_each_level() {
 async fn a_token_works_once_and_its_client_alone_is_told_it() {
     let server = quick(demo_server(1)).start().await;
     let (mut first, one) = Client::resumable(&server).await;
-    // While the first connection is open: its page was closed in a way that nobody has noticed yet.
+    // The first connection is still open, as if the server had not noticed yet that its page was closed.
     let mut second = Client::resuming(&server, &one).await;
     let two = second.token().await;
     assert_eq!(first.until("loading: Error").await, TAKEN_OVER);
@@ -75,14 +75,14 @@ async fn a_token_works_once_and_its_client_alone_is_told_it() {
         let told = refused(&server, nonsense).await;
         assert!([ENDED, TAKEN_OVER].contains(&told.as_str()), "{nonsense}: {told}");
     }
-    // Neither of them has changed anything.
+    // These attempts have changed nothing.
     let mut third = Client::resuming(&server, &two).await;
     assert_eq!(second.until("loading: Error").await, TAKEN_OVER);
     assert_eq!(server.status().await["instances"]["arrivals"], 1);
     let three = third.token().await;
     drop(third);
     server.until_away(1).await;
-    // Nobody else is told a token, nor its secret part alone.
+    // No page and no log contains a token, or its secret part.
     let mut told = server.log();
     for path in ["/status", "/monitor", "/metrics"] {
         told += &http::get(&server.url(path)).await.text();
@@ -133,7 +133,7 @@ async fn a_client_behind_a_stalled_link_resumes_or_is_given_up() {
     let (mut lost, token) = Client::connect(&through).await.start_resumable().await;
     let pid = server.simulations().await[0]["pid"].clone();
     relay.set(Mood::Silent);
-    // The server has not noticed anything.
+    // The server has not noticed the loss yet.
     let mut client = Client::resuming(&server, &token).await;
     let next = client.token().await;
     assert_eq!(server.simulations().await[0]["pid"], pid);
@@ -142,7 +142,7 @@ async fn a_client_behind_a_stalled_link_resumes_or_is_given_up() {
     client.until(".").await;
     drop(client);
 
-    // Again through the link, which stays silent: after silence and absence nothing is left.
+    // Again through the link, which stays silent: after the timeouts of silence and absence nothing remains.
     let mut client = Client::connect(&through).await.resume(&next).await;
     let last = client.token().await;
     relay.set(Mood::Silent);
@@ -153,7 +153,7 @@ async fn a_client_behind_a_stalled_link_resumes_or_is_given_up() {
 
 #[actix_rt::test]
 async fn who_comes_back_too_late_hears_why_it_has_ended() {
-    // A Webots that says nothing is no lost connection.
+    // A silent Webots is not a lost connection.
     let server = quick(demo_server(1)).set("timing.heartbeat", 3600).start().await;
     let crash = async || {
         let webots = instances_below(&server.folder).into_iter().find(|one| one.1.contains("demo-simulator"));
@@ -165,7 +165,7 @@ async fn who_comes_back_too_late_hears_why_it_has_ended() {
         let client = Client::connect(&format!("ws://127.0.0.1:{}/client", relay.port)).await;
         let (mut client, token) = client.start_resumable().await;
         client.until("absence: ").await;
-        // One whose connection only seems to be there hears the same.
+        // A client whose connection only seems to be open gets the same answer.
         if is_silent {
             relay.set(Mood::Silent);
         } else {
@@ -223,7 +223,7 @@ async fn who_resumes_counts_for_the_first_address() {
     server.until_away(1).await;
     let forbidden = Client::with_headers(&server.websocket("/client"), &[("origin", "https://evil.example.org")]).await;
     assert_eq!(forbidden.err(), Some(403));
-    // From elsewhere it may be had, and counts for the address that has asked for it.
+    // It may be resumed from another address, but still counts for the first one.
     let mut client = at("192.0.2.3").await.resume(&token).await;
     client.token().await;
     let mut second = at("192.0.2.2").await.asking(&arm()).await;

@@ -1,4 +1,4 @@
-//! A server in which one client has come to a certain state of its simulation.
+//! A server with one client in a certain state.
 
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
@@ -6,15 +6,15 @@ use std::time::{Duration, Instant};
 
 use crate::support::{Builder, Client, Server, arm, instance_folders_in, instances_below, server_that_is, until};
 
-/// The states of a simulation: one that is only connected, and those that servers show.
+/// The states: connected without a simulation, and the states of simulations that servers show.
 pub const ALL: [&str; 7] = ["connected", "queued", "checkingout", "launching", "idle", "running", "stopping"];
 
-/// Everything of a test in one state. The server ends with it.
+/// A server and its clients in one state. The server ends with this value.
 pub struct Scene {
     pub server: Server,
-    /// The client in that state; it has left where the state is `stopping`.
+    /// The client in that state; in `stopping` it has left.
     pub client: Option<Client>,
-    /// The one that holds the only place, where the state is `queued`.
+    /// In `queued`, the client that has the only slot.
     pub other: Option<Client>,
     pub folder: tempfile::TempDir,
     _hanging: Option<TcpListener>,
@@ -53,16 +53,15 @@ impl Scene {
     }
 }
 
-/// The states of all simulations, as the server shows them.
 pub async fn stages(server: &Server) -> Vec<String> {
     let status = server.status().await;
     status["simulations"].as_array().unwrap().iter().map(|one| one["stage"].as_str().unwrap().to_owned()).collect()
 }
 
-/// Waits until nothing of any simulation is left: process, place, port and folder.
+/// Waits until nothing of any simulation remains: process, slot, port and folder.
 pub async fn nothing_left(server: &Server, places: u16) {
     until("all simulations are gone", async || {
-        // What costs most comes last: to look at all processes of the machine.
+        // The most expensive check comes last: it reads all processes of the machine.
         stages(server).await.is_empty()
             && instance_folders(&server.folder).is_empty()
             && (server.port + 1..=server.port + places).all(|port| TcpListener::bind(("0.0.0.0", port)).is_ok())
@@ -71,8 +70,8 @@ pub async fn nothing_left(server: &Server, places: u16) {
     .await;
 }
 
-/// Waits until nothing of a simulation is left on a server with one place, which is to be so soon after its grace time, in
-/// seconds, since its client has left. Returns how long it took.
+/// Waits until nothing of a simulation remains on a server with one slot, which must be soon after the grace time, in
+/// seconds, since its client left. Returns how long it took.
 pub async fn gone_within(grace: f64, left: Instant, server: &Server) -> Duration {
     nothing_left(server, 1).await;
     let took = left.elapsed();
@@ -80,7 +79,7 @@ pub async fn gone_within(grace: f64, left: Instant, server: &Server) -> Duration
     took
 }
 
-/// The folders of simulations below a server's folder.
+/// The instance directories below a server's folder.
 pub fn instance_folders(folder: &Path) -> Vec<PathBuf> {
     instance_folders_in(&folder.join("cache"))
 }

@@ -1,4 +1,4 @@
-//! Many starts and stops in a row leave the server as it was.
+//! Many starts and stops in a row must leave the server as it was.
 
 use std::path::Path;
 use std::time::Duration;
@@ -8,7 +8,7 @@ use procfs::process::Process;
 
 use crate::support::{Client, Forge, Server, Webots, arm, holds_soon, instances_below, simulation_server, until};
 
-/// What a server holds at one moment.
+/// The resources that a server uses at one moment.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Holdings {
     processes: u64,
@@ -19,9 +19,9 @@ pub struct Holdings {
     memory_kib: u64,
 }
 
-/// Clients at a time: the server has so many places.
+/// Parallel clients, and slots of the server.
 const AT_A_TIME: usize = 4;
-/// Starts before the first count: pools of threads and allocators fill.
+/// Starts before the first count: they fill thread pools and allocators.
 const WARM_UP: usize = 40;
 
 impl Holdings {
@@ -39,7 +39,6 @@ impl Holdings {
         }
     }
 
-    /// Names and numbers.
     pub fn rows(&self) -> [(&'static str, u64); 6] {
         [
             ("processes", self.processes),
@@ -51,11 +50,11 @@ impl Holdings {
         ]
     }
 
-    /// What has grown. Memory may move a little; what leaks with each start does not stay below.
+    /// What has grown. Memory may grow a little, but less than any leak in each start would cause.
     pub fn leaks_since(&self, before: &Self, starts: usize) -> Vec<String> {
         let slack = |name: &str| match name {
             "resident memory, KiB" => 2048 + starts as u64,
-            // The pool of the runtime keeps idle threads for some seconds.
+            // The runtime keeps idle threads for some seconds.
             "threads" => 8,
             _ => 0,
         };
@@ -71,8 +70,8 @@ fn folders(folder: &Path) -> u64 {
     entries.filter(|entry| entry.path().is_dir()).map(|entry| 1 + folders(&entry.path())).sum()
 }
 
-/// Starts and stops so many simulations; gives back what the server held before and after. A busy machine
-/// fills its pools later: what grows gets so many rounds to stop growing, which a leak never does.
+/// Starts and stops this many simulations; returns what the server used before and after. On a busy machine pools fill
+/// later, so all growth must stop within this many rounds, which a leak never does.
 pub async fn soak(starts: usize, rounds: usize) -> (Holdings, Holdings) {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     let server = simulation_server(&webots.path(), forge.path(), AT_A_TIME as u16).start().await;
@@ -81,7 +80,7 @@ pub async fn soak(starts: usize, rounds: usize) -> (Holdings, Holdings) {
     let mut round = 1;
     loop {
         visit(&server, starts).await;
-        // Folders may just be being removed.
+        // Folders may still be in removal.
         let mut after = Holdings::of(&server);
         let nothing_grows = holds_soon(async || {
             after = Holdings::of(&server);
@@ -94,7 +93,7 @@ pub async fn soak(starts: usize, rounds: usize) -> (Holdings, Holdings) {
     }
 }
 
-/// So many visits, some of which end before Webots is ready, or at any moment; waits until all are gone.
+/// Makes this many visits, some of which end before Webots is ready; waits until nothing of them remains.
 async fn visit(server: &Server, visits: usize) {
     let url = arm();
     let next = std::cell::Cell::new(0);

@@ -1,4 +1,4 @@
-//! Start, drain and stop of the server itself; announcing.
+//! Starting, draining and stopping the server; announcements.
 
 use std::net::TcpListener;
 use std::time::{Duration, Instant};
@@ -12,7 +12,7 @@ use crate::support::{Builder, Client, SOON, arm, demo_server, http, until};
 
 #[actix_rt::test]
 async fn a_draining_server_ends_with_its_last_client() {
-    // As engines give passwords.
+    // Container orchestrators pass passwords in files.
     let secret = tempfile::NamedTempFile::new().unwrap();
     std::fs::write(secret.path(), "secret\n").unwrap();
     for by in ["signal", "page"] {
@@ -38,7 +38,7 @@ async fn a_draining_server_ends_with_its_last_client() {
         let told = late.until("loading: Error:").await;
         assert!(told.contains("about to end, and takes no new clients. Connect again"), "{told}");
         assert_eq!(late.closed().await, Some(1013), "another server may take it");
-        // The simulation goes on, also for those who come to look on.
+        // The simulation goes on, also for new viewers.
         let _viewer = Client::connect(&format!("{stream}/")).await.with_scene().await;
         running.leave().await;
         waiting.until("webots:").await;
@@ -104,7 +104,7 @@ async fn a_fault_of_the_configuration_is_one_line_and_exit_code_2() {
     }
 }
 
-/// Starts a server that refuses its configuration in these words.
+/// Starts a server, which must refuse its configuration with these words.
 async fn refused(builder: Builder, words: &[&str]) {
     let said = builder.refused(2).await;
     assert!(said.contains("config.json: ") && words.iter().all(|word| said.contains(word)), "{words:?}: {said}");

@@ -1,4 +1,4 @@
-//! An administrator stops one simulation: its client hears why, and no other simulation ends.
+//! An administrator stops one simulation: its client receives the reason, and no other simulation ends.
 
 use serde_json::json;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -71,14 +71,15 @@ async fn only_the_password_stops_a_simulation() {
     assert_eq!(stop(&server, other.id(), &json!({"reason": "x\n".repeat(200)}).to_string()).await, 202);
     let told = other.until("loading: Error:").await;
     assert!(told.len() < 400 && told.ends_with("..."), "{told}");
-    // Without a password there are no actions.
+    // Without an `adminPassword`, a server allows no actions.
     let server = demo_server(1).start().await;
     let mut client = Client::ready(&server).await;
     assert_eq!(post(&path(&server, client.id()), Some(PASSWORD), "").await, 403);
     client.until(".").await;
 }
 
-/// Sends these bytes on one connection, and returns the statuses of the answers, of which `count` are waited for.
+/// Sends these bytes on one connection. Returns the statuses of the first `count` answers, and of any that came with
+/// them.
 async fn statuses(server: &Server, requests: &[String], count: usize) -> Vec<u16> {
     let mut socket = TcpStream::connect(server.address()).await.unwrap();
     let mut answers = Vec::new();
@@ -103,7 +104,7 @@ async fn a_body_belongs_to_its_request_and_holds_up_nobody() {
     };
     let load = || "GET /load HTTP/1.1\r\nHost: x\r\n\r\n".to_owned();
     let length = |body: &str| format!("Content-Length: {}\r\n", body.len());
-    // What looks like a request is the body of one.
+    // The body of a request that looks like a request itself.
     let inner = "GET /health HTTP/1.1\r\nHost: x\r\n\r\n";
     let body = r#"{"reason": "x"}"#;
     for (requests, expected) in [
@@ -117,7 +118,7 @@ async fn a_body_belongs_to_its_request_and_holds_up_nobody() {
     ] {
         assert_eq!(statuses(&server, &requests, expected.len()).await, expected, "{requests:?}");
     }
-    // Without the password the body is not waited for.
+    // Without the password, the server does not wait for the body.
     assert_eq!(statuses(&server, &[post(false, "Content-Length: 99\r\n", "{")], 1).await, [401]);
     assert_eq!(statuses(&server, &[post(false, &length(body), body), load()], 2).await[0], 401);
 }
@@ -135,7 +136,7 @@ async fn a_stop_never_ends_the_next_simulation_of_a_slot() {
         nothing_left(&server, 1).await;
     }
     drop(server);
-    // Another run of the server counts from the beginning again, and gives the same place.
+    // A new run of the server numbers from the beginning again, and uses the same slot.
     let server = builder().start().await;
     let mut client = Client::ready(&server).await;
     let id = client.id().to_owned();

@@ -1,4 +1,4 @@
-//! Who has which simulation: the user whom a trusted web server names, and what a client calls itself.
+//! Who uses which simulation: the user that a trusted web server reports, and the name that a client gives itself.
 
 use futures_util::StreamExt;
 use serde_json::json;
@@ -10,7 +10,7 @@ fn with_users(places: u16) -> Builder {
     demo_server(places).set("adminPassword", PASSWORD).set("userHeader", "X-Forwarded-User")
 }
 
-/// A client that a web server names so, and that calls itself so.
+/// A client with headers of a web server, and with a name of its own choice.
 async fn start(server: &Server, headers: &[(&'static str, &str)], name: Option<&str>) -> Client {
     let mut client = Client::with_headers(&server.websocket("/client"), headers).await.unwrap();
     client.send(&json!({"start": {"url": arm(), "name": name}}).to_string()).await;
@@ -21,7 +21,7 @@ async fn page(server: &Server) -> String {
     get_as_administrator(&server.url("/monitor")).await.text()
 }
 
-/// What the live page is sent first, with the password.
+/// The first event for a live page with the password.
 async fn event(server: &Server) -> String {
     let request = awc::Client::default().get(server.url("/events")).basic_auth("admin", PASSWORD);
     let mut answer = request.send().await.unwrap();
@@ -59,7 +59,7 @@ async fn a_name_is_for_administrators_alone_and_never_markup() {
     let log = server.log();
     assert!(log.lines().any(|line| line.contains(&id) && line.contains("user \"<b>anna@lab</b>\"")), "{log}");
     assert!(page(&server).await.contains("anna@lab"), "the simulations that ended have a name, too");
-    // What others read.
+    // Pages without the password.
     for path in ["/monitor", "/status", "/metrics", "/load"] {
         let text = http::get(&server.url(path)).await.text();
         assert!(!text.contains("anna") && !text.contains("alert(1)"), "{path}: {text}");
@@ -67,7 +67,7 @@ async fn a_name_is_for_administrators_alone_and_never_markup() {
     until("the output is kept", async || get_as_administrator(&output).await.status == 200).await;
     let kept = get_as_administrator(&output).await.text();
     assert!(kept.contains("asks for") && !kept.contains("anna") && !kept.contains("alert(1)"), "{kept}");
-    // Where there is no password, nobody sees who is there.
+    // If there is no password, no user is shown.
     let server = demo_server(1).set("userHeader", "X-Forwarded-User").start().await;
     let mut client = start(&server, &[("x-forwarded-user", user)], Some(label)).await;
     client.until("webots:").await;
@@ -105,7 +105,7 @@ async fn one_user_has_a_share_of_the_places_wherever_it_is() {
     let told = from("anna", "203.0.113.3").await.until("").await;
     let words = "loading: Error: You have 1 places of this simulation server, and 1 more are waiting";
     assert!(told.starts_with(words), "{told}");
-    // Another user of the same address, and somebody without a name, pass the one who waits.
+    // Another user of the same address, and a client without a user, overtake the waiting one.
     let mut other = from("ben", "203.0.113.1").await;
     other.until("webots:").await;
     let mut nameless = start(&server, &[("x-forwarded-for", "203.0.113.1")], Some("anna")).await;
