@@ -1,4 +1,4 @@
-//! What a program of a world sees and reaches. Each deed is done by the stand-in for Webots, which tells how it went.
+//! What a world's program sees and reaches. The stand-in for Webots does each deed, and prints those that succeed.
 
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
@@ -7,13 +7,13 @@ use std::process::Command;
 use crate::simulation::scene::nothing_left;
 use crate::support::{Builder, Client, Forge, Webots, arm, simulation_server, skip};
 
-/// Everything of a test: a server with things that are none of a world's business.
+/// A server, and files that are not for worlds.
 pub struct Stage {
-    /// Holds the configuration, the log and the cache.
+    /// Directory of the configuration, log and cache.
     pub folder: tempfile::TempDir,
     /// The home of the server's user.
     home: tempfile::TempDir,
-    /// Somewhere that is neither in `/tmp` nor in a home.
+    /// A folder that is neither in `/tmp` nor in a home.
     pub elsewhere: tempfile::TempDir,
     pub forge: Forge,
 }
@@ -38,7 +38,8 @@ impl Stage {
         stage
     }
 
-    /// One whose folder elsewhere is shown in a sandbox. Nothing, and a word, where there can be no such folder.
+    /// A stage whose `elsewhere` is not hidden by sandboxes. `None`, with a reason printed, if there can be no such
+    /// folder.
     fn apart() -> Option<Self> {
         if apart().is_none() {
             let hidden = "the home and folders for temporary files, which a sandbox hides";
@@ -53,7 +54,7 @@ impl Stage {
         builder.env("HOME", self.home.path().to_str().unwrap()).env("SECRET_OF_THE_SERVER", "a secret")
     }
 
-    /// What a program of a world can do of these deeds, each a name and a line for a shell.
+    /// Which of these deeds a world's program can do; each is a name and a shell command.
     pub async fn tried(
         &self,
         deeds: &[(&str, String)],
@@ -71,7 +72,7 @@ impl Stage {
     }
 }
 
-/// A folder that can be written, and is neither a home nor for temporary files: the project may lie in one of these.
+/// A writable folder outside of homes and temporary folders. The project may be in one, so there are several candidates.
 fn apart() -> Option<&'static str> {
     let user = nix::unistd::User::from_uid(nix::unistd::getuid()).unwrap().map(|user| user.dir);
     let hidden: Vec<PathBuf> = ["/tmp", "/var/tmp"]
@@ -85,14 +86,14 @@ fn apart() -> Option<&'static str> {
         .collect();
     [env!("CARGO_TARGET_TMPDIR"), "/srv", "/var/lib", "/opt"].into_iter().find(|folder| {
         let Ok(real) = Path::new(folder).canonicalize() else { return false };
-        // It is written into lines for a shell.
+        // The path becomes part of shell commands.
         !folder.contains(' ')
             && !hidden.iter().any(|place| real.starts_with(place))
             && tempfile::tempdir_in(real).is_ok()
     })
 }
 
-/// Lets everybody read and write a folder.
+/// Lets all users read and write a folder.
 pub fn open(folder: &Path) {
     std::fs::set_permissions(folder, std::fs::Permissions::from_mode(0o777)).unwrap();
 }
@@ -101,7 +102,7 @@ fn shown(path: impl AsRef<Path>) -> String {
     path.as_ref().display().to_string()
 }
 
-/// What is read and written, and at which levels that can be done.
+/// Deeds with files, and whether they succeed at each level.
 fn files(stage: &Stage) -> Vec<(&'static str, String, [bool; 2])> {
     let (folder, home, elsewhere) = (shown(&stage.folder), shown(&stage.home), shown(&stage.elsewhere));
     let number = if cfg!(target_arch = "aarch64") { 219 } else { 250 };
@@ -158,7 +159,7 @@ async fn a_world_sees_and_changes_what_its_level_allows() {
     compare(&stage, |builder| builder.set("limits.output", 10_000), &[1, 0]).await;
 }
 
-/// What runs a server as an ordinary user; nothing where that can't be.
+/// The command that runs a server as an ordinary user; `None` if that is not possible.
 pub fn as_nobody() -> Option<&'static str> {
     let program = Path::new(env!("CARGO_BIN_EXE_simulation-server"));
     let may_be_run = |folder: &Path| folder.metadata().unwrap().permissions().mode() & 1 == 1;
@@ -174,7 +175,7 @@ async fn a_sandbox_holds_for_an_ordinary_user_too() {
     let Some(nobody) = as_nobody() else { return };
     let Some(stage) = Stage::apart() else { return };
     compare(&stage, |builder| builder.before(nobody), &[1]).await;
-    // One of them is bubblewrap.
+    // bubblewrap is one more process.
     let processes = [("be bounded by the kernel", "test $(ulimit -u) = 71".to_owned())];
     let done = stage.tried(&processes, "sandbox", |builder| builder.before(nobody).set("limits.processes", 70)).await;
     assert_eq!(done, ["be bounded by the kernel"]);
@@ -206,7 +207,7 @@ async fn folders_are_shown_and_opened_by_keys() {
         ("read the configuration", format!("grep secret {}/config.json", shown(&stage.folder))),
     ];
     let done = stage.tried(&deeds, "sandbox", |builder| {
-        // What holds the server's own folders shows all but those.
+        // A path that contains the server's own directories does not make those visible.
         builder
             .set("sandbox.readable", serde_json::json!([home, stage.folder.path()]))
             .set("sandbox.writable", elsewhere.as_str())
@@ -258,7 +259,7 @@ async fn empty_folders_of_a_sandbox_stay_empty() {
         ("set the limit of namespaces", set("/proc/sys/user/max_user_namespaces")),
     ];
     for before in ["true"].into_iter().chain(as_nobody()) {
-        // Hidden folders must be there when the server starts.
+        // Only folders that exist when the server starts are hidden.
         for name in ["log", "cache"] {
             let folder = stage.folder.path().join(name);
             std::fs::remove_dir_all(&folder).ok();

@@ -1,4 +1,4 @@
-//! A virtual display of a simulation's own.
+//! A virtual display for each simulation.
 
 use std::path::PathBuf;
 
@@ -28,7 +28,7 @@ async fn a_virtual_display_is_inside_of_the_sandbox() {
     for (user, before) in users {
         let folder = tempfile::tempdir().unwrap();
         open(folder.path());
-        // The cache is hidden from simulations.
+        // Sandboxes hide the cache.
         let fonts = folder.path().join("cache/fonts");
         let webots = Webots::script(&format!(
             "test -S /tmp/.X11-unix/X${{DISPLAY#:}} && echo 'DONE socket'\nxset q >/dev/null && echo 'DONE use it'\n\
@@ -62,10 +62,10 @@ async fn a_virtual_display_is_inside_of_the_sandbox() {
     }
 }
 
-/// What a display takes for a screen of 8,192 by 8,192 pixels, in bytes.
+/// Memory of a display with a screen of 8,192 by 8,192 pixels, in bytes.
 const MEMORY: u64 = 256 << 20;
 
-/// What the monitor tells of the memory of the only simulation, in bytes.
+/// The memory of the only simulation on the monitor, in bytes.
 async fn told_memory(server: &Server) -> u64 {
     let page = server.monitor().await;
     let cell = page.split_once("data-label=\"Memory\"").map_or("", |(_, cell)| cell);
@@ -90,7 +90,7 @@ async fn what_a_virtual_display_takes_counts_for_its_simulation() {
             let folder = group.0.join(own);
             let inside = std::fs::read_to_string(folder.join("cgroup.procs")).unwrap();
             assert!(inside.lines().any(|pid| pid == xvfb(&server).to_string()), "{inside}");
-            // Where systemd delegates this controller, it keeps `limits.memory`.
+            // If systemd delegates this controller, it enforces `limits.memory`.
             if let Ok(memory) = std::fs::read_to_string(folder.join("memory.current")) {
                 assert!(memory.trim().parse::<u64>().unwrap() >= MEMORY, "{memory}");
             }

@@ -1,10 +1,10 @@
-//! How a server gets its level, and what it says of it.
+//! How a server chooses its level, and how it reports it.
 
 use serde_json::json;
 
 use crate::support::{self, Builder, Client, Webots, arm, demo_server, server_of};
 
-/// A folder with git and a shell, and with a bubblewrap that fails if one is wanted.
+/// A folder with git and a shell, and with this script as bubblewrap if there is one.
 fn programs(bubblewrap: Option<&str>) -> tempfile::TempDir {
     let folder = support::programs(&["git", "bash", "env", "sh", "sleep", "rm", "prlimit"]);
     if let Some(script) = bubblewrap {
@@ -72,7 +72,7 @@ async fn a_sandbox_is_what_a_machine_has_by_itself() {
     let page = server.monitor().await;
     assert!(page.contains("<dt>Isolation</dt><dd>sandbox</dd>"), "{page}");
     let log = server.log();
-    // What the machine that runs the test may lack.
+    // Warnings about what the machine of the tests may lack.
     let known = ["only bubblewrap from 0.8 on", "network of simulations: shared with this machine: "];
     let is_known = |line: &&str| known.iter().any(|words| line.contains(words));
     assert_eq!(log.lines().filter(|line| line.contains("WARN")).find(|line| !is_known(line)), None);

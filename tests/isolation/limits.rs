@@ -1,4 +1,4 @@
-//! What a simulation may take at each level, and what comes of it when it takes more.
+//! Limits of a simulation at each level, and what happens if it exceeds them.
 
 use std::time::{Duration, Instant};
 
@@ -9,14 +9,14 @@ use crate::support::{Client, DEMO, SOON, Server, Webots, arm, http, server_of, s
 
 const LEVELS: [&str; 2] = ["none", "sandbox"];
 
-/// What the client of a simulation is told that does this once it is ready, and is ended for it.
+/// The error for the client of a simulation that does this once it is ready, and must be ended for it.
 async fn told_for(deed: &str, level: &str, key: &str, value: u64) -> String {
     let webots = Webots::script(&format!("{DEMO} \"$@\" &\nuntil [ -e go ]; do sleep 0.05; done\n{deed}\nwait"));
     let builder = server_of(webots, 4).set("isolation", level);
     let server = builder.set(&format!("limits.{key}"), value).start().await;
     let mut client = Client::ready(&server).await;
     std::fs::write(instance_folders(&server.folder)[0].join("project/go"), "").unwrap();
-    // Its heartbeats go on as long as it is not ended.
+    // It sends heartbeats until it is ended, so each text would restart the timeout of `until`.
     let told = actix_rt::time::timeout(2 * SOON, client.until("loading: Error:")).await;
     let told = told.unwrap_or_else(|_| panic!("{level}, {deed}: it was not ended"));
     assert_eq!(client.closed().await, Some(1000));
@@ -39,7 +39,7 @@ async fn who_fills_the_disk_is_told_and_ended() {
         let small = "for n in $(seq 3000); do echo > small$n; done";
         deeds.extend([slowly, small, nameless].map(|deed| (level, deed.to_owned(), words)));
     }
-    // Each is counted ten seconds after its start.
+    // In parallel, because each is counted only every ten seconds.
     let told = deeds.iter().map(|(level, deed, words)| async move {
         let told = told_for(deed, level, "disk", 5).await;
         assert!(told.contains(words), "{level}, {deed}: {told}");
@@ -66,7 +66,7 @@ async fn files_are_bounded_in_size_and_those_that_are_open_in_number() {
     }
 }
 
-/// The time of processors that a server has taken, in seconds.
+/// The CPU time of a server, in seconds.
 fn taken(server: &Server) -> f64 {
     let stat = procfs::process::Process::new(server.pid()).unwrap().stat().unwrap();
     (stat.utime + stat.stime) as f64 / procfs::ticks_per_second() as f64
@@ -82,7 +82,7 @@ async fn a_flood_of_output_costs_no_more_than_a_tenth_of_a_core() {
         ("tr '\\0' x < /dev/zero", "none"),
         ("cat /dev/urandom", "none"),
         ("while :; do echo pause; echo fast; done", "none"),
-        // A write for each byte, which is read before the next one comes.
+        // A write for each byte, after the server has read the byte before.
         ("python3 -c 'import os\nwhile True: os.write(1, b\"x\")'", "none"),
     ] {
         let webots = Webots::script(&format!("{DEMO} \"$@\" >/dev/null &\n{flood} & wait"));
@@ -99,7 +99,7 @@ async fn a_flood_of_output_costs_no_more_than_a_tenth_of_a_core() {
             begin.elapsed() > Duration::from_secs(3)
         })
         .await;
-        // A line that never ends is never written, and what tells of events is none.
+        // Endless lines are not written, nor are lines that report events.
         let is_written = ["yes", "cat /dev/urandom"].contains(&flood);
         assert!(!is_written || size() > 500, "{flood}: {} bytes", size());
         let share = (taken(&server) - before) / begin.elapsed().as_secs_f64();
@@ -110,7 +110,7 @@ async fn a_flood_of_output_costs_no_more_than_a_tenth_of_a_core() {
     }
 }
 
-/// A control group that this process may divide as if systemd had delegated it; none where there is no cgroup v2.
+/// A control group that this process may divide as if systemd had delegated it; `None` without cgroup v2.
 pub struct Delegated(pub std::path::PathBuf);
 
 impl Delegated {
@@ -121,7 +121,7 @@ impl Delegated {
         std::fs::create_dir(&folder).ok().map(|()| Self(folder))
     }
 
-    /// The shell's words by which a program joins it.
+    /// The shell command with which a program joins it.
     pub fn join(&self) -> String {
         format!("echo $$ > {}/cgroup.procs", self.0.display())
     }

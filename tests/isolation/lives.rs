@@ -1,4 +1,4 @@
-//! What ends with a simulation at each level, and how.
+//! What ends with a simulation at each level, and how it ends.
 
 use std::time::{Duration, Instant};
 
@@ -17,19 +17,19 @@ pub fn named(word: &str) -> Vec<i32> {
     all.filter(has).map(|one| one.pid()).collect()
 }
 
-/// A number of seconds that no other process sleeps.
+/// An argument of `sleep` that identifies the process.
 pub fn long() -> String {
     format!("1000.{}", rand::random::<u64>())
 }
 
-/// One is in the group of its simulation, another has left it, and the last has no mark either.
+/// `stayed` is in the process group of its simulation, but has no mark; `left` has the mark; `hidden` has neither.
 #[actix_rt::test]
 async fn what_hides_on_purpose_ends_with_its_sandbox() {
     needs!("bwrap");
     for (level, reason, survivors) in [
         ("sandbox", "client", vec![]),
         ("sandbox", "kill", vec![]),
-        // This is what the level does not promise.
+        // The level does not promise to end these.
         ("none", "client", vec!["left", "hidden"]),
         ("none", "stop", vec!["hidden"]),
         ("none", "kill", vec!["hidden"]),
@@ -68,7 +68,7 @@ async fn a_simulation_has_its_grace_time_at_each_level() {
     for (level, user, network) in levels() {
         let stage = Stage::new();
         let (open, written) = (stage.elsewhere.path().to_str().unwrap(), stage.elsewhere.path().join("written"));
-        // As Webots' launcher does: it hands SIGTERM on, and waits.
+        // Like Webots' launcher: it forwards SIGTERM, and waits.
         let work = format!("sleep 0.3; echo saved > '{}'", written.display());
         let webots = Webots::script(&format!("trap \"{work}; exit 0\" TERM\n{DEMO} \"$@\" & wait"));
         let builder = stage.builder(&webots, level).before(user).set("sandbox.network", network);

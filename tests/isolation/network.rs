@@ -1,6 +1,7 @@
-//! What a network of its own keeps a world's program from, and what it leaves. Each wall is tried without it too.
+//! What a network of its own keeps a world's program from, and what it still allows. Each deed is also tried without
+//! it.
 //!
-//! pasta gives none to root: a test of root has another user run the server.
+//! pasta creates none for root: as root, a test runs the server as another user.
 
 use std::os::linux::net::SocketAddrExt;
 use std::os::unix::fs::PermissionsExt;
@@ -18,7 +19,8 @@ use crate::support::{
     Builder, Client, DEMO, Server, Webots, arm, display, instances_below, is_told, programs, skip, until,
 };
 
-/// What runs a server as an ordinary user who can have networks; nothing, and a word, where there is none.
+/// The command that runs a server as an ordinary user who can have networks; `None`, with a reason printed, if there is
+/// none.
 fn ordinary() -> Option<&'static str> {
     needs!("bwrap", None);
     needs!("pasta", None);
@@ -30,22 +32,22 @@ fn ordinary() -> Option<&'static str> {
     if nix::unistd::getuid().is_root() { as_nobody() } else { Some("true") }
 }
 
-/// What a simulation is kept in: a level, who runs the server, and the network.
+/// The isolations of a simulation: level, command that runs the server, and network.
 pub fn levels() -> Vec<(&'static str, &'static str, &'static str)> {
     let mut levels = vec![("none", "true", "shared"), ("sandbox", "true", "shared")];
     levels.extend(ordinary().map(|user| ("sandbox", user, "own")));
     levels
 }
 
-/// A server of an ordinary user in whose sandboxes this network is.
+/// A server of an ordinary user, with this network for its sandboxes.
 fn server(stage: &Stage, webots: &Webots, user: &str, network: &str) -> Builder {
     stage.builder(webots, "sandbox").before(user).set("sandbox.network", network)
 }
 
-/// Has a shell know the port that its program was given.
+/// Sets `port` in a shell to the value of the option `--port`.
 const PORT: &str = "for one; do case $one in --port=*) port=${one#--port=};; esac; done";
 
-/// A deed for a shell: a line of Python. `s` is the module `socket`.
+/// A deed as a shell command: a line of Python in which `s` is the module `socket`.
 fn python(line: &str) -> String {
     format!("python3 -c \"import os, socket as s, errno; {line}\"")
 }
@@ -63,7 +65,7 @@ async fn a_world_in_its_own_network_reaches_nothing_of_the_machine() {
         ("reach a port of the machine", python(&format!("s.create_connection(('127.0.0.1', {port}), 5)"))),
         ("reach an abstract socket", python(&format!("s.socket(s.AF_UNIX).connect('\\\\0{name}')"))),
         ("pass for a trusted proxy", {
-            // The server's own port is before that of the first place.
+            // The server's own port is one below the first slot's.
             let request = "GET /load HTTP/1.1\\r\\nHost: x\\r\\nX-Forwarded-For: 192.0.2.7\\r\\n\\r\\n";
             let ask = format!("c = s.create_connection(('127.0.0.1', $port - 1), 5); c.send(b'{request}')");
             format!("{PORT}\n{}", python(&format!("{ask}; assert b'200 OK' in c.recv(99)")))
@@ -112,7 +114,7 @@ async fn a_world_in_its_own_network_reaches_nothing_of_the_machine() {
     }
 }
 
-/// Listens on the streaming ports after its own, and hides its descriptors from a server of an ordinary user.
+/// Listens on the next two streaming ports, and hides its descriptors from a server of an ordinary user.
 const TAKES_ALL: &str = "python3 -c \"import ctypes, socket, time; ctypes.CDLL(None).prctl(4, 0); \
     s = [socket.create_server(('0.0.0.0', p)) for p in range($port + 1, $port + 3)]; print('TAKEN'); time.sleep(1000)\" &";
 
@@ -157,7 +159,7 @@ async fn a_display_can_be_reached_at_each_level() {
     }
 }
 
-/// The processes of a server's simulations that are none of its own.
+/// The processes of a server's simulations, without the server itself.
 fn all_of(server: &Server) -> Vec<(i32, String)> {
     instances_below(&server.folder).into_iter().filter(|(pid, _)| *pid != server.pid()).collect()
 }
@@ -185,7 +187,7 @@ async fn pasta_ends_with_its_simulation_and_with_the_server() {
                 nothing_left(&server, 1).await;
             }
             "server" => {
-                // The guardian would do the same a moment later.
+                // The guardian, which would end pasta a moment later, is killed too.
                 kill(Pid::from_raw(server.guardian()), Signal::SIGKILL).unwrap();
                 server.signal(Signal::SIGKILL);
                 server.ended().await;
@@ -248,7 +250,7 @@ async fn which_network_simulations_have_is_told() {
 async fn a_machine_with_one_version_of_ip_has_own_networks() {
     let Some(user) = ordinary() else { return };
     for (ip, address, route) in [("ip -6", "2001:db8::2/64", "2001:db8::1"), ("ip -4", "192.0.2.2/24", "192.0.2.1")] {
-        // What this thread starts from here on is on a machine of its own, with this address and route alone.
+        // From here on, this thread starts programs in a network namespace with only this address and route.
         if unshare(CloneFlags::CLONE_NEWNET).is_err() {
             return skip("only root can make a network namespace");
         }
@@ -262,7 +264,7 @@ async fn a_machine_with_one_version_of_ip_has_own_networks() {
         }
         for streaming in ["direct", "relay"] {
             let (stage, webots) = (Stage::new(), Webots::script(&format!("{DEMO} \"$@\" & wait")));
-            // All of them are of this namespace.
+            // `::` stands for the addresses of this namespace.
             let server = server(&stage, &webots, user, "own").set("streaming", streaming).set("bind", "::");
             let server = server.env("DEMO_SIMULATOR_BIND", "::").start().await;
             let client = Client::ready(&server).await;

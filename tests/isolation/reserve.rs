@@ -1,4 +1,4 @@
-//! The reserve of the disk: whatever simulations write, it is not used up.
+//! The reserve of the disk: no simulation can use it up.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -12,10 +12,10 @@ use crate::simulation::scene::{instance_folders, nothing_left};
 use crate::support::disk::{self, Full};
 use crate::support::{Builder, Client, DEMO, SOON, Server, Webots, open_folder, server_of, skip, until};
 
-/// The size of the disk, in MiB; `diskReserve` is as it is by itself.
+/// The size of the disk, in MiB; `diskReserve` has its default.
 const SIZE: u32 = 1024;
 
-/// Many processes with many files each.
+/// Many processes that write many files each.
 const MANY: &str = "import os, itertools\n\
                     for one in range(8):\n\
                     \x20   if os.fork() == 0:\n\
@@ -25,7 +25,7 @@ const MANY: &str = "import os, itertools\n\
                     \x20           with open(f'{folder}/{number}', 'wb') as file: file.write(bytes(65536))\n\
                     os.wait()";
 
-/// Files without a name, which processes have open; they let nobody see that.
+/// Deleted files that processes keep open. With an argument, the processes hide their descriptors.
 const NAMELESS: &str = "import ctypes, os, sys\n\
                         for one in range(8):\n\
                         \x20   if os.fork() == 0:\n\
@@ -36,17 +36,17 @@ const NAMELESS: &str = "import ctypes, os, sys\n\
                         \x20           for piece in range(64): os.write(files[-1], bytes(65536))\n\
                         os.wait()";
 
-/// The free room of a disk, in bytes.
+/// The free space of a disk, in bytes.
 fn free(folder: &Path) -> u64 {
     let disk = statvfs(folder).unwrap();
     disk.blocks_available() * disk.fragment_size()
 }
 
-/// Notes the least room that a disk has.
+/// Records the least free space of a disk.
 struct Least(Arc<AtomicU64>);
 
 impl Least {
-    /// Until this value is dropped.
+    /// Records until this value is dropped.
     fn of(folder: &Path) -> Self {
         let (folder, least) = (folder.to_owned(), Self(Arc::new(AtomicU64::new(u64::MAX))));
         let bytes = Arc::downgrade(&least.0);
@@ -64,7 +64,7 @@ impl Least {
     }
 }
 
-/// A server on a disk of its own, whose simulations do what `go` in their project says.
+/// A server in this folder whose simulations are limited only by `diskReserve`.
 async fn server(webots: Webots, folder: &Path, change: impl FnOnce(Builder) -> Builder) -> Server {
     open(folder);
     let builder = server_of(webots, 2).folder(folder).set("timing.heartbeat", 0.5);
@@ -77,7 +77,7 @@ fn webots() -> Webots {
     ))
 }
 
-/// Starts a simulation, which does this once it is ready. Returns its client and the folder of its instance.
+/// Starts a simulation and writes this program into its project. Returns its client and its instance directory.
 async fn doing(server: &Server, deed: &str) -> (Client, PathBuf) {
     let before = instance_folders(&server.folder);
     let client = Client::ready(server).await;
@@ -86,7 +86,7 @@ async fn doing(server: &Server, deed: &str) -> (Client, PathBuf) {
     (client, new)
 }
 
-/// Lets the deed of a simulation begin, whose instance has this folder.
+/// Makes the simulation with this instance directory run this line.
 fn go(folder: &Path, line: &str) {
     std::fs::write(folder.join("project/new"), line).unwrap();
     std::fs::rename(folder.join("project/new"), folder.join("project/go")).unwrap();
@@ -108,7 +108,7 @@ async fn on_a_quiet_machine_the_reserve_of_the_disk_is_kept() {
         let server = server(webots(), &own, |builder| builder.before(before)).await;
         let (mut innocent, folder) = doing(&server, "").await;
         go(&folder, "true");
-        // Root sees what hides, too.
+        // A server of root sees hidden descriptors, too.
         for (name, deed, argument) in [("many", MANY, ""), ("nameless", NAMELESS, ""), ("hidden", NAMELESS, "hidden")] {
             let what = format!("{user}, {name}");
             let (mut client, folder) = doing(&server, deed).await;
@@ -142,7 +142,7 @@ async fn no_simulation_ends_where_another_program_fills_the_disk() {
     let mut client = Client::ready(&server).await;
     let _filler = Full::at(folder.path());
     until("it is full", async || server.health().await.0 == 503).await;
-    // Longer than an end needs to show an effect.
+    // Longer than the time that an end has to show an effect.
     for _ in 0..12 {
         client.until(".").await;
     }

@@ -1,11 +1,11 @@
-//! A reset of a controller writes into the project and nowhere else, whatever the world's program makes of its folders.
+//! A reset of a controller writes only into the project, whatever the world's program does to its folders.
 
 use std::path::Path;
 
 use crate::simulation::scene::{instance_folders, nothing_left};
 use crate::support::{Client, DEMO, Webots, demo_server, server_of, until};
 
-/// What the controller of [`Forge::with_arm`] has.
+/// The content of the controller of [`Forge::with_arm`].
 const ORIGINAL: &str = "print('original')\n";
 
 #[actix_rt::test]
@@ -31,7 +31,7 @@ async fn a_reset_replaces_a_link_and_follows_none() {
             let folder = instance_folders(&server.folder)[0].clone();
             let deed = deed.replace("VICTIM", &format!("'{}'", victim.display()));
             let deed = deed.replace("OUTSIDE", &format!("'{}'", outside.path().display()));
-            // What a project's folder says of files and repositories is not for the server's git.
+            // The server's git must ignore settings in the project's folder.
             let git = "echo '*.py working-tree-encoding=UTF-16' > .gitattributes; echo 'gitdir: /tmp' > .git";
             let mut shell = std::process::Command::new("sh");
             let done = shell.args(["-ec", &format!("{deed}; {git}")]).current_dir(folder.join("project")).status();
@@ -56,8 +56,8 @@ async fn a_reset_replaces_a_link_and_follows_none() {
     }
 }
 
-/// Exchanges two names for ever: the folder of a controller, and a link that leads out of the project. Removes the file that
-/// is reset.
+/// Keeps swapping the folder of a controller and a symlink to a folder outside the project. Removes the file that is
+/// reset.
 const EXCHANGE: &str = "import ctypes, os, sys\n\
     os.symlink(sys.argv[1], 'controllers/x')\n\
     libc, folder = ctypes.CDLL(None), os.open('controllers/c', os.O_RDONLY)\n\
@@ -72,7 +72,7 @@ async fn a_reset_never_writes_outside_of_the_project() {
     let outside_shown = outside.path().display();
     let webots = Webots::script(&format!("python3 -c \"{EXCHANGE}\" '{outside_shown}' &\n{DEMO} \"$@\" & wait"));
     let server = server_of(webots, 1).set("isolation", "sandbox");
-    // A client may ask for so much between two pings.
+    // Resets between two pings are limited.
     let server = server.set("timing.ping", 0.2).start().await;
     let mut client = Client::ready(&server).await;
     let project = instance_folders(&server.folder)[0].join("project");

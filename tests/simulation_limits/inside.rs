@@ -16,7 +16,7 @@ use webots_fleet::simulation::state::AppState;
 
 use crate::support::{Builder, Client, arm, instance_folders_in, instances_below, server_that_is, until};
 
-/// A server with one place, and what it stands on.
+/// A server with one slot, and what it needs.
 pub struct Inside {
     pub server: Arc<AppState>,
     pub port: u16,
@@ -26,9 +26,9 @@ pub struct Inside {
 }
 
 impl Inside {
-    /// Starts a server. Where checkouts are to hang, its forge never answers.
+    /// Starts a server. If checkouts are to hang, its forge never answers.
     pub async fn new(stage: Stage, change: impl FnOnce(&mut SimulationConfig)) -> Self {
-        // Before the server: it takes for its own what is started later.
+        // Before the server starts: it would take processes that are started later for its own.
         let (mut builder, hanging) = server_that_is(&format!("{stage:?}").to_lowercase());
         let folder = tempfile::tempdir().unwrap();
         let mut config = config::load::<SimulationConfig>(&builder.write(folder.path())).unwrap().config;
@@ -41,12 +41,12 @@ impl Inside {
         Self { server, port, running, folder, _parts: (builder, hanging) }
     }
 
-    /// A client that has asked for the world.
+    /// A client that has requested the world.
     pub async fn client(&self) -> Client {
         self.connect().await.asking(&arm()).await
     }
 
-    /// A client that has asked for nothing.
+    /// A client that has requested nothing.
     pub async fn connect(&self) -> Client {
         Client::connect(&format!("ws://127.0.0.1:{}/client", self.port)).await
     }
@@ -61,7 +61,7 @@ impl Inside {
         self.server.slots.snapshot().simulations.iter().map(|one| one.stage).collect()
     }
 
-    /// Waits until nothing of any simulation is left: connection, process, place, port and folder.
+    /// Waits until nothing of any simulation remains: connection, process, slot, port and folder.
     pub async fn until_nothing_is_left(&self) {
         let cache = self.folder.path().join("cache");
         until("nothing is left", async || {
@@ -74,7 +74,7 @@ impl Inside {
         .await;
     }
 
-    /// How the server ends by itself.
+    /// Waits until the server ends by itself; returns its result.
     pub async fn ended(self) -> Result<(), AppError> {
         actix_rt::time::timeout(crate::support::SOON, self.running).await.unwrap().unwrap()
     }

@@ -1,6 +1,6 @@
-//! What can't be reached from outside of the simulation server: its time limit, for a configuration file can't ask for
-//! less than six minutes, and panics of its actors. This program runs the server itself. It has a `main` of its own
-//! because the server starts its own program as guardian of each Webots.
+//! What black-box tests of the simulation server can't reach: its time limit, because the configuration allows no less
+//! than six minutes, and panics of its actors. This program runs the server itself. It has a `main` of its own because
+//! the server starts its own program as guardian of each Webots.
 
 #![allow(
     missing_docs,
@@ -51,7 +51,7 @@ fn main() {
     run("panics::an_actor_that_must_live_ends_the_server", panics::an_actor_that_must_live_ends_the_server);
 }
 
-/// Runs a test, unless others were asked for by name.
+/// Runs a test, unless the command line names only others.
 fn run<F: Future<Output = ()>>(name: &str, test: fn() -> F) {
     let mut wanted = std::env::args().skip(1).filter(|argument| !argument.starts_with('-')).peekable();
     if wanted.peek().is_none() || wanted.any(|part| name.contains(&part)) {

@@ -1,4 +1,4 @@
-//! Panics of actors: what they held is freed, and a server that can't go on ends.
+//! Panics of actors: their resources are freed, and a server that can't go on ends.
 
 use std::net::TcpListener;
 use std::sync::Arc;
@@ -16,19 +16,19 @@ use webots_fleet::simulation::state::AppState;
 use crate::inside::Inside;
 use crate::support::{Client, arm};
 
-/// Whoever gets this panics.
+/// An actor that receives this panics.
 #[derive(Message)]
 #[rtype(result = "()")]
 struct Panic;
 
-/// Lets actors get it.
+/// Lets these actors receive [`Panic`].
 macro_rules! panics {
     ($($actor:ty),*) => {
         $(impl Handler<Panic> for $actor {
             type Result = ();
 
             fn handle(&mut self, _: Panic, _: &mut Self::Context) {
-                // A panic that prints nothing.
+                // Panics without printing.
                 std::panic::resume_unwind(Box::new("a test has asked for it"));
             }
         })*
@@ -37,7 +37,7 @@ macro_rules! panics {
 
 panics!(WebClient, LoadMonitor);
 
-/// Opens a WebSocket as the server does, and gives away its actor's address.
+/// Opens a WebSocket as the server does, and sends the address of its actor to the test.
 async fn gate(
     request: HttpRequest,
     stream: web::Payload,
@@ -95,6 +95,6 @@ pub async fn a_client_leaves_nothing_in_any_state() {
 pub async fn an_actor_that_must_live_ends_the_server() {
     let inside = Inside::new(Stage::Idle, |_| ()).await;
     inside.server.load_monitor.do_send(Panic);
-    // The program ends with exit code 1 for whatever is told here.
+    // Any error here makes the program end with exit code 1.
     assert_eq!(inside.ended().await.unwrap_err().to_string(), "the actor LoadMonitor is gone");
 }

@@ -9,7 +9,7 @@ use crate::inside::Inside;
 use crate::support::until;
 
 pub async fn a_simulation_ends_at_its_time_limit_in_any_state() {
-    // At level `none`, what hides lives as long as the server.
+    // At level `none`, hidden processes live as long as the server.
     needs!("bwrap");
     for stage in [Stage::Launching, Stage::Idle, Stage::Running, Stage::Stopping] {
         let inside = Inside::new(stage, |config| {
@@ -25,7 +25,7 @@ pub async fn a_simulation_ends_at_its_time_limit_in_any_state() {
         }
         let told = client.until("loading: Error:").await;
         assert!(told.starts_with("loading: Error: The time limit of 5 seconds was reached"), "{stage:?}: {told}");
-        // One that does not even become ready fails for a reason of the server's own: another one may take its client.
+        // A simulation that does not become ready counts as the server's own fault: another server may take its client.
         assert_eq!(client.closed().await, Some(if stage == Stage::Launching { 1013 } else { 1000 }), "{stage:?}");
         assert!(begin.elapsed() >= Duration::from_secs(5), "{stage:?}: it came too early");
         inside.until_nothing_is_left().await;
@@ -34,7 +34,7 @@ pub async fn a_simulation_ends_at_its_time_limit_in_any_state() {
     }
 }
 
-/// Nobody can hold a place for ever by coming back: the limit counts from the first start.
+/// No client can hold a slot forever by resuming: the limit counts from the first start.
 pub async fn who_is_away_at_the_time_limit_hears_it() {
     let inside = Inside::new(Stage::Idle, |config| config.timeout = 5).await;
     let begin = Instant::now();
