@@ -1,4 +1,4 @@
-//! Images that are built: a project's own Dockerfile, what it may not do, and what happens when a build fails.
+//! Built images: a project's own Dockerfile, what it may not do, and what happens if a build fails.
 
 use webots_fleet::simulation::container::ResourceOwner;
 
@@ -29,12 +29,12 @@ async fn a_projects_dockerfile_is_built_once_for_all_clients() {
     for container in of_service(&server, "webots") {
         let built = ask(&["exec", &container, "cat", "/usr/local/webots-project/controllers/c/built"]);
         assert_eq!(built, "print('original')");
-        // It may change its project, and nothing else.
+        // It may write into its project and into `/tmp`.
         ask(&["exec", &container, "touch", "/usr/local/webots-project/new", "/tmp/new"]);
-        // A check of its image costs the machine nothing.
+        // Health checks of the image, which would cost CPU time, are off.
         assert_eq!(ask(&["inspect", "--format", "{{json .State.Health}}", &container]), "null");
     }
-    // The next one need not wait for a build.
+    // The next simulation need not wait for a build.
     one.leave().await;
     until("one is gone", async || containers(&server).len() == 1).await;
     let mut next = Client::start(&server, &arm()).await;
@@ -97,7 +97,7 @@ async fn what_can_not_be_built_is_told_in_words_and_leaves_nothing() {
 #[actix_rt::test]
 async fn a_version_without_an_image_is_told_in_words() {
     let Some(_docker) = docker().await else { return };
-    // A registry that says at once that it is not there.
+    // A registry that refuses connections.
     let image = serde_json::json!({"image": "127.0.0.1:1/webots:{version}"});
     let server = server_with(&[("worlds/a.wbt", &WORLD.replace("R2025a", "R2022b"))]).set("container", image);
     is_told(&server.start().await, &arm(), "127.0.0.1:1/webots:R2022b").await;
@@ -114,7 +114,7 @@ async fn a_client_that_leaves_in_the_middle_of_a_build_ends_it() {
     until("it is built", async || builds().await == 1).await;
     client.leave().await;
     until("the build is gone", async || builds().await == 0).await;
-    // The place is free again.
+    // The slot is free again.
     server.forge().commit("lab/arm", "main", &[("Dockerfile", &dockerfile(""))]);
     Client::start(&server, &arm()).await.patiently("webots:").await;
 }
@@ -130,7 +130,7 @@ async fn images_of_ours_that_are_old_are_removed_and_no_others() {
     let Some(_docker) = docker().await else { return };
     let (folder, owner, used) = images(&[("old", true), ("others", false), ("running", true)], "running", "-6 years");
     let (_server, client) = running(server(1).folder(folder.path())).await;
-    // It is looked for what nobody needs when a simulation has ended.
+    // The end of a simulation triggers a search for unused images.
     client.leave().await;
     until("the old one is gone", async || !is_there("old")).await;
     assert!(is_there("others") && is_there("running"));
@@ -143,7 +143,7 @@ async fn a_full_disk_is_freed_of_images_that_no_container_uses() {
     let Some(_docker) = docker().await else { return };
     let (folder, owner, used) = images(&[("unused", true), ("of-others", false), ("used", true)], "used", "-2 hours");
     load(folder.path(), "new", &owner, "now");
-    // No disk has so much room.
+    // No disk has this much room.
     let full = server(1).folder(folder.path()).set("diskReserve", 100_000_000);
     let _server = full.start().await;
     until("the one that nobody uses is gone", async || !is_there("unused")).await;
@@ -151,8 +151,8 @@ async fn a_full_disk_is_freed_of_images_that_no_container_uses() {
     ask(&["rm", &used]);
 }
 
-/// Images that the server of a folder, or another, has built at this time, and a container of one of them. Returns the folder,
-/// the server's name as an owner, and the container.
+/// Images built at this time by the server of a folder, or by another server, and a container of one of them. Returns
+/// the folder, the server's name as an owner, and the container.
 fn images(tags: &[(&str, bool)], used: &str, created: &str) -> (tempfile::TempDir, String, String) {
     let folder = tempfile::tempdir().unwrap();
     std::fs::create_dir(folder.path().join("cache")).unwrap();
@@ -174,14 +174,14 @@ fn is_there(tag: &str) -> bool {
     !ask(&["image", "ls", "--quiet", &image(tag)]).is_empty()
 }
 
-/// Gives the daemon an image that a server has built at this time, as `date` reads it.
+/// Loads an image into the daemon, as if a server had built it at this time, as `date` reads it.
 fn load(folder: &std::path::Path, tag: &str, owner: &str, created: &str) {
     let time = std::process::Command::new("date").args(["--utc", "+%FT%TZ", "--date", created]).output().unwrap();
     let (name, created) = (image(tag), String::from_utf8(time.stdout).unwrap().trim().to_owned());
     let files = folder.join("image");
     std::fs::create_dir_all(&files).unwrap();
     std::fs::write(files.join("layer.tar"), [0; 1024]).unwrap();
-    // The digest of the layer, two blocks of zeros.
+    // The digest of the layer: two blocks of zeros.
     let layer = "sha256:5f70bf18a086007016e948b04aed3b82103a36bea41755b6cddfaf10ace3c6ef";
     let config = serde_json::json!({
         "architecture": "amd64", "os": "linux", "created": created, "author": name,

@@ -1,5 +1,4 @@
-//! A Docker daemon of the tests' own, shared by all of them. It ends with the process of the tests, and all of its
-//! containers with it.
+//! A Docker daemon that all tests here share. It ends with the process of the tests, and so do all its containers.
 
 use std::io::Write;
 use std::os::unix::process::CommandExt;
@@ -19,20 +18,20 @@ struct Daemon {
 
 static USERS: RwLock<()> = RwLock::const_new(());
 static DAEMON: OnceLock<Option<Daemon>> = OnceLock::new();
-/// How long the daemon may take to begin.
+/// Timeout of the daemon's start.
 const START: Duration = Duration::from_secs(60);
-/// How many networks it has room for, so that simulations are soon more.
+/// Number of networks for which it has room; few, so that simulations soon need more.
 pub const NETWORKS: u16 = 2;
-/// The interface of the servers' network. It stays when the daemon is killed.
+/// The bridge of the servers' network. It stays when the daemon is killed.
 const INTERFACE: &str = "webots-fleet";
 
-/// The daemon, started by whoever asks first; nothing, and a word, where there can be none.
+/// The daemon, started by the first caller; `None`, with a reason printed, if there can be none.
 pub async fn docker() -> Option<RwLockReadGuard<'static, ()>> {
     let shared = USERS.read().await;
     DAEMON.get_or_init(start).is_some().then_some(shared)
 }
 
-/// The same, when nobody else uses it: it may be stopped.
+/// The daemon without other users, so that it may be stopped.
 pub async fn alone() -> Option<RwLockWriteGuard<'static, ()>> {
     let alone = USERS.write().await;
     DAEMON.get_or_init(start).is_some().then_some(alone)
@@ -41,11 +40,11 @@ pub async fn alone() -> Option<RwLockWriteGuard<'static, ()>> {
 fn start() -> Option<Daemon> {
     if let Some(why) = missing() {
         assert!(std::env::var_os("CI").is_none(), "this has to be tested where CI is set, and can't: {why}");
-        // Not by a macro: what those print is shown for tests that fail only.
+        // Not with `eprintln!`: its output is shown only if a test fails.
         std::io::stderr().write_all(format!("SKIPPED, for {why}: the tests of containers\n").as_bytes()).unwrap();
         return None;
     }
-    // Paths of sockets have to be short.
+    // Socket paths have a short length limit.
     let below = std::env::temp_dir().join("webots-fleet-docker");
     remove_old(&below);
     let folder = below.join(std::process::id().to_string());
@@ -58,7 +57,7 @@ fn start() -> Option<Daemon> {
     Some(daemon)
 }
 
-/// Why there can be no daemon here.
+/// The reason why there can be no daemon here.
 fn missing() -> Option<String> {
     if !nix::unistd::getuid().is_root() {
         return Some("dockerd needs root".to_owned());
@@ -71,7 +70,7 @@ fn missing() -> Option<String> {
     absent.or_else(|| image::prepare().err())
 }
 
-/// Removes what earlier runs have left.
+/// Removes the files of earlier runs.
 fn remove_old(folder: &Path) {
     for entry in std::fs::read_dir(folder).into_iter().flatten().flatten() {
         let name = entry.file_name().to_string_lossy().into_owned();
@@ -86,14 +85,14 @@ impl Daemon {
         format!("unix://{}/docker.sock", self.folder.display())
     }
 
-    /// Starts the daemon as the first process of a namespace: with it everything inside ends.
+    /// Starts the daemon as the first process of a PID namespace: everything inside ends with it.
     fn launch(&self) {
         let folder = self.folder.clone();
-        // What one that was killed has left.
+        // Left by a killed daemon.
         std::fs::remove_file(folder.join("pid")).ok();
         std::fs::remove_dir_all(folder.join("exec")).ok();
         let (socket, log) = (self.socket(), std::fs::File::create(self.folder.join("log")).unwrap());
-        // The kernel ends it with the thread that has started it: one that lives as long as this process.
+        // The kernel kills it with the thread that started it, so this thread lives as long as the process.
         std::thread::spawn(move || {
             let path = |name: &str| folder.join(name).display().to_string();
             let mut command = Command::new("setpriv");
@@ -102,7 +101,7 @@ impl Daemon {
             command.args(["dockerd", "--host", &socket, "--data-root", &path("data"), "--exec-root", &path("exec")]);
             command.args(["--pidfile", &path("pid"), "--bridge=none", "--ip-masq=false"]);
             command.args(["--iptables=false", "--ip6tables=false"]);
-            // Two halves.
+            // Room for two networks.
             command.arg("--default-address-pool=base=10.213.0.0/16,size=17").process_group(0);
             let outputs = command.stdin(Stdio::null()).stdout(log.try_clone().unwrap()).stderr(log);
             let mut child = outputs.spawn().unwrap();
@@ -129,16 +128,16 @@ fn daemon() -> &'static Daemon {
     DAEMON.get().unwrap().as_ref().unwrap()
 }
 
-/// Lets all users of the machine use the daemon, as those in the group `docker` may use that of the machine.
+/// Lets all users of the machine use the daemon, as the group `docker` may use that of a machine.
 pub fn open_socket() {
     let socket = daemon().folder.join("docker.sock");
     std::fs::set_permissions(socket, std::os::unix::fs::PermissionsExt::from_mode(0o666)).unwrap();
 }
 
-/// A user of the machine who is not root, by number.
+/// The id of a user who is not root.
 pub const ORDINARY: u32 = 12345;
 
-/// Has a server, whose files are in this folder, run as an ordinary user.
+/// Makes a server with files in this folder run as an ordinary user.
 pub fn as_ordinary(server: Builder, folder: &Path) -> Builder {
     open_socket();
     let owner = format!("{ORDINARY}:{ORDINARY}");
@@ -149,17 +148,17 @@ pub fn as_ordinary(server: Builder, folder: &Path) -> Builder {
     server.folder(folder).before(&user)
 }
 
-/// Makes an image of an archive, in the daemon whose files are in this folder.
+/// Imports an image from an archive, into the daemon with files in this folder.
 pub fn import(folder: &Path, tar: &str, name: &str) {
     made(folder, &["import", tar, name]);
 }
 
-/// Makes an image of a folder with a Dockerfile, in the daemon whose files are in this folder.
+/// Builds an image from a folder with a Dockerfile, in the daemon with files in this folder.
 pub fn build(folder: &Path, context: &Path, name: &str) {
     made(folder, &["build", "--network", "none", "--tag", name, context.to_str().unwrap()]);
 }
 
-/// Makes an image of a Dockerfile that copies nothing.
+/// Builds an image from a Dockerfile that copies nothing.
 pub fn build_from(dockerfile: &str, name: &str) {
     let context = tempfile::tempdir().unwrap();
     std::fs::write(context.path().join("Dockerfile"), dockerfile).unwrap();
@@ -171,30 +170,30 @@ fn made(folder: &Path, arguments: &[&str]) {
     assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
 }
 
-/// How programs reach the daemon.
+/// The value of `DOCKER_HOST` for the daemon.
 pub fn host() -> String {
     daemon().socket()
 }
 
-/// What `docker` prints with these arguments.
+/// The output of `docker` with these arguments.
 pub fn ask(arguments: &[&str]) -> String {
     let output = daemon().command(arguments).output().unwrap();
     assert!(output.status.success(), "docker {arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
     String::from_utf8_lossy(&output.stdout).trim().to_owned()
 }
 
-/// A simulation server with so many places that runs simulations in containers of the daemon. It has a forge of its own.
+/// A simulation server with this many slots that runs simulations in containers of the daemon. It has its own forge.
 pub fn server(places: u16) -> Builder {
     demo_server(places)
         .set("isolation", "container")
         .set("webots", serde_json::Value::Null)
-        // A client of a test reads nothing, not even pings, while the test waits for an image that another one needs.
+        // A test's client reads nothing, not even pings, while the test waits for the image of another simulation.
         .set("timing", serde_json::json!({ "heartbeat": 0.5, "silence": 300 }))
         .env("DOCKER_HOST", &host())
         .env("DOCKER_CONFIG", &daemon().folder.display().to_string())
 }
 
-/// Starts a server and a client, whose simulation runs.
+/// Starts a server, and a client with a running simulation.
 pub async fn running(server: Builder) -> (Server, Client) {
     let server = server.start().await;
     let mut client = Client::start(&server, &arm()).await;
@@ -202,36 +201,36 @@ pub async fn running(server: Builder) -> (Server, Client) {
     (server, client)
 }
 
-/// What a client is told whose simulation can't run, and the code with which its connection ends.
+/// The error for a client whose simulation can't run, and the close code.
 pub async fn refused(server: &Server, world: &str) -> (String, Option<u16>) {
     let mut client = Client::start(server, world).await;
     (client.patiently("loading: Error:").await, client.closed().await)
 }
 
-/// A server with one place, whose project has these files too.
+/// A server with one slot, and with these additional files in the project.
 pub fn server_with(files: &[(&str, &str)]) -> Builder {
     let server = server(1);
     server.forge().commit("lab/arm", "main", files);
     server
 }
 
-/// The same with a Dockerfile: these lines come after those that copy the project.
+/// The same with a Dockerfile that has these lines after copying the project.
 pub fn server_built(lines: &str) -> Builder {
     server_with(&[("Dockerfile", &dockerfile(lines))])
 }
 
-/// The same with this script as its Webots.
+/// The same with this script as Webots.
 pub fn server_running(webots: &str) -> Builder {
     let install = "RUN install /usr/local/webots-project/fake /usr/local/webots/webots";
     server_with(&[("Dockerfile", &dockerfile(install)), ("fake", &format!("#!/bin/bash\n{webots}\n"))])
 }
 
-/// A Dockerfile that copies a project, and has these lines.
+/// A Dockerfile that copies a project and then has these lines.
 pub fn dockerfile(lines: &str) -> String {
     format!("FROM {}\nCOPY . /usr/local/webots-project\n{lines}\n", image::NAME)
 }
 
-/// What `--check` prints for a server's configuration.
+/// The output of `--check` for a server's configuration.
 pub fn check(server: &Server) -> String {
     let mut command = Command::new(env!("CARGO_BIN_EXE_simulation-server"));
     command.arg("--check").arg(server.folder.join("config.json")).env("DOCKER_HOST", host());
@@ -239,25 +238,25 @@ pub fn check(server: &Server) -> String {
     format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
 }
 
-/// The containers of a server, those that have ended among them.
+/// The containers of a server, including those that have ended.
 pub fn containers(server: &Server) -> Vec<String> {
     containers_of(&prefix(server))
 }
 
-/// The containers whose names or projects begin like this: their names and projects.
+/// The names and projects of containers whose name or project begins like this.
 pub fn containers_of(prefix: &str) -> Vec<String> {
     let all = ask(&["ps", "--all", "--format", "{{.Names}} {{.Label \"com.docker.compose.project\"}}"]);
     all.lines().filter(|line| line.split(' ').any(|name| name.starts_with(prefix))).map(str::to_owned).collect()
 }
 
-/// How the names of a server's projects begin.
+/// The prefix of the names of a server's projects.
 pub fn prefix(server: &Server) -> String {
     let owner = webots_fleet::simulation::container::ResourceOwner::of(&server.cache());
     format!("webots-fleet-{}-", owner.0)
 }
 
-/// The containers of one service of a server, as soon as there is one. What a container prints may come before Docker counts
-/// it among those that run.
+/// The running containers of one service of a server, as soon as there is one. Docker may list a container as running
+/// only after the container has printed something.
 pub fn of_service(server: &Server, service: &str) -> Vec<String> {
     let (prefix, deadline) = (prefix(server), Instant::now() + SOON);
     let filter = format!("label=com.docker.compose.service={service}");
@@ -286,7 +285,6 @@ pub fn kill() {
     }
 }
 
-/// Starts it again.
 pub fn start_again() {
     daemon().launch();
 }

@@ -1,10 +1,10 @@
-//! What a world's program tries in a container: each row is also in docs/isolation.md.
+//! What a world's program tries in a container; docs/isolation.md has a row for each.
 
 use super::daemon::{ask, containers, docker, of_service, running, server_running};
 use super::image::NAME;
 use crate::support::{Builder, arm, is_told, until};
 
-/// A server whose Webots does this and then heartbeats.
+/// A server whose Webots does this and then sends heartbeats.
 fn doing(script: &str) -> Builder {
     server_running(&format!("{script}\nwhile :; do echo .; sleep 0.2; done"))
 }
@@ -12,14 +12,14 @@ fn doing(script: &str) -> Builder {
 #[actix_rt::test]
 async fn a_program_sees_its_image_and_its_project_only() {
     let Some(_docker) = docker().await else { return };
-    // Variables of the server's own mean nothing to compose.
+    // compose ignores the server's own environment variables.
     let builder = doing("").env("SECRET", "xyz").env("PORT", "9").env("PROJECT", "/etc").env("BIND", "nobody");
     let (server, _client) = running(builder).await;
     let webots = &of_service(&server, "webots")[0];
     assert_eq!(ask(&["exec", webots, "cat", "/usr/local/webots-project/controllers/c/c.py"]), "print('original')");
     let inside = |command: &str| ask(&["exec", webots, "bash", "-c", &format!("({command}) 2>&1 || true")]);
     assert!(!inside("env").contains("SECRET"));
-    // The machine's processes, folders and devices.
+    // Processes, folders and devices of the machine.
     let processes = inside("cat /proc/[0-9]*/cmdline | tr '\\0' ' '; echo; ls -d /proc/[0-9]*");
     assert!(!processes.contains("simulation-server"), "{processes}");
     assert!(!inside("ls -R /usr/local /tmp /run").contains("config.json"));
@@ -69,7 +69,7 @@ async fn what_fills_the_project_is_told_and_ended() {
 #[actix_rt::test]
 async fn links_in_the_project_lead_no_other_container_astray() {
     let Some(_docker) = docker().await else { return };
-    // Webots replaces the participant's folder by a link to the machine's files, and is reset.
+    // Webots replaces the participant's folder by a symlink to files of the machine, and asks for a reset.
     let server = server_running(
         "cd /usr/local/webots-project\nrm -rf controllers\nln -s /etc controllers\nln -s /etc c\n\
          while :; do echo .; echo reset; sleep 0.2; done",

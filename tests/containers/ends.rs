@@ -1,4 +1,4 @@
-//! What is left when things end that should not: the server, the daemon.
+//! What remains after the server or the daemon is killed.
 
 use std::time::{Duration, Instant};
 
@@ -7,10 +7,10 @@ use nix::sys::signal::Signal;
 use super::daemon::{self, alone, ask, check, containers, docker, refused, running, server, server_running};
 use crate::support::{Client, Server, arm, until};
 
-/// All of a simulation has to be gone by then.
+/// Longest time until nothing of a simulation remains.
 const GONE: Duration = Duration::from_secs(10);
 
-/// Whether a server says that it can start simulations; its load tells of a busy machine too.
+/// Whether a server reports that it can start simulations. Not by its load, which also depends on the machine.
 async fn takes_clients(server: &Server) -> bool {
     server.status().await["problem"].is_null()
 }
@@ -43,7 +43,7 @@ async fn only_leftovers_of_this_server_are_removed() {
         ask(&["create", "--name", name, "--label", &label, "--network", "none", super::image::NAME, "sleep", "1000"])
     };
     let (mine, other) = (owner.project(2001), "webots-fleet-000000000000-2001-0".to_owned());
-    // The label of an image may have any text, and its containers inherit it.
+    // An image's label may have any text, and its containers inherit it.
     let containers =
         [(format!("{mine}-webots"), &mine), (format!("{other}-webots"), &other), ("forged".to_owned(), &mine)]
             .map(|(name, project)| make(&name, project));
@@ -63,7 +63,7 @@ async fn a_server_that_is_started_again_at_once_keeps_what_it_starts() {
     let (mut first, _client) = running(server(1).folder(folder.path())).await;
     first.signal(Signal::SIGKILL);
     first.ended().await;
-    // The guardian of the first may still be removing what that has left.
+    // The guardian of the first server may still be removing its containers.
     let (second, mut client) = running(server(1).folder(folder.path())).await;
     let begin = Instant::now();
     while begin.elapsed() < Duration::from_secs(8) {
@@ -79,9 +79,9 @@ async fn a_stopped_docker_is_reported_until_it_is_back() {
     daemon::kill();
     let lost = client.patiently("loading: Error:").await;
     assert!(lost.contains("Docker has stopped on this simulation server"), "{lost}");
-    // Another server may take it.
+    // Another server may take the client.
     assert_eq!(client.closed().await, Some(1013));
-    // The first after that comes before the server has looked.
+    // The server has not checked Docker yet when the first client comes.
     for _ in 0..2 {
         let (told, code) = refused(&server, &arm()).await;
         assert!(told.contains("Docker does not answer on this simulation server"), "{told}");

@@ -1,4 +1,4 @@
-//! What a project tries in the files that are read before its simulation runs, and what odd surroundings do to that.
+//! What a project tries with symlinks, memory, folders and devices in its images.
 
 use super::daemon::{as_ordinary, ask, docker, dockerfile, of_service, refused, running, server, server_built};
 use super::image::NAME;
@@ -23,7 +23,7 @@ async fn a_link_in_an_image_leads_no_build_to_files_of_the_machine() {
 #[actix_rt::test]
 async fn a_build_has_no_more_memory_than_a_simulation() {
     let Some(_docker) = docker().await else { return };
-    // It ends by itself, without having been stopped, at 200 MB.
+    // It would end by itself at 200 MB.
     let server = server_built("RUN perl -e 'my @a; push @a, \"x\" x 1000000 for 1..200'").set("limits.memory", 64);
     let (told, _) = refused(&server.start().await, &arm()).await;
     assert!(told.contains("can't be built") && told.contains("137"), "{told}");
@@ -34,7 +34,7 @@ async fn folders_and_devices_of_an_image_are_its_projects_fault() {
     let Some(_docker) = docker().await else { return };
     let (server, folder) = (server(1), tempfile::tempdir().unwrap());
     let replaced = |folder| (format!("rm -rf {folder} && touch {folder}"), "");
-    // An ordinary user can't even copy a device out of the image.
+    // An ordinary user can't copy a device out of the image.
     let device = ("mknod /usr/local/webots-project/zero c 1 5".to_owned(), "not permitted");
     let all = [replaced("/tmp"), replaced("/run"), replaced("/var/tmp"), device];
     for (branch, (line, _)) in ["a", "b", "c", "d"].into_iter().zip(&all) {
@@ -52,7 +52,7 @@ async fn folders_and_devices_of_an_image_are_its_projects_fault() {
 #[actix_rt::test]
 async fn a_device_made_by_a_dockerfile_opens_nothing() {
     let Some(_docker) = docker().await else { return };
-    // The memory of the machine, and a disk that there may be.
+    // The memory of the machine, a disk that may exist, and `/dev/zero`.
     let devices = "RUN cd /usr/local/webots-project && mknod mem c 1 1 && mknod disk b 254 0 && mknod controllers/zero c 1 5 \
                    && chmod 666 mem disk controllers/zero";
     let (server, _client) = running(server_built(devices)).await;

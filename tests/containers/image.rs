@@ -11,19 +11,19 @@
 use std::path::Path;
 use std::process::Command;
 
-/// The name of the image for the worlds of the tests.
+/// Name of the image for the worlds of the tests.
 pub const NAME: &str = "cyberbotics/webots.cloud:R2025a-ubuntu22.04";
 /// The image of an editor.
 pub const EDITOR: &str = "benjamindeleze/theia-test:test3";
-/// The Debian below both.
+/// The Debian image below both.
 const DEBIAN: &str = "webots-fleet.test/debian";
-/// What a script ends with that can't do its work on this machine.
+/// Exit code of a script that can't do its work on this machine.
 const SKIPPED: i32 = 77;
 
-/// Makes the archive of the Debian, unless an earlier run has.
+/// Creates the archive of the Debian image, unless an earlier run has.
 ///
 /// # Errors
-/// Where it can't be made.
+/// If it can't be created.
 pub fn prepare() -> Result<(), String> {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/image_root.sh");
     let status = Command::new(script).arg(archive()).status().unwrap();
@@ -38,7 +38,7 @@ fn archive() -> String {
     format!("{}/images.tar", env!("CARGO_TARGET_TMPDIR"))
 }
 
-/// Makes the images in the daemon, with `folder` for what they are made of.
+/// Creates the images in the daemon; `folder` is for their build contexts.
 pub fn make(folder: &Path) {
     super::daemon::import(folder, &archive(), DEBIAN);
     let simulator = Path::new(env!("CARGO_BIN_EXE_demo-simulator"));

@@ -1,4 +1,4 @@
-//! What a project may ask for in its webots.yml: an editor, a competition; and what the administrator relaxes.
+//! What a project may request in its webots.yml, an editor or a competition, and what administrators may relax.
 
 use serde_json::json;
 
@@ -29,7 +29,7 @@ async fn an_editor_shows_no_folder_outside_of_the_project() {
     let Some(_docker) = docker().await else { return };
     let server = server(1).start().await;
     let work = server.forge().work_tree("lab/arm", "main");
-    // As a line of its own it would say where the project is.
+    // As a line of its own, the second part of the name would set where the project is.
     let folder = work.join("controllers/x\nPROJECT=/etc");
     std::fs::create_dir_all(&folder).unwrap();
     std::fs::write(folder.join("file"), "").unwrap();
@@ -42,8 +42,8 @@ async fn an_editor_shows_no_folder_outside_of_the_project() {
     }
 }
 
-/// The layout of the Dockerfiles of real competitions: a default port that their server replaces, and an entry point that
-/// a shell reads.
+/// Like the Dockerfiles of real competitions: a default port that their server replaces, and an entry point that is run
+/// by a shell.
 const COMPETITION: [(&str, &str); 4] = [
     ("Dockerfile", "FROM {NAME}\nRUN mkdir -p /usr/local/webots-project\nCOPY . /usr/local/webots-project\n"),
     (
@@ -90,7 +90,7 @@ async fn a_participant_connects_and_runs_edited_code_after_a_reset() {
     ] {
         assert_eq!(seen[key], value, "{key}");
     }
-    // The editor changes the program, and the client resets the simulation.
+    // The editor changes the program, and a viewer resets the simulation.
     let theia = &of_service(&server, "theia")[0];
     ask(&["exec", theia, "sh", "-c", "echo 'print(2)' >/home/project/webots-project/participant.py"]);
     let mut viewer = Client::connect(&format!("ws://127.0.0.1:{port}/")).await;
@@ -116,10 +116,10 @@ async fn what_an_image_keeps_at_home_is_found_and_can_be_changed() {
     assert_eq!(inside("cat ~/.cache/Cyberbotics/Webots/assets/*"), "an asset of the image");
     assert!(inside("cat ~/.config/Cyberbotics/Webots-R2025a.conf").contains("cacheSize=1024"));
     inside("echo x >~/.cache/Cyberbotics/Webots/assets/new && echo y >>~/.config/Cyberbotics/Webots-R2025a.conf");
-    // The image itself stays as it is, for others.
+    // The image itself stays unchanged.
     assert!(inside("touch /usr/local/new 2>&1 || true").contains("Read-only file system"));
     assert_eq!(inside("cat /proc/1/comm"), "docker-init");
-    // What it writes is the server's to remove.
+    // The server must remove the files that it writes.
     inside("mkdir -p /usr/local/webots-project/deep && touch /usr/local/webots-project/deep/new");
     client.leave().await;
     until("all is gone", async || containers(&server).is_empty()).await;

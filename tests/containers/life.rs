@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 use super::daemon::{self, ask, containers, docker, of_service, running, server};
 use crate::support::{Client, WORLD, arm, instance_folders_in, is_told, until, world};
 
-/// All of a simulation has to be gone by then.
+/// Longest time until nothing of a simulation remains.
 const GONE: Duration = Duration::from_secs(10);
 
 #[actix_rt::test]
@@ -20,7 +20,6 @@ async fn a_world_runs_in_a_container_and_leaves_nothing() {
     let mut viewer = Client::connect(&format!("ws://127.0.0.1:{}/", server.port + 1)).await.with_running_scene().await;
     assert_eq!(server.status().await["isolation"], "container");
     assert_eq!(containers(&server).len(), 1);
-    // What it takes is shown to whoever looks.
     until("the monitor shows its processor time and memory", async || {
         let page = server.monitor().await;
         let value = |label: &str| {
@@ -31,7 +30,7 @@ async fn a_world_runs_in_a_container_and_leaves_nothing() {
     })
     .await;
     let now = viewer.time().await;
-    // Long enough for a look at what it takes.
+    // Long enough for a measurement of its usage.
     while viewer.time().await < now + 4000.0 {}
     drop(viewer);
     client.leave().await;
@@ -41,7 +40,7 @@ async fn a_world_runs_in_a_container_and_leaves_nothing() {
     until("its folder is gone", async || instance_folders_in(&server.cache()).is_empty()).await;
     let read = || std::fs::read_to_string(server.folder.join("log/simulation/simulations.csv")).unwrap_or_default();
     until("its end is in simulations.csv", async || read().lines().count() == 2).await;
-    // The port is free, and the next one gets it.
+    // The port is free again, and the next simulation gets it.
     let mut next = Client::start(&server, &arm()).await;
     assert_eq!(next.patiently("webots:").await, format!("webots:ws://localhost:{}", server.port + 1));
 }

@@ -1,5 +1,5 @@
-//! Simulations in containers: the built simulation server on a real Docker daemon, which these tests start themselves, with
-//! images that are made here and have the names of the real ones. Needs root; skipped with a word without it.
+//! Simulations in containers: the built simulation server with a real Docker daemon, which these tests start, and
+//! images that they build under the names of the real ones. Needs root; without it the tests are skipped.
 
 #![allow(
     missing_docs,

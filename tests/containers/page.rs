@@ -1,4 +1,4 @@
-//! docs/containers.md by doing: its commands and its files as they stand.
+//! Runs the commands of docs/containers.md, with its files as they are.
 //!
 //! | stands in | for | because |
 //! |---|---|---|
@@ -13,12 +13,12 @@ use super::daemon::{ask, build_from, docker, host, of_service, open_socket, runn
 use super::image::NAME;
 use crate::support::{make_program, open_folder, page};
 
-/// The blocks of the page in this language.
+/// The code blocks of the page in this language.
 fn blocks(language: &str) -> Vec<String> {
     page::blocks(&page::page("containers.md"), language)
 }
 
-/// A machine on which the commands of a page are run.
+/// A machine that runs the commands of a page.
 struct Machine(tempfile::TempDir);
 
 impl Machine {
@@ -30,12 +30,12 @@ impl Machine {
         machine
     }
 
-    /// A program in place of the real one.
+    /// A script in place of a real program.
     fn script(&self, name: &str, text: &str) {
         make_program(&self.0.path().join("bin").join(name), text);
     }
 
-    /// What these commands print. The real /etc stays as it is below that of this machine, which has a network of its own.
+    /// The output of these commands. They run in a new network, with an overlay over the real /etc.
     fn run(&self, commands: &str) -> String {
         let etc = "mount -t overlay overlay -o lowerdir=/etc,upperdir=$FOLDER/etc,workdir=$FOLDER/work /etc";
         let output = Command::new("unshare")
@@ -60,7 +60,7 @@ async fn the_commands_for_containers_lead_to_a_ready_server() {
     open_socket();
     let machine = Machine::new();
     std::fs::write(machine.0.path().join("etc/webots-fleet/simulation/main.json"), &blocks("json")[0]).unwrap();
-    // The images of the tests are those of one version.
+    // All tests use the images of one version.
     let commands = blocks("sh").concat();
     for image in commands.lines().filter_map(|line| line.strip_prefix("docker pull cyberbotics/webots.cloud:")) {
         ask(&["tag", NAME, &format!("cyberbotics/webots.cloud:{image}")]);
@@ -71,7 +71,7 @@ async fn the_commands_for_containers_lead_to_a_ready_server() {
     machine.script("docker", real);
     machine.script("sudo", "exec setpriv --reuid 12345 --regid 12345 --clear-groups \"${@:3}\"");
     symlink(env!("CARGO_BIN_EXE_simulation-server"), machine.0.path().join("bin/simulation-server")).unwrap();
-    // What the page says of the packet filter is loaded.
+    // Loads the packet filter of the page.
     let filter = "PATH=$PATH:/usr/sbin\nnft -f deploy/nftables/containers.nft\nnft -f /etc/webots-fleet/nftables/lab.nft\n\
                   nft list table inet webots_fleet";
     let told = machine.run(&format!("(\n{commands}\n)\n{filter}"));
@@ -84,7 +84,7 @@ async fn the_commands_for_containers_lead_to_a_ready_server() {
 #[actix_rt::test]
 async fn the_dockerfile_of_the_page_on_containers_is_built_and_runs() {
     let Some(_docker) = docker().await else { return };
-    // Packages can't be had here.
+    // Packages can't be downloaded here.
     let image = "webots-fleet.test/packages";
     build_from(&format!("FROM {NAME}\nRUN ln -s /bin/true /usr/local/bin/apt-get\n"), image);
     let makefile = ("controllers/mine/Makefile", "all:\n\ttouch made\n");

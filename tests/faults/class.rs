@@ -1,4 +1,4 @@
-//! The load under which faults are injected: a rehearsal.
+//! The load during faults: a rehearsal.
 
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
@@ -9,17 +9,17 @@ use tokio::process::{Child, Command};
 
 use crate::support::arm;
 
-/// How many clients come and go.
+/// Number of clients that come and go.
 const CLIENTS: u32 = 8;
 
-/// A class that comes and goes. It is ended with this value.
+/// A class that comes and goes. It is killed when this value is dropped.
 pub struct Class {
     child: Child,
     file: PathBuf,
 }
 
 impl Class {
-    /// Lets it come to a session server again and again for so long. What it has met is written into the folder.
+    /// Makes it come to a session server again and again for this long. The results are written into the folder.
     pub fn start(url: &str, folder: &Path, time: Duration) -> Self {
         let file = folder.join("class.json");
         let mut command = Command::new(env!("CARGO_BIN_EXE_rehearse"));
@@ -30,7 +30,7 @@ impl Class {
         Self { child: command.spawn().unwrap(), file }
     }
 
-    /// Waits until all clients have gone. Returns what they have met.
+    /// Waits until all clients have left. Returns the results.
     pub async fn end(mut self) -> Value {
         actix_rt::time::timeout(Duration::from_secs(90), self.child.wait()).await.expect("the class ends").unwrap();
         serde_json::from_str(&std::fs::read_to_string(&self.file).unwrap()).unwrap()

@@ -1,5 +1,5 @@
-//! The faults, each with what heals it: here those of the fleet's processes. Whatever is done to a fleet is undone before the
-//! function returns, but for what the fleet has to mend itself.
+//! The faults, each with its repair; here those of the fleet's processes. Each function undoes its fault before it
+//! returns, except for what the fleet must repair itself.
 
 use std::future::Future;
 use std::pin::Pin;
@@ -18,15 +18,15 @@ use crate::surroundings::*;
 
 type Injected<'fleet> = Pin<Box<dyn Future<Output = bool> + 'fleet>>;
 
-/// A fault. It tells whether it was possible.
+/// A fault. `inject` returns whether it was possible.
 pub struct Fault {
     pub name: &'static str,
     pub inject: for<'fleet> fn(&'fleet mut Fleet, &'fleet mut SmallRng) -> Injected<'fleet>,
 }
 
-/// How long something that stands still does so.
+/// Duration of a fault, for example of a stopped process.
 pub const WHILE: Duration = Duration::from_secs(3);
-/// How long what a killed server leaves may live.
+/// Longest life of processes that a killed server leaves.
 const AT_ONCE: Duration = Duration::from_secs(5);
 
 macro_rules! faults {
@@ -35,7 +35,6 @@ macro_rules! faults {
     };
 }
 
-/// All faults.
 pub fn all() -> Vec<Fault> {
     faults! {
         "a session server is killed": kill_session;
@@ -83,7 +82,7 @@ async fn kill_server(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
     true
 }
 
-/// Waits until a server that was killed has ended, and nothing that it had started is left.
+/// Waits until a killed server and all processes that it started have ended.
 async fn bury(fleet: &mut Fleet, index: usize) {
     fleet.servers[index].ended().await;
     let stopwatch = Stopwatch::start();
@@ -103,8 +102,8 @@ async fn stand_still(fleet: &Fleet, random: &mut SmallRng, is_session: bool) -> 
     true
 }
 
-/// Sends a signal to a process that the simulation servers have started, whose command line has these words. Waits for
-/// one: clients come and go.
+/// Sends a signal to a process that a simulation server has started, with these words in its command line. Waits for
+/// such a process, because clients come and go.
 async fn signal(fleet: &Fleet, random: &mut SmallRng, words: &str, signal: Signal) -> bool {
     let deadline = Instant::now() + WHILE;
     while Instant::now() < deadline {
@@ -113,7 +112,7 @@ async fn signal(fleet: &Fleet, random: &mut SmallRng, words: &str, signal: Signa
         if !all.is_empty() {
             return kill(Pid::from_raw(all[random.random_range(0..all.len())]), signal).is_ok();
         }
-        // A git lives for some milliseconds.
+        // A git process runs for only some milliseconds.
         actix_rt::time::sleep(Duration::from_millis(2)).await;
     }
     false

@@ -1,4 +1,4 @@
-//! The fleet that is tested, and what must hold of it.
+//! The fleet under test, and its invariants.
 
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
@@ -17,27 +17,26 @@ use crate::support::{self, Builder, Client, Forge, SOON, Server, Webots, disk, h
 use crate::support::{instance_folders_in, instances_below, session_server, simulation_server};
 use crate::surroundings::Clock;
 
-/// How many simulation servers there are.
+/// Number of simulation servers.
 pub const SERVERS: usize = 5;
-/// The one on a small disk of its own.
+/// The server with a small disk of its own.
 pub const SMALL_DISK: usize = 3;
-/// The one behind a link that can be cut.
+/// The server behind a link that can be cut.
 pub const LINKED: usize = 4;
-/// The one that a name leads to.
+/// The server that is found by a name.
 const NAMED: usize = 0;
-/// That name.
 const NAME: &str = "fleet.test";
-/// How many simulations fit on each.
+/// Slots of each simulation server.
 pub const PLACES: u16 = 4;
-/// How long the fleet may take to be whole again, on a machine that has much else to do.
+/// Longest time until the fleet is whole again, on a machine with much other load.
 pub const BOUND: Duration = Duration::from_mins(1);
 
-/// What the servers stand on, and start from again.
+/// What the servers need, also to restart.
 pub struct Site {
     pub relay: Relay,
-    /// Where there can be one.
+    /// `None` if there can't be one.
     pub names: Option<NameServer>,
-    /// That of all servers.
+    /// Shared by all servers.
     pub clock: Clock,
     forge: Forge,
     webots: Webots,
@@ -64,19 +63,19 @@ impl Site {
         site
     }
 
-    /// Has the name server know the name.
+    /// Adds the name to the name server.
     pub fn set_name(&self) {
         if let Some(names) = &self.names {
             names.set(NAME, &[std::net::Ipv4Addr::LOCALHOST.into()]);
         }
     }
 
-    /// Where the files of all servers are.
+    /// Directory of all servers' files.
     pub fn root(&self) -> &Path {
         self.folder.path()
     }
 
-    /// Where a server's files are.
+    /// Directory of a server's files.
     pub fn folder(&self, index: usize) -> PathBuf {
         self.folder.path().join(format!("server-{index}"))
     }
@@ -96,7 +95,7 @@ impl Site {
         let timing = json!({"grace": 1, "heartbeat": 0.5, "ping": 2, "silence": 6, "launch": 20, "checkout": 40});
         let builder = simulation_server(&self.webots.path(), self.forge.path(), PLACES).set("timing", timing);
         std::fs::create_dir_all(self.folder(index)).unwrap();
-        // The small disk has less room than the default.
+        // The small disk has less room than the default reserve.
         let builder = builder.set("hangLimit", 1).set("diskReserve", 8);
         self.clock.of(builder).folder(&self.folder(index)).port(self.ports[index])
     }
@@ -116,7 +115,7 @@ impl Site {
             Some(names) => builder.before(&names.asked()),
             None => builder,
         };
-        // What else runs on this machine must not close the fleet.
+        // Other load on this machine must not close the fleet.
         self.clock.of(builder.set("timing", json!({"answer": 1})).set("loadThreshold", 1000))
     }
 }
@@ -126,9 +125,9 @@ pub struct Fleet {
     pub session: Server,
     pub servers: Vec<Server>,
     pub site: Site,
-    /// Where packets can be lost.
+    /// A network that can lose packets.
     pub network: Option<Network>,
-    /// What each server took of memory before anything happened, in bytes.
+    /// The memory of each server at the start, in bytes.
     memory: Vec<u64>,
 }
 
@@ -144,27 +143,27 @@ impl Fleet {
         Self { session, servers, site, network, memory }
     }
 
-    /// Starts a simulation server at the place of one that is gone, as a service manager does.
+    /// Restarts a simulation server that has ended, as a service manager does.
     pub async fn restart(&mut self, index: usize) {
         self.servers[index] = self.site.server(index).start().await;
     }
 
-    /// Starts a session server at the place of the one that is gone.
+    /// Restarts the session server after it has ended.
     pub async fn restart_session(&mut self) {
         self.session = self.site.session().start().await;
     }
 
-    /// Lets a class come again and again for so long.
+    /// Makes a class come again and again for this long.
     pub fn class(&self, time: Duration) -> Class {
         Class::start(&self.session.url(""), self.site.root(), time)
     }
 
-    /// Waits until everything holds that must hold.
+    /// Waits until all invariants hold.
     pub async fn whole(&self, after: &str) {
         self.comes_to(after, Self::look).await;
     }
 
-    /// Waits until nothing is left of any simulation: no process, port or folder, and memory as it was.
+    /// Waits until nothing of any simulation remains, neither process, port nor folder, and memory is as before.
     pub async fn empty(&self) {
         self.comes_to("the class", async |fleet| fleet.look_for_rests()).await;
     }
@@ -177,7 +176,7 @@ impl Fleet {
         }
     }
 
-    /// One look at everything that must hold while clients come and go.
+    /// Checks all invariants once, while clients come and go.
     async fn look(&self) -> Result<(), String> {
         let status = http::try_get(&self.session.url("/status")).await?.json();
         let states: Vec<&str> =
@@ -185,7 +184,7 @@ impl Fleet {
         if states.len() != SERVERS || states.iter().any(|state| !matches!(*state, "up" | "full")) {
             return Err(format!("the servers are {states:?}: {status}"));
         }
-        // What clients are told is what is true.
+        // Clients receive the true availability.
         let mut client = Client::try_connect(&self.session.websocket("/")).await?;
         let Some(Heard::Text(told)) = client.next_within(SOON).await else {
             return Err("availability is not told".to_owned());
@@ -194,7 +193,7 @@ impl Fleet {
         if (told == "1") != is_true {
             return Err(format!("clients are told {told}, the servers are {states:?}"));
         }
-        // Simulations are those of clients that are there, and nothing else is left of others.
+        // Each simulation has a client, and nothing of others remains.
         for (index, server) in self.servers.iter().enumerate() {
             let known = http::try_get(&server.url("/status")).await?.json();
             let known = known["simulations"].as_array().unwrap().len();
@@ -205,14 +204,14 @@ impl Fleet {
                 ));
             }
         }
-        // A client of its own gets a simulation.
+        // A new client gets a simulation.
         let given = http::try_get(&self.session.url("/session")).await?.text();
         try_start(&given).await?.leave().await;
         Ok(())
     }
 
-    /// How many simulations have a folder on a server, and how many of its streaming ports are in use. To try to take one would
-    /// be in the way of a server that tries the same.
+    /// The number of instance directories and of streaming ports in use on a server. Does not try to bind the ports,
+    /// which could make a server fail that tries the same.
     fn held(&self, index: usize) -> (usize, usize) {
         let all = Process::myself().and_then(|this| this.tcp()).unwrap();
         let places = self.site.places(index);
@@ -235,7 +234,7 @@ impl Fleet {
     }
 }
 
-/// What a process has in memory, in bytes.
+/// The resident memory of a process, in bytes.
 fn memory(pid: i32) -> u64 {
     Process::new(pid).and_then(|process| process.statm()).unwrap().resident * procfs::page_size()
 }

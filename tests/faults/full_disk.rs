@@ -1,5 +1,5 @@
-//! Two servers, the disk of one of them full, and a class of 16: all of them run. The disk fills while a class runs, and
-//! empties again.
+//! Two servers, one of them with a full disk, and a class of 16, whose simulations must all run. The disk fills up
+//! while simulations run, and is emptied again.
 
 use std::path::Path;
 
@@ -7,7 +7,7 @@ use crate::fleet::try_start;
 use crate::support::disk::{self, Full};
 use crate::support::{Builder, Client, Server, arm, demo_server, http, session_server, skip, until};
 
-/// How many come.
+/// Number of clients.
 const CLASS: u16 = 16;
 
 fn server(folder: &Path) -> Builder {
@@ -16,14 +16,14 @@ fn server(folder: &Path) -> Builder {
     demo_server(CLASS).folder(folder).set("diskReserve", 8)
 }
 
-/// The state of the second simulation server, and the last error that was met there.
+/// The state of the second simulation server, and its last error.
 async fn second(session: &Server) -> (String, String) {
     let page = session.status().await;
     let text = |key: &str| page["servers"][1][key].as_str().unwrap_or_default().to_owned();
     (text("state"), text("error"))
 }
 
-/// A class that comes one by one, each after the other has its simulation.
+/// A class that comes one by one: each client after the one before has its simulation.
 async fn class(session: &Server, clients: u16) -> Vec<Client> {
     let mut class = Vec::new();
     for number in 1..=clients {
@@ -47,7 +47,7 @@ async fn a_server_with_a_full_disk_takes_nobody() {
     let session = session_server(&[healthy.address(), full.address()]).set("loadThreshold", 1000).start().await;
     until("both work", async || second(&session).await.0 == "up").await;
 
-    // It fills while it has a simulation.
+    // The disk fills up while the server has a simulation.
     let mut running = try_start(&format!("ws://{}", full.address())).await.unwrap();
     let filler = Full::at(&small);
     until("the full one is not offered", async || second(&session).await.0 == "down").await;
@@ -64,7 +64,7 @@ async fn a_server_with_a_full_disk_takes_nobody() {
     assert_eq!(healthy.simulations().await.len(), usize::from(CLASS));
     running.until(".").await;
 
-    // It empties.
+    // The disk is emptied.
     drop(filler);
     until("it is offered again", async || second(&session).await.0 == "up").await;
     assert_eq!(full.health().await.0, 200);

@@ -1,9 +1,9 @@
-//! Faults under load: five simulation servers, a session server and a small class that comes and goes, while servers are
-//! killed and stopped, disks are full, clocks step, names hang, packets are lost. After each fault the
-//! fleet must be whole again by itself, but for a server that was killed, which its service manager starts again: here, the
-//! test. Some faults need root, others iptables: what is not possible is said.
+//! Faults under load: five simulation servers, a session server and a small class that comes and goes, while servers
+//! are killed and stopped, disks fill up, clocks step, DNS hangs, packets get lost. After each fault the fleet must
+//! become whole again by itself; only killed servers are restarted by the test, in place of a service manager. Some
+//! faults need root, others iptables; faults that are not possible are reported.
 //!
-//! `FAULTS_FOR=1h FAULTS_SEED=7 cargo test --test faults -- --nocapture` plays it for longer, or again.
+//! `FAULTS_FOR=1h FAULTS_SEED=7 cargo test --test faults -- --nocapture` runs longer, or repeats a run.
 
 #![allow(
     missing_docs,
@@ -36,7 +36,7 @@ use fault::Fault;
 use fleet::Fleet;
 use support::network::Network;
 
-/// How long faults are injected where nothing else is asked for.
+/// Duration if `FAULTS_FOR` is not set.
 const SHORT: Duration = Duration::from_secs(60);
 
 #[actix_rt::test]
@@ -52,7 +52,7 @@ async fn the_fleet_is_whole_again_after_each_fault() {
     let start = Instant::now();
     let class = fleet.class(time + Duration::from_secs(20));
     let mut injected: Vec<&str> = Vec::new();
-    // Each fault once, in any order, and then any.
+    // Each fault once in random order, then again.
     let mut open = fault::all();
     while start.elapsed() < time {
         if open.is_empty() {

@@ -1,4 +1,4 @@
-//! A session server that is started again, and all its clients come back at once.
+//! A session server restarts, and all its clients return at once.
 
 use std::time::{Duration, Instant};
 
@@ -7,9 +7,8 @@ use futures_util::StreamExt;
 use crate::support::ports::dead_port;
 use crate::support::{Client, demo_server, session_server};
 
-/// How many clients there are.
 const CLIENTS: usize = 5_000;
-/// How long it may take until each of them has heard the truth again.
+/// Longest time until all of them have received the availability again.
 const BOUND: Duration = Duration::from_secs(20);
 
 #[actix_rt::test]
@@ -18,7 +17,7 @@ async fn on_a_quiet_machine_five_thousand_clients_reconnect_at_once() {
     let folder = tempfile::tempdir().unwrap();
     let (reserved, simulation_port) = dead_port();
     let servers = [format!("127.0.0.1:{simulation_port}")];
-    // However busy this machine is, its simulation server is not full.
+    // Load on this machine must not make its simulation server full.
     let configure = || session_server(&servers).set("maxClientsPerAddress", 2 * CLIENTS).set("loadThreshold", 1_000);
     let mut session = configure().folder(folder.path()).start().await;
     let port = session.port;
@@ -36,13 +35,13 @@ async fn on_a_quiet_machine_five_thousand_clients_reconnect_at_once() {
     assert_eq!(status["clients"], clients.len());
 }
 
-/// Lets all clients connect, and waits until each has heard whether a server is available.
+/// Connects all clients, and waits until each has received this availability.
 async fn come(url: &str, truth: &str) -> Vec<Client> {
     let coming = futures_util::stream::iter(0..CLIENTS).map(|_| async {
         let mut client = Client::connect(url).await;
         client.until(truth).await;
         client
     });
-    // As many at a time as this one program can play.
+    // As many at a time as this test can handle.
     coming.buffer_unordered(200).collect().await
 }

@@ -1,4 +1,4 @@
-//! Faults of what is around the servers: disks, files, clocks, names and links.
+//! Faults in the servers' environment: disks, files, clocks, names and links.
 
 use std::fs::File;
 use std::os::unix::fs::FileExt;
@@ -26,7 +26,7 @@ pub async fn fill_disk(fleet: &mut Fleet, _: &mut SmallRng) -> bool {
     true
 }
 
-/// A folder is replaced by one that can't be written, or can't be written any more.
+/// Makes a folder read-only, either as it is or replaced by an empty one.
 pub async fn close_folder(fleet: &mut Fleet, name: &str, is_empty: bool) -> bool {
     let folder = fleet.site.folder(SMALL_DISK).join(name);
     let closed = if is_empty { ReadOnly::empty(&folder) } else { ReadOnly::at(&folder) };
@@ -53,14 +53,14 @@ pub async fn no_files(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
     limit(soft) && is_possible
 }
 
-/// The time of day, for the programs that are started with it: it can be set.
+/// A time of day that can be set, for the programs that are started with it.
 pub struct Clock {
     folder: tempfile::TempDir,
     step: File,
 }
 
 impl Clock {
-    /// One that is right.
+    /// A clock without an offset.
     pub fn new() -> Self {
         let folder = shared_library("faults/clock.c", "clock.so");
         let step = File::create(folder.path().join("step")).unwrap();
@@ -69,19 +69,19 @@ impl Clock {
         clock
     }
 
-    /// Has a server use this clock.
+    /// Makes a server use this clock.
     pub fn of(&self, server: Builder) -> Builder {
         let file = |name: &str| self.folder.path().join(name).to_str().unwrap().to_owned();
         server.env("LD_PRELOAD", &file("clock.so")).env("CLOCK_STEP", &file("step"))
     }
 
-    /// Sets by how many seconds it differs from the machine's.
+    /// Sets the offset from the machine's clock.
     pub fn set(&self, seconds: i64) {
         self.step.write_all_at(&seconds.to_ne_bytes(), 0).unwrap();
     }
 }
 
-/// The time of day of all servers makes a step, and one back.
+/// The clock of all servers steps, and steps back.
 pub async fn step_clock(fleet: &mut Fleet, seconds: i64) -> bool {
     fleet.site.clock.set(seconds);
     fleet.whole("the clock's step").await;
@@ -90,7 +90,7 @@ pub async fn step_clock(fleet: &mut Fleet, seconds: i64) -> bool {
     true
 }
 
-/// What becomes of the name server.
+/// Faults of the name server.
 #[derive(Clone, Copy)]
 pub enum Names {
     Hang,
@@ -98,7 +98,7 @@ pub enum Names {
     HaveNoServer,
 }
 
-/// Names fail, and the fleet is whole nevertheless.
+/// Names can't be resolved, but the fleet stays whole.
 pub async fn break_names(fleet: &mut Fleet, how: Names) -> bool {
     let Some(names) = &mut fleet.site.names else {
         return false;
@@ -108,7 +108,7 @@ pub async fn break_names(fleet: &mut Fleet, how: Names) -> bool {
         Names::AreUnknown => names.set("another.test", &[]),
         Names::HaveNoServer => names.end(),
     }
-    // A name is looked up again every two seconds.
+    // Long enough for lookups, which run every second.
     actix_rt::time::sleep(WHILE).await;
     fleet.whole("names failed").await;
     match (how, &mut fleet.site.names) {
@@ -119,7 +119,7 @@ pub async fn break_names(fleet: &mut Fleet, how: Names) -> bool {
     true
 }
 
-/// The session server and one simulation server see each other through a link that changes.
+/// Changes the link between the session server and one simulation server for a while.
 pub async fn change_link(fleet: &mut Fleet, mood: Mood) -> bool {
     fleet.site.relay.set(mood);
     actix_rt::time::sleep(WHILE).await;
@@ -127,7 +127,7 @@ pub async fn change_link(fleet: &mut Fleet, mood: Mood) -> bool {
     true
 }
 
-/// Packets from and to a server are lost, for everybody.
+/// Loses packets from and to a server, for all its peers.
 pub async fn lose_packets(fleet: &mut Fleet, random: &mut SmallRng, share: f64) -> bool {
     let Some(network) = fleet.network else {
         return false;
