@@ -1,12 +1,12 @@
-//! The images of a Webots and of an editor, under the names of the real ones: a Debian whose `xvfb-run`, `xauth`, `Xvfb` and
-//! Python are real, below the layout of the official Dockerfiles.
+//! The images of a Webots and of an editor, under the real names: a Debian with real `xvfb-run`, `xauth`, `Xvfb` and
+//! Python, and on top of it the layout of the official Dockerfiles.
 //!
 //! | stands in | for | because |
 //! |---|---|---|
-//! | the demo simulator | `webots-bin` | Webots is larger than what these tests may fetch |
-//! | `image/webots/webots` | its launcher | the demo simulator has no controllers from outside, for which Webots makes folders |
-//! | `image/webots/webots-controller` | `webots-controller` | the same; it tells what surrounds a participant's program |
-//! | the demo simulator | Theia | only its port, its user and its mounts count here |
+//! | the demo simulator | `webots-bin` | Webots is too large a download for these tests |
+//! | `image/webots/webots` | its launcher | the demo simulator makes no folders for external controllers, so the script makes them |
+//! | `image/webots/webots-controller` | `webots-controller` | the same; it reports the environment of a participant's program |
+//! | the demo simulator | Theia | only its port, its user and its mounts matter here |
 
 use std::path::Path;
 use std::process::Command;

@@ -2,9 +2,9 @@
 //!
 //! | stands in | for | because |
 //! |---|---|---|
-//! | a script that does nothing | `apt-get`, `systemctl` | the machine of the tests stays as it is |
-//! | `docker image inspect` | `docker pull` | no registry can be reached: what is pulled has to be there by that name |
-//! | `setpriv` | `sudo` | the user of the package is not on this machine: another one who is not root |
+//! | a script that does nothing | `apt-get`, `systemctl` | the tests must not change the machine |
+//! | `docker image inspect` | `docker pull` | no registry is reachable: the images must exist under the names that are pulled |
+//! | `setpriv` | `sudo` | the package's user does not exist on this machine; the commands run as another user than root |
 
 use std::os::unix::fs::symlink;
 use std::process::{Command, Stdio};
