@@ -42,8 +42,7 @@ async fn an_editor_shows_no_folder_outside_of_the_project() {
     }
 }
 
-/// Like the Dockerfiles of real competitions: a default port that their server replaces, and an entry point that is run
-/// by a shell.
+/// Like the Dockerfiles of real competitions: a default port that their server replaces, and a shell entry point.
 const COMPETITION: [(&str, &str); 4] = [
     ("Dockerfile", "FROM {NAME}\nRUN mkdir -p /usr/local/webots-project\nCOPY . /usr/local/webots-project\n"),
     (

@@ -38,8 +38,7 @@ impl Stage {
         stage
     }
 
-    /// A stage whose `elsewhere` is not hidden by sandboxes. `None`, with a reason printed, if there can be no such
-    /// folder.
+    /// A stage with an `elsewhere` that sandboxes don't hide. `None`, with a reason printed, if there can be none.
     fn apart() -> Option<Self> {
         if apart().is_none() {
             let hidden = "the home and folders for temporary files, which a sandbox hides";

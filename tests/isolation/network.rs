@@ -1,5 +1,4 @@
-//! What a network of its own keeps a world's program from, and what it still allows. Each deed is also tried without
-//! it.
+//! What a network of its own keeps a world's program from, and what it allows. Each deed is also tried without it.
 //!
 //! pasta creates none for root: as root, a test runs the server as another user.
 
@@ -19,8 +18,7 @@ use crate::support::{
     Builder, Client, DEMO, Server, Webots, arm, display, instances_below, is_told, programs, skip, until,
 };
 
-/// The command that runs a server as an ordinary user who can have networks; `None`, with a reason printed, if there is
-/// none.
+/// The command that runs a server as an ordinary user with own networks; `None`, with a reason printed, if none can.
 fn ordinary() -> Option<&'static str> {
     needs!("bwrap", None);
     needs!("pasta", None);

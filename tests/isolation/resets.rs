@@ -56,8 +56,7 @@ async fn a_reset_replaces_a_link_and_follows_none() {
     }
 }
 
-/// Keeps swapping the folder of a controller and a symlink to a folder outside the project. Removes the file that is
-/// reset.
+/// Keeps swapping a controller's folder and a symlink out of the project, and removes the file to reset.
 const EXCHANGE: &str = "import ctypes, os, sys\n\
     os.symlink(sys.argv[1], 'controllers/x')\n\
     libc, folder = ctypes.CDLL(None), os.open('controllers/c', os.O_RDONLY)\n\

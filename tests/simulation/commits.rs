@@ -31,7 +31,7 @@ async fn any_commit_of_a_branch_or_tag_runs() {
         assert_eq!(objects.contains(" blob "), can_filter == "false", "{objects}");
         let fetches = || wrapper.calls().iter().filter(|call| call.contains(" fetch ")).count();
         assert_eq!(fetches(), 4, "three commits, and the history once: {:#?}", wrapper.calls());
-        // Known commits cause no further requests. The `gc` after a fetch runs in the background.
+        // Known commits are not fetched again. The `gc` after a fetch runs in the background.
         let calls = || wrapper.calls().iter().filter(|call| !call.contains(" gc ")).count();
         let before = calls();
         assert!(run(&commits[0]).await.contains("opened [first]"));

@@ -74,8 +74,7 @@ async fn one_address_leaves_places_and_a_part_of_the_line_to_others() {
     let words =
         "loading: Error: Clients of your address have 3 places of this simulation server, and 3 more are waiting";
     assert!(told.starts_with(words), "{told}");
-    // Another address gets the fourth slot at once, although three clients wait, and also the fourth place in the
-    // queue.
+    // Another address gets the fourth slot at once, although three clients wait, and the fourth place in the queue.
     let mut lucky = Client::start_from(&server, other, &arm()).await;
     assert_eq!(lucky.until("webots:").await, format!("webots:ws://localhost:{}", server.port + 4));
     let mut late = Client::start_from(&server, third, &arm()).await;

@@ -1,5 +1,4 @@
-//! Streams through the server (`"streaming": "relay"`): the client receives all that Webots sends, and no other client
-//! does.
+//! Streams through the server (`"streaming": "relay"`): only their client receives what Webots sends, and all of it.
 
 use std::time::Duration;
 
@@ -298,14 +297,13 @@ async fn no_trick_leads_anywhere_else() {
         assert!(answer.starts_with(&format!("HTTP/1.1 {status} ")), "{shown}: {answer}");
         assert!(!shown.contains("/client") || answer.ends_with("Error: a request for this has no body."), "{answer}");
     }
-    // None of these requests has reached Webots, or the address that they named.
+    // No request has reached Webots or the address that it named.
     let reached = actix_rt::time::timeout(Duration::from_millis(200), async {
         tokio::select! { one = played.listener.accept() => one, one = other.accept() => one }
     });
     assert!(reached.await.is_err());
 
-    // A request in absolute form, as clients of a proxy send it, goes to Webots; a second request behind it gets no
-    // answer.
+    // A request in absolute form, as for a proxy, goes to Webots; a second request behind it gets no answer.
     let absolute =
         format!("GET http://{elsewhere}{path}/a.png?x=1 HTTP/1.1\r\n{headers}X-Secret: y\r\nAuthorization: z\r\n\r\n");
     let second = format!("GET {path}/second.png HTTP/1.1\r\n{headers}\r\n");

@@ -78,8 +78,7 @@ async fn only_the_password_stops_a_simulation() {
     client.until(".").await;
 }
 
-/// Sends these bytes on one connection. Returns the statuses of the first `count` answers, and of any that came with
-/// them.
+/// Sends these bytes on one connection, waits for `count` answers, and returns their statuses.
 async fn statuses(server: &Server, requests: &[String], count: usize) -> Vec<u16> {
     let mut socket = TcpStream::connect(server.address()).await.unwrap();
     let mut answers = Vec::new();

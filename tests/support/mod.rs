@@ -94,8 +94,7 @@ pub fn programs(names: &[&str]) -> tempfile::TempDir {
     folder
 }
 
-/// Reports that a test or a part of it is skipped, and why. Not with `eprintln!`: its output is shown only if the test
-/// fails.
+/// Reports that a test or a part of it is skipped, and why. `eprintln!` would be shown only if the test fails.
 pub fn skip(why: &str) {
     let test = std::thread::current().name().unwrap_or_default().to_owned();
     std::io::stderr().write_all(format!("SKIPPED, for {why}: {test}\n").as_bytes()).unwrap();

@@ -1,5 +1,4 @@
-//! A real DNS server, dnsmasq, on an address of its own. It knows only the names that a test sets, and forwards no
-//! query.
+//! A real DNS server, dnsmasq, on its own address. It knows only names that a test sets, and forwards no query.
 
 use std::net::{IpAddr, Ipv4Addr, TcpStream, UdpSocket};
 use std::process::{Child, Command, Stdio};
@@ -84,8 +83,7 @@ impl NameServer {
         }
     }
 
-    /// A shell script for [`Builder::before`](super::program::Builder::before) that makes a server use this name
-    /// server.
+    /// A script for [`Builder::before`](super::program::Builder::before) that makes a server use this name server.
     pub fn asked(&self) -> String {
         asking(self.address, self.folder.path()).unwrap()
     }

@@ -21,8 +21,7 @@ impl Network {
         Some(Self(()))
     }
 
-    /// Loses this share of the packets from and to these ports (`PORT` or `FIRST:LAST`) until the returned value is
-    /// dropped.
+    /// Loses this share of packets from and to these ports (`PORT` or `FIRST:LAST`) until the result is dropped.
     pub fn lose(self, share: f64, ports: &[String]) -> Lost {
         for ports in ports {
             for side in ["--sport", "--dport"] {

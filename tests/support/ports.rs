@@ -1,5 +1,4 @@
-//! Blocks of free ports, and closed ports. Simulation servers need consecutive ports, and check on all addresses that
-//! each is free.
+//! Blocks of free ports, and closed ports. Simulation servers need consecutive ports that are free on all addresses.
 
 use std::fs::File;
 use std::net::{Ipv4Addr, TcpListener};

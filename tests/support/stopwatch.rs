@@ -57,7 +57,7 @@ impl Lap<'_> {
         self.begin.elapsed()
     }
 
-    /// The time since the start, without [`Lap::held_up`].
+    /// The time since the start, without the waits for a processor.
     pub fn elapsed(&self) -> Duration {
         self.wall().saturating_sub(self.held_up())
     }
