@@ -49,7 +49,7 @@ fn start() -> Option<Daemon> {
     remove_old(&below);
     let folder = below.join(std::process::id().to_string());
     std::fs::create_dir_all(&folder).unwrap();
-    // Unless another daemon of the machine uses it.
+    // A daemon that was killed leaves it.
     Command::new("ip").args(["link", "del", INTERFACE]).stderr(Stdio::null()).status().unwrap();
     let daemon = Daemon { folder };
     daemon.launch();
