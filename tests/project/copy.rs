@@ -16,7 +16,7 @@ pub fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// A copy of the project. On drop, processes that run from it are killed, and listed if the test fails.
+/// A copy of the project. On drop its servers are stopped, and their logs are printed if the test fails.
 pub struct Project {
     temporary: tempfile::TempDir,
     /// The port of the session server.

@@ -6,8 +6,8 @@ use regex_lite::Regex;
 
 use super::copy::{root, walk};
 
-/// The layers of each part of the library, from bottom to top: files and folders. Each may import from itself and from layers
-/// before it; those of `session` and `simulation` also from all of `shared`, but never from each other.
+/// The layers of each part of the library, from bottom to top: files and folders. Each may import from itself and from
+/// layers before it; those of `session` and `simulation` also from all of `shared`, but never from each other.
 const ROOMS: [(&str, &str); 3] = [
     ("shared", "text config domain run http"),
     ("session", "placement config mail fleet state web app"),

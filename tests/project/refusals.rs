@@ -8,7 +8,7 @@ use nix::unistd::Pid;
 use super::copy::{Outcome, Project, nothing_is_left};
 use crate::support::{http, until};
 
-/// Runs `server.sh`, which must fail with this exit code; returns what it prints.
+/// Runs `server.sh`, which must fail with this exit code; returns its error output.
 async fn refused(project: &Project, arguments: &[&str], code: i32) -> String {
     let Outcome { code: found, output, errors } = project.server_sh(arguments).await;
     assert_eq!(found, Some(code), "{arguments:?}: {output}{errors}");
