@@ -1,4 +1,4 @@
-//! Mutations of examples: parts are removed or repeated; random bytes or strings that have broken programs are inserted.
+//! Mutations of examples: parts are removed or repeated; random bytes or strings known to break programs are inserted.
 
 use proptest::prelude::*;
 use proptest::sample::{Index, select};
