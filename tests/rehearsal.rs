@@ -222,7 +222,7 @@ async fn interrupt(by: Signal) {
     command.args(["--clients", "2", "--over", "10m", "--stay", "10m", "--json"]).arg(&file);
     let child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     until("the first client connects to Webots", async || !fleet.asked("/webots").is_empty()).await;
-    // Meanwhile the simulation begins to run; the load is polled once a second.
+    // Waits for some polls of the load, one a second, so that the simulation runs.
     let before = fleet.asked("/load").len();
     until("time passes", async || fleet.asked("/load").len() > before + 2).await;
     signal(&child, by);
