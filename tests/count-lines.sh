@@ -1,17 +1,17 @@
 #!/bin/sh
-# Counts the lines of code in `src` and in the tests. Comments, blank lines, the demo simulator and the rehearsal don't
-# count for `src`; its unit tests (from `#[cfg(test)]` to the end of a file) count as tests.
+# Counts the lines of code in `src` and in the tests, without comments and blank lines. The demo simulator and the
+# rehearsal don't count for `src`; its unit tests (from `#[cfg(test)]` to the end of a file) count as tests.
 #
 # Usage: tests/count-lines.sh [FOLDER...]    only these folders of `src`, each with its own line
 set -eu
 cd "$(dirname "$0")/.."
 
-# Prints the lines of code that standard input has.
+# Counts the lines of code in standard input.
 code() {
     grep -cvE '^[[:space:]]*(//.*)?$' || true
 }
 
-# Prints what the sources under the arguments have before (`code`) or from (`tests`) their unit tests on.
+# Prints the sources below these folders: the lines before their unit tests (`code`), or from there on (`tests`).
 part() {
     what=$1; shift
     find "$@" -name '*.rs' -not -path '*/demo_simulator/*' -not -path '*/rehearse/*' -exec awk -v what="$what" '

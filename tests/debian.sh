@@ -1,7 +1,7 @@
-# Makes clean Debians by mmdebstrap. To be sourced.
+# Makes clean Debian systems with mmdebstrap. To be sourced.
 # shellcheck shell=bash
 
-# The first mirror that apt of this machine has, or FLEET_MIRROR; nothing if there is none.
+# FLEET_MIRROR, or else the first mirror in this machine's apt sources; empty if there is none.
 debian_mirror() {
     local mirror=${FLEET_MIRROR-}
     [[ -n $mirror ]] || mirror=$(sed -nE 's/^URIs: *([^ ]+).*/\1/p; s/^deb (\[[^]]*\] )?([^ ]+).*/\2/p' \
@@ -9,7 +9,7 @@ debian_mirror() {
     printf '%s\n' "${mirror%%$'\n'*}"
 }
 
-# Makes a distribution with these packages, a folder or an archive (NAME.tar).
+# Makes a system with these packages, as a folder or an archive (NAME.tar).
 make_debian() { # DISTRIBUTION PACKAGES TARGET OPTION FOR mmdebstrap...
     local mirror components=main
     mirror=$(debian_mirror)

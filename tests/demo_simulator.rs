@@ -1,5 +1,5 @@
-//! The built demo simulator, as viewers and a simulation server meet it. Other tests use it in place of Webots, and show the
-//! rest of what it does.
+//! Black-box tests of the demo simulator, with viewers and signals. The rest is covered by other tests, which use it in
+//! place of Webots.
 
 use std::fs::File;
 use std::net::Ipv4Addr;
@@ -11,7 +11,7 @@ use nix::unistd::Pid;
 
 use crate::support::{Client, until};
 
-/// The port that it is asked to use, below those that systems deal out.
+/// The simulator's port, below the ephemeral ports.
 const PORT: u16 = 21_234;
 const WORLD: &str = "#VRML_SIM R2025a utf8\nWorldInfo { }\nViewpoint { }\n";
 /// A model with one robot that moves and one box that does not.
@@ -24,16 +24,16 @@ const MODEL: &str = r#"<?xml version="1.0" encoding="UTF-8"?>
   </Scene>
 </X3D>
 "#;
-/// How that robot moves; steps are 10 ms long.
+/// The motion of that robot; steps are 10 ms long.
 const MOTION: &str = r#"{
     "basicTimeStep": 10,
     "FPS": 50,
     "robots": {"mover": {"id": 6, "start": [1, 2, 0], "heading": 0, "radius": 0.4, "speed": 0.25}}
 }"#;
-/// Where the robot is in the beginning.
+/// The robot's initial position.
 const START: &str = r#"application/json:{"time":0,"updates":[{"id":6,"translation":"1 2 0","rotation":"0 0 1 0"}]}"#;
 
-/// A simulator with a project of two worlds. It is killed with the test.
+/// A simulator with a project of two worlds, killed on drop.
 struct Simulator {
     child: Child,
     address: Ipv4Addr,
@@ -41,7 +41,7 @@ struct Simulator {
 }
 
 impl Simulator {
-    /// A paused one.
+    /// Starts a simulator, which is paused.
     fn start() -> Self {
         let address = own_address();
         let project = tempfile::tempdir().unwrap();
@@ -60,14 +60,14 @@ impl Simulator {
         Self { child, address, project }
     }
 
-    /// A connection, once it listens.
+    /// Connects once the simulator listens.
     async fn connect(&self) -> Client {
         let (output, words) = (self.project.path().join("output"), format!("server listening on port {PORT}."));
         until(&words, async || std::fs::read_to_string(&output).unwrap().contains(&words)).await;
         Client::connect(&format!("ws://{}:{PORT}/", self.address)).await
     }
 
-    /// A viewer that only looks on and has seen the scene.
+    /// A broadcast viewer that has received the scene.
     async fn spectator(&self) -> Client {
         let mut viewer = self.connect().await;
         viewer.send("w3d;broadcast").await;
@@ -90,7 +90,7 @@ impl Drop for Simulator {
     }
 }
 
-/// A loopback address that no other simulator of any test run here has.
+/// A loopback address that no other simulator has, in any test run on this machine.
 fn own_address() -> Ipv4Addr {
     static NEXT: AtomicU8 = AtomicU8::new(1);
     let [.., high, low] = std::process::id().to_be_bytes();
@@ -161,7 +161,7 @@ async fn later_viewers_receive_the_mode_of_the_simulation() {
         late.until(mode).await;
         let time = viewer.time().await;
         assert!(viewer.time().await > time, "{:?}", viewer.heard);
-        // Who does not only look on pauses it, as who asks for that does.
+        // A viewer that does not ask for broadcast pauses the simulation, as does the message `pause`.
         if mode == "fast" {
             let mut player = simulator.connect().await;
             player.send("w3d").await;
@@ -180,7 +180,7 @@ async fn a_signal_ends_it_with_0_after_the_closing_handshake() {
         let mut viewer = simulator.spectator().await;
         let _silent = simulator.spectator().await;
         kill(Pid::from_raw(simulator.child.id().cast_signed()), signal).unwrap();
-        // With any other code Webots' page shows a dialog.
+        // On any other code Webots' page shows a dialog.
         assert_eq!(viewer.closed().await, Some(1000));
         simulator.ends_with(0).await;
     }

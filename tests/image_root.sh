@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# Makes the archive of a Debian with what images need of the system: Xvfb, xauth, Python and make for Webots', what the Dockerfiles of deploy/docker
-# install, and nginx. Once, it is kept.
+# Makes an archive of a Debian with the system packages of the images: Xvfb, xauth, Python and make for Webots' image, those that the Dockerfiles of
+# deploy/docker install, and nginx. It is made once and kept.
 # image_root.sh ARCHIVE
-# It is of the distribution of this machine, whose programs run in it. Ends with 77 where it can't be made.
+# It has this machine's distribution, so that programs built here run in it. Ends with 77 if it can't be made.
 set -Eeuo pipefail
 archive=$1
 cd "$(dirname "$(readlink -f "$0")")/.."
@@ -20,7 +20,7 @@ flock "$lock"
 command -v mmdebstrap >/dev/null && [[ -n $(debian_mirror) ]] || exit 77
 echo "makes the Debian of the images, once: $distribution"
 rm -f "$archive.complete"
-# Nobody reads a manual there, or draws with OpenGL, whose compiler is half of all.
+# The images need no manuals and no OpenGL, whose compiler is half of the size.
 left_out=()
 for folder in share/doc share/man share/locale 'lib/*/dri' 'lib/*/libLLVM'; do left_out+=("--dpkgopt=path-exclude=/usr/$folder*"); done
 make_debian "$distribution" "$packages" "$archive" --skip=output/dev "${left_out[@]}" >"$archive.log" 2>&1 || {

@@ -1,13 +1,13 @@
 #!/usr/bin/env bash
 # Installs commands that are missing, through apt: tests/install.sh COMMAND=PACKAGE[,PACKAGE...]...
-# Says what it installs, or, where it can't, what somebody has to.
+# Prints what it installs, or the command to run if it can't.
 set -eu
 
 missing=() packages=()
 for pair in "$@"; do
     command=${pair%%=*}
     case $command in
-        # The command alone can't make an environment where Debian keeps that part in a package of its own.
+        # python3 may lack venv, which is a separate package on Debian.
         python3-venv) python3 -c 'import ensurepip, venv' 2>/dev/null && continue ;;
         *) command -v "$command" >/dev/null && continue ;;
     esac

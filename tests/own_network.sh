@@ -1,12 +1,12 @@
 #!/bin/sh
-# Runs a command in a network of its own, in which nothing changes when interfaces of the machine do, those of containers in other
-# tests for example: the loopback, and a way out that leads nowhere, which pasta wants to see. Without root it has that of the machine.
+# Runs a command in its own network, unaffected by changes of the machine's interfaces, such as those of containers in other tests.
+# It has the loopback and a default route to nowhere, which pasta needs. Without root, the command runs in the machine's network.
 set -eu
 if [ "$1" = --inside ]; then
     shift
     ip link set lo up
     ip link add eth0 type veth peer name eth1
-    # Else the kernel adds addresses of IPv6 a second later.
+    # Otherwise the kernel adds IPv6 addresses a second later.
     ip link set eth0 addrgenmode none
     ip link set eth1 addrgenmode none
     ip link set eth1 up

@@ -1,6 +1,6 @@
 #!/bin/sh
-# Runs a command with a /tmp in memory of its own: files that come and go by the thousand take a third of the processor time that they take on
-# a disk, and mounts of others don't appear in it. Without root, with little memory, or in a clone that is below /tmp, it has that of the machine.
+# Runs a command with its own /tmp in memory: thousands of short-lived files take a third of the processor time that they take on a disk,
+# and mounts of others don't appear in it. Without root, with little memory, or in a clone below /tmp, the command uses the machine's /tmp.
 set -eu
 if [ "$1" = --inside ]; then
     shift

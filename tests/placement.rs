@@ -1,4 +1,4 @@
-//! A small part of what `cargo bench --bench placement` measures, so that a change that spoils the policy fails the tests.
+//! A small part of `cargo bench --bench placement`, so that a change that worsens the policy fails the tests.
 
 #[path = "../benches/placement/compare.rs"]
 mod compare;
@@ -24,7 +24,7 @@ fn no_rival_is_better_in_a_small_fleet() {
     for scenario in level.into_iter().chain(compare::foreign_scenarios(&[5])) {
         let row = compare::compare(&scenario);
         for (policy, name) in compare::POLICIES.iter().enumerate().take(compare::FIRST_RIVAL) {
-            // Servers that report only a load are taken to be alike, and to do nothing else.
+            // The policy that knows only loads assumes equal servers and no other programs on them.
             if policy == 0 || scenario.foreign == scenario::Foreign::None {
                 assert_eq!(compare::better_rivals(&row, policy), Vec::<String>::new(), "{name}: {scenario:?}");
             }

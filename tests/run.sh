@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Runs all tests: tests/run.sh
-# Or those whose name has these words, in seconds once they are built: tests/run.sh ARGUMENT FOR cargo test...
-# Installs through apt what they need and the machine lacks, and says so.
+# Or selected tests, within seconds once they are built: tests/run.sh ARGUMENT FOR cargo test...
+# Installs missing packages through apt and prints them.
 set -eu
 cd "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/.."
 
@@ -10,26 +10,26 @@ command -v cargo >/dev/null || {
     echo 'error: cargo is missing; https://rustup.rs tells how to install it' >&2
     exit 1
 }
-# Debian has web servers where only root looks for programs.
+# On Debian, web servers are in /usr/sbin, which only root has in its PATH.
 PATH=$PATH:/usr/sbin
-# The C compiler links the programs; python3 and openssl make counterparts for mail and TLS; xvfb gives a display,
-# bubblewrap sandboxes, pasta networks for them; the fleet is tested behind both web servers, by a real browser too, and its package and the guide
-# to it in a Debian that mmdebstrap makes; nft loads the packet filter; promtool reads the alerts, dnsmasq leads to simulation servers, and kubectl
-# puts what is for Kubernetes together.
+# The C compiler links the programs; python3 and openssl make counterparts for mail and TLS; xvfb provides a display,
+# bubblewrap sandboxes, pasta their networks; the fleet is tested behind both web servers, also with a real browser; its package and the guide
+# are tested in a Debian made by mmdebstrap; nft loads the packet filter; promtool checks the alerts, dnsmasq resolves names of simulation servers,
+# and kubectl renders the files for Kubernetes.
 tests/install.sh cc=gcc,libc6-dev git=git git-lfs=git-lfs flock=util-linux openssl=openssl python3=python3 python3-venv=python3-venv \
     Xvfb=xvfb bwrap=bubblewrap pasta=passt apache2=apache2-bin nginx=nginx setpriv=util-linux chromium=chromium \
     mmdebstrap=mmdebstrap dpkg-shlibdeps=dpkg-dev desktop-file-validate=desktop-file-utils xhost=x11-xserver-utils \
     systemd-analyze=systemd ip=iproute2 nft=nftables promtool=prometheus dnsmasq=dnsmasq-base kubectl=kubernetes-client
-# The same browser without windows takes half of the processor time, where there is a package of it.
+# The headless build of the browser takes half of the processor time, if the distribution has it.
 ! apt-cache show chromium-headless-shell >/dev/null 2>&1 ||
     tests/install.sh chromium-headless-shell=chromium-headless-shell || echo 'the browser tests take longer' >&2
-# udev makes it so; a machine without udev may have it for root alone, or not at all.
+# udev does this; without udev the device may be missing or accessible to root only.
 if ((EUID == 0)) && [[ ! -c /dev/net/tun || $(stat --format=%a /dev/net/tun) != 666 ]]; then
     echo 'lets everybody open /dev/net/tun, as udev does'
     mkdir -p /dev/net
     { [[ -c /dev/net/tun ]] || mknod /dev/net/tun c 10 200; } && chmod 666 /dev/net/tun || echo 'that failed' >&2
 fi
-# dockerd would begin to run on a machine that has not asked for it.
+# Only with CI: the package would start dockerd on a developer's machine.
 [[ -z ${CI-} ]] || tests/install.sh dockerd=docker.io iptables=iptables docker-compose=docker-compose
 readonly CARGO=(cargo test --locked --no-fail-fast)
 if (($# > 0)); then
@@ -50,7 +50,7 @@ end_all() {
 trap end_all EXIT
 trap 'exit 130' INT TERM HUP
 
-# Starts a command beside whatever else runs, in a process group of its own.
+# Starts a command in the background, in its own process group.
 start() { # COMMAND...
     set -m
     FLEET_BIN=$PWD/target/debug FLEET_BUSY=$logs/busy "$@" >"$logs/${*//\//-}" 2>&1 </dev/null &
@@ -58,7 +58,7 @@ start() { # COMMAND...
     jobs[$*]=$!
 }
 
-# Waits for a command, and shows what it said. One that can't be run on this machine has said why, and ends with 77.
+# Waits for a command and prints its output. A command that can't run on this machine prints why and ends with 77.
 finish() { # COMMAND...
     local result=0
     wait "${jobs[$*]}" || result=$?
@@ -76,19 +76,19 @@ elapsed() {
     echo "$(((SECONDS - start) / 60)) min $(((SECONDS - start) % 60)) s"
 }
 
-# Everything is built once. What makes the next build faster only costs time here.
+# Everything is built once, so incremental compilation would only cost time.
 export CARGO_INCREMENTAL=0
 start tests/deploy/prepare.sh
 start tests/python.sh
 ! command -v dockerd >/dev/null || start tests/image_root.sh target/tmp/images.tar
 cargo test --locked --no-run
-# Where these have failed, those who need them say why.
+# If these failed, the tests that need them report why.
 wait "${jobs[@]}" || true
 jobs=()
 echo "built: $(elapsed)"
 
-# All of these wait much of the time, and run side by side. What needs a machine of its own, or a daemon with images, is in
-# memory: where there is little of it, these run one after another.
+# All of these mostly wait, so they run in parallel. Machines and Docker images are kept in memory; with little memory, the
+# commands run one after another.
 memory=$(awk '$1 == "MemAvailable:" { print int($2 / 1024) }' /proc/meminfo)
 beside=()
 run_beside() { # COMMAND...
@@ -103,19 +103,19 @@ run_beside tests/browser/run
 run_beside "${CARGO[@]}" --test faults -- --skip on_a_quiet_machine
 run_beside "${CARGO[@]}" --test simulation_limits
 echo "run side by side, and tell when each has ended: ${beside[*]@Q}"
-# The images of this one don't wait for a machine of its own.
+# While this file exists, the Swarm test only makes its images.
 touch "$logs/busy"
 ((memory <= 10000)) || start tests/swarm.sh
 for command in "${beside[@]}"; do
     # shellcheck disable=SC2086 # None of its words has a space.
     [[ -z ${jobs[$command]-} ]] || finish $command
 done
-# These depend on how fast the machine is: nothing runs beside them.
+# These depend on the speed of the machine: nothing runs beside them.
 start "${CARGO[@]}" --test integration --test faults on_a_quiet_machine
 finish "${CARGO[@]}" --test integration --test faults on_a_quiet_machine
 rm "$logs/busy"
 [[ -n ${jobs[tests/swarm.sh]-} ]] || start tests/swarm.sh
-# The guide is mostly apt that unpacks, in the time in which the Swarm waits.
+# The guide mostly unpacks packages with apt, while the Swarm test waits.
 guide='nice -n 19 tests/deploy/guide.sh'
 ((memory > 10000)) || finish tests/swarm.sh
 # shellcheck disable=SC2086

@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# A fleet on a real Docker Swarm on this machine, by deploy/swarm/stack.yml and the images of deploy/docker: deploy, grow, shrink,
-# update, edit, kill; what a visitor meets in Chromium. Says what it measures.
+# A fleet on a real Docker Swarm on this machine, with deploy/swarm/stack.yml and the images of deploy/docker: deploy, grow, shrink,
+# update, edit, kill; visits with Chromium. Prints what it measures.
 #
-# dockerd runs in namespaces of its own, from which nothing can be reached. So the images that the Dockerfile begins with are
-# the Debian that tests/image_root.sh makes, with an apt-get that has nothing to do and a cargo that copies what is built already: FLEET_BIN, an
-# absolute path, names its folder. As long as there is a file FLEET_BUSY, it makes the images, and nothing that is measured.
+# dockerd runs in its own namespaces, without a network to the outside. So the base images of the Dockerfile are the Debian of
+# tests/image_root.sh, with an apt-get that does nothing and a cargo that copies the programs from FLEET_BIN, an absolute path.
+# While the file FLEET_BUSY exists, the script only makes the images and measures nothing.
 set -Eeuo pipefail
 cd "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/.."
 PATH=$PATH:/usr/sbin:/sbin
@@ -14,8 +14,7 @@ fail() {
     exit 1
 }
 
-# Where this can't be tested it has not passed: it ends with 77, as skipped tests do; where everything has to be tested
-# (CI is set) it has failed.
+# Ends with 77, as skipped tests do, if this machine can't run the test; if everything must be tested (CI is set), it fails.
 skip() { # WHY
     [[ -z ${CI-} ]] || fail "this has to be tested where CI is set, and can't: $*"
     printf 'skipped: swarm.sh: %s\n' "$*" >&2
@@ -46,7 +45,7 @@ finish() {
         timeout 10 docker service ps --no-trunc fleet_door fleet_session fleet_simulation >&2 || true
         for service in door session simulation; do timeout 10 docker service logs --tail 20 "fleet_$service" >&2 || true; done
     fi
-    # With it the first process of its namespace ends, and with that all the others.
+    # This ends the first process of its namespace, and so all others in it.
     [[ -z $keeper ]] || kill -KILL "$keeper" 2>/dev/null || true
     wait 2>/dev/null || true
     local patience=50
@@ -58,14 +57,14 @@ trap 'printf "error: line %s: %s\n" "$LINENO" "$BASH_COMMAND" >&2' ERR
 trap finish EXIT
 trap 'exit 130' INT TERM HUP
 
-# Milliseconds since the machine was started.
+# Milliseconds since boot.
 now() {
     local uptime
     read -r uptime _ </proc/uptime
     echo "${uptime/./}0"
 }
 
-# Waits until a command succeeds; fails after so many seconds.
+# Waits until a command succeeds; fails after this many seconds.
 within() { # SECONDS COMMAND...
     local begin limit=$1
     begin=$(now)
@@ -84,7 +83,7 @@ get() { # PATH
     in_machine curl --silent --show-error --max-time 5 "$DOOR$1"
 }
 
-# Where simulation servers are, of those in these states.
+# The addresses of the simulation servers in these states.
 servers() { # STATE...
     get /status | python3 -c 'import json, sys
 print(*(one["address"] for one in json.load(sys.stdin)["servers"] if one["state"] in sys.argv[1:]))' "$@"
@@ -95,12 +94,12 @@ are() { # NUMBER STATE...
     found=$(servers "${@:2}") && [[ $(wc -w <<<"$found") == "$1" ]]
 }
 
-# Asks often enough to have asked both session servers: the door leads to either, and one may know later than the other.
+# Repeats a check often enough to reach both session servers: the door forwards to either, and one may lag behind.
 everywhere() { # COMMAND...
     for _ in {1..12}; do "$@" || return; done
 }
 
-# Whether so many simulations run, on all servers together.
+# Whether this many simulations run on all servers together.
 run_simulations() { # NUMBER
     local running
     running=$(get /status | python3 -c 'import json, sys
@@ -116,20 +115,20 @@ run_containers() { # NUMBER SERVICE
     [[ $(containers "$2" | wc -l) == "$1" ]]
 }
 
-# Whether Swarm uses so many: it does once they were healthy for the first time.
+# Whether this many are healthy; Swarm sends requests to a container once it is.
 are_healthy() { # NUMBER SERVICE
     [[ $(docker ps --quiet --filter "label=com.docker.swarm.service.name=fleet_$2" --filter health=healthy | wc -l) == "$1" ]]
 }
 
-# A class of clients that come and go; each has to be there to the end, and its simulation to move (stays of 2 s are too short to
-# measure that: their share of real time is 0).
+# A class of clients that come and go; each must stay to the end with a moving simulation (stays of 2 s are too short to measure
+# that: their REAL_TIME is 0).
 class() { # CLIENTS OVER STAY REAL_TIME ARGUMENT...
     in_machine "$BIN/rehearse" --yes --world "$WORLD" --clients "$1" --over "$2" --stay "$3" --real-time "$4" --expect "$1" \
         "${@:5}" "$DOOR" >"$WORK/class" 2>&1 || fail "$(cat "$WORK/class")"
 }
 
-# Begins a class that comes at once, and comes back when all of it runs: what disturbs the fleet meets it whole, however slow the
-# machine is. Nothing of another class is there any more. $clients is to be waited for.
+# Starts a class whose clients all come at once, and returns when all their simulations run, so that a disturbance affects the whole
+# class even on a slow machine. Waits first until the simulations of earlier classes have ended. Callers wait for $clients.
 full_class() { # CLIENTS
     within 60 everywhere run_simulations 0
     class "$1" 1s 12s 0.01 &
@@ -137,13 +136,13 @@ full_class() { # CLIENTS
     within 60 everywhere run_simulations "$1"
 }
 
-# Somebody with Chromium; what is said is kept.
+# A visit with Chromium; its output is kept.
 visit() { # URL ARGUMENT...
     in_machine "$PYTHON" tests/browser/through_swarm.py "$@" >"$WORK/visit" 2>"$WORK/visit-errors" ||
         fail "$(cat "$WORK/visit" "$WORK/visit-errors")"
 }
 
-# When a visitor has said this.
+# The time that the visit's output gives for this event.
 said() { # WHAT
     sed --quiet "s/^$1 //p" "$WORK/visit"
 }
@@ -156,12 +155,12 @@ build() { # IMAGE ARGUMENT...
     docker build --quiet --tag "$@" >"$WORK/build" 2>&1 || fail "$(cat "$WORK/build")"
 }
 
-# Runs a command that deploys, and shows its errors where it fails.
+# Runs a command that deploys; prints its errors if it fails.
 deploy() { # COMMAND...
     "$@" >/dev/null 2>"$WORK/deploy" || fail "$(cat "$WORK/deploy")"
 }
 
-# A command of docs/scaling.md as it stands there: the one of this number below a heading, of those that are indented.
+# A command of docs/scaling.md: the one of this number among the indented commands below a heading.
 page() { # HEADING NUMBER
     local found
     found=$(awk -v heading="## $1" -v number="$2" '
@@ -172,7 +171,7 @@ page() { # HEADING NUMBER
     printf '%s\n' "$found"
 }
 
-# Runs a command of the page in a folder.
+# Runs a command of the documentation in a folder.
 follow() { # FOLDER COMMAND
     (cd "$1" && bash -euo pipefail -c "$2") >"$WORK/page" 2>&1 || fail "$2: $(tail -n 20 "$WORK/page")"
 }
@@ -181,7 +180,7 @@ told() {
     printf '%-64s %s\n' "$1" "$2"
 }
 
-# --- A machine with dockerd, which ends with this script.
+# --- A machine with dockerd. It ends with this script.
 
 mkdir -p "$WORK/data"
 # shellcheck disable=SC2016 # It is the inner shell's.
@@ -220,9 +219,9 @@ END
 build fleet-base "$WORK/base"
 for image in debian:bookworm-slim rust:1.95-bullseye cyberbotics/webots:R2025a-ubuntu22.04; do docker tag fleet-base "$image"; done
 follow . "$(page 'Docker Swarm' 2)"
-# The image of Webots, for a fleet of one's own.
+# The image with Webots, for a fleet that runs it.
 follow . "$(page 'Docker Swarm' 6)"
-# nginx as its unprivileged image has it.
+# nginx as in its unprivileged image.
 mkdir "$WORK/nginx"
 cat >"$WORK/nginx/nginx.conf" <<'END'
 pid /tmp/nginx.pid;
@@ -252,7 +251,7 @@ until [[ ! -e ${FLEET_BUSY-} ]]; do sleep 0.1; done
 mkdir -p "$WORK/project/deploy"
 cp --recursive deploy/swarm "$WORK/project/deploy"
 ln -s project/deploy/swarm "$WORK/swarm"
-# All report the load of this one machine, which is busy with much else: it closes no server, and the clients count for more.
+# All servers report the load of this one busy machine: it must not make them full, and each client counts for more.
 sed -i 's/"port": 1999,/"port": 1999,\n  "loadThreshold": 1000,\n  "clientCost": 30,/' "$WORK/swarm/session.json"
 begin=$(now)
 follow "$WORK/project" "$(page 'Docker Swarm' 3)"
@@ -260,7 +259,7 @@ visit "$VIEWER"
 told 'from docker stack deploy to a scene that moves in Chromium' "$(($(said moves) - begin)) ms"
 within 20 are 2 up
 
-# Four more while clients come and go, so often that each new server can be used at once.
+# Four more servers while clients come and go, often enough to use each new server at once.
 class 20 2s 2s 0 --soak 30s --json "$WORK/visits" &
 clients=$!
 class_began=$(date +%s.%N)
@@ -278,7 +277,7 @@ wait "$clients"
 used=$(docker inspect $(containers simulation) | python3 tests/deploy/first_use.py "$WORK/visits" "$class_began" "${old[@]}") || fail "$used"
 told 'from the start of each new server to its first client (5 s asked)' "$used"
 
-# Four fewer while simulations run: each of these goes on to its end.
+# Four servers fewer while simulations run: each simulation runs to its end.
 full_class 20
 begin=$(now)
 docker service scale --detach fleet_simulation=2 >/dev/null
@@ -308,7 +307,7 @@ within 90 replaced
 within 10 are 2 up
 told 'clients during a rolling update, to the end' '20 of 20'
 
-# What is killed comes back; whoever looked on is told, and needs one click.
+# A killed server comes back; its client is notified and needs one click.
 visit "$VIEWER" --kill fleet_simulation &
 visitor=$!
 within 60 has_said kill
@@ -336,7 +335,7 @@ wait "$clients"
 told 'from docker kill of a session server until the door answers' "$longest ms at most"
 told 'clients while both session servers are killed in turn, to the end' '10 of 10'
 
-# What was edited is deployed again, and nothing else.
+# After an edit only the changed service is deployed again.
 before=$(containers simulation door)
 sed -i 's/"title": "Carousel"/"title": "Merry-go-round"/' "$WORK/swarm/session.json"
 deploy "$WORK/swarm/deploy" fleet
@@ -345,7 +344,7 @@ within 60 edited
 [[ $(containers simulation door) == "$before" ]] || fail 'servers whose configuration is the same were replaced'
 told 'an edited configuration, deployed again' 'is used'
 
-# The door leads to the fleet, and nowhere else.
+# The door forwards only to the fleet.
 inside=$(servers up | cut -d ' ' -f 1)
 session=$(docker inspect --format '{{(index .NetworkSettings.Networks "fleet_fleet").IPAddress}}' "$(containers session | head -n 1)")
 [[ $(get "/${inside/://}/load") =~ ^[0-9.]+$ ]] || fail 'the door does not lead to a simulation server'
@@ -356,7 +355,7 @@ for path in /127.0.0.1/2000/load /10.99.0.1/2000/load /localhost/2000/load /simu
 done
 told 'paths to elsewhere that the door refuses' '10 of 10'
 
-# Another fleet: with https, an image by another name, and simulation servers on nodes with GPUs alone.
+# Another fleet: with https, an image by another name, and simulation servers only on nodes with GPUs.
 docker stack rm fleet >/dev/null
 gone() { [[ -z $(docker ps --quiet) && -z $(docker network ls --quiet --filter name=fleet_fleet) ]]; }
 within 60 gone
@@ -366,7 +365,7 @@ openssl req -x509 -newkey rsa:2048 -nodes -days 1 -subj /CN=localhost -addext su
 mkdir -p "$WORK/tls/.well-known/acme-challenge"
 echo answer >"$WORK/tls/.well-known/acme-challenge/question"
 chown -R 101 "$WORK/tls"
-# They are of the demo here too.
+# The simulation servers use the demo's configuration here too.
 cp "$WORK/swarm/simulation.json" "$WORK/swarm/simulation-gpu.json"
 docker tag webots-fleet/session-server:0.1.0 lab/session-server:1
 export DOOR_PORT=80 FLEET_DOOR=wss://localhost SESSION=lab/session-server:1 SIMULATION=webots-fleet/simulation-demo:0.1.0 DOOR_TLS=$WORK/tls X11=$WORK/x11

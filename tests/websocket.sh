@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # A WebSocket client that needs nothing but bash and coreutils: tests/websocket.sh ws://HOST:PORT/PATH [MESSAGE]
 #
-# Sends MESSAGE, then each line of its input, and prints each text that comes. It ends when the other side closes; at
-# the end of its input it goes on listening (Ctrl-C ends it). Made to try things by hand: no TLS, short messages only.
+# Sends MESSAGE, then each line of its input, and prints each text that it receives. It ends when the server closes; at the
+# end of its input it keeps receiving (Ctrl-C ends it). For tries by hand: no TLS, short messages only.
 set -u
 LC_ALL=C
 
@@ -12,7 +12,7 @@ if ! [[ ${1-} =~ ^ws://([^:/]+):([0-9]+)(/.*)?$ ]] || (($# > 2)); then
 fi
 host=${BASH_REMATCH[1]} port=${BASH_REMATCH[2]} path=${BASH_REMATCH[3]:-/}
 
-# Sends a frame. It is masked, as those of clients must be, with zeros: that changes nothing.
+# Sends a frame, masked with zeros: clients must mask, and zeros change nothing.
 send() { # OPCODE HEX
     local length=$((${#2} / 2)) header escaped='' byte
     if ((length < 126)); then
@@ -26,7 +26,7 @@ send() { # OPCODE HEX
 
 hex() { od -An -v -tx1 | tr -d ' \n'; }
 
-# Reads so many bytes; fails when fewer are left.
+# Reads this many bytes; fails if fewer are left.
 take() { # COUNT
     local bytes
     bytes=$(head -c "$1" <&3 | hex)

@@ -1,4 +1,4 @@
-"""Chromium, driven by Playwright, and what every page must keep to."""
+"""Chromium, driven by Playwright, and the checks of every page."""
 
 import os
 import tempfile
@@ -9,22 +9,22 @@ from playwright.sync_api import sync_playwright
 
 from fleet import SOON
 
-# Debian's Chromium without windows takes half of the processor time.
+# Debian's headless build of Chromium takes half of the processor time.
 SHELL = "/usr/bin/chromium-headless-shell"
 CHROMIUM = os.environ.get("CHROMIUM") or (SHELL if os.path.exists(SHELL) else "/usr/bin/chromium")
-# The browser itself must not call home either; it draws scenes without a graphics card, and pages without what stands in for one,
-# which takes twice as much processor time.
+# The browser itself must not call home either. It draws scenes with software rendering, and pages without, which would take
+# twice as much processor time.
 SWITCHES = [
     "--no-sandbox", "--disable-background-networking", "--disable-component-update", "--disable-sync", "--no-first-run",
     "--disable-features=Translate,OptimizationHints,MediaRouter", "--use-gl=angle", "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader", "--disable-gpu-compositing",
 ]
-# What it says of its own speed then is no complaint about a page.
+# A warning about its own speed is not an error of the page.
 OWN_SPEED = "GL Driver Message (OpenGL, Performance"
 
 
 class Browser:
-    """A Chromium with a profile of its own: use it with `with`."""
+    """A Chromium with its own profile; a context manager."""
 
     def __enter__(self):
         self.profile = tempfile.TemporaryDirectory(prefix="chromium-")
@@ -46,7 +46,7 @@ class Browser:
 
 
 class Page:
-    """A tab that writes down what it asks for and what it complains about."""
+    """A tab that records requested URLs and messages of the console."""
 
     def __init__(self, context):
         self.context = context
@@ -62,7 +62,7 @@ class Page:
             self.complaints.append(f"{message.type}: {message.text}")
 
     def from_address(self, address):
-        """From now on all that it asks for seems to come through a web server, from this address."""
+        """From now on its requests seem to be forwarded by a web server, from this address."""
         self.context.set_extra_http_headers({"X-Forwarded-For": address})
 
     def hosts(self):
@@ -70,8 +70,8 @@ class Page:
         return {part.hostname for part in parts if part.scheme not in ("data", "blob", "about")}
 
     def faults(self):
-        """What axe-core finds that is serious or critical."""
-        # What axe-core itself does wrong is no complaint about the page.
+        """The serious and critical violations that axe-core finds."""
+        # Console messages of axe-core itself are not errors of the page.
         complaints = list(self.complaints)
         violations = Axe().run(self.tab).response["violations"]
         self.complaints[:] = complaints
@@ -79,11 +79,11 @@ class Page:
         return [f"{one['id']}: {node['html'][:200]} {node['failureSummary']}" for one in grave for node in one["nodes"]]
 
     def overflow(self):
-        """By how many pixels the page is wider than the window."""
+        """The number of pixels by which the page is wider than the window."""
         return self.tab.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
 
     def look(self, scheme, width):
-        """Shows it in another scheme, in a window of another width."""
+        """Changes the colour scheme and the width of the window."""
         self.tab.emulate_media(color_scheme=scheme)
         self.tab.set_viewport_size({"width": width, "height": 900})
 

@@ -1,4 +1,4 @@
-"""What all browser tests stand on: one fleet per class, one browser per file; the logs of a test that fails are printed."""
+"""The base of all browser tests: one fleet per class, one browser per file; logs are printed if a test fails."""
 
 import sys
 import unittest
@@ -12,26 +12,26 @@ expect.set_options(timeout=1000 * SOON)
 
 
 def picture(page):
-    """The scene as it is drawn."""
+    """A screenshot of the scene."""
     return page.tab.locator("#view").screenshot()
 
 
 class BrowserTest(unittest.TestCase):
-    """A class of tests with a fleet of its own."""
+    """A class of tests with its own fleet."""
 
     session = None
     simulation = None
     strangers = ()
-    # The only one that pages may ask.
+    # The only host to which pages may send requests.
     host = "127.0.0.1"
-    # The browser itself complains of what it can't reach, in tests that cut it off.
+    # Whether console errors are allowed: offline, the browser reports unreachable URLs.
     may_complain = False
     browser = None
 
     @classmethod
     def setUpClass(cls):
         cls.fleet = cls.enterClassContext(cls.make_fleet())
-        # Each page has a profile of its own.
+        # One browser suffices because each page has its own profile.
         if BrowserTest.browser is None:
             BrowserTest.browser = unittest.enterModuleContext(Browser())
             unittest.addModuleCleanup(setattr, BrowserTest, "browser", None)
@@ -48,7 +48,7 @@ class BrowserTest(unittest.TestCase):
         return result
 
     def open(self, url, **options):
-        """A page in a tab of its own, which keeps to the rules of all pages."""
+        """Opens a page in its own tab; after the test the rules of all pages are checked."""
         page = self.browser.page(**options)
         self.addCleanup(page.close)
         self.addCleanup(self.keeps_to_the_rules, page)
@@ -61,7 +61,7 @@ class BrowserTest(unittest.TestCase):
         self.assertEqual(page.hosts(), {self.host}, "who was asked")
 
     def start_world(self, name="Playground", **options):
-        """The viewer page with a running simulation, and the simulation server that was chosen."""
+        """The viewer page with a simulation that is ready, and its simulation server."""
         page = self.open(self.fleet.session.url("viewer"), **options)
         expect(page.tab.locator("#light")).to_contain_text("Available")
         page.tab.get_by_role("button", name=name).click()
@@ -74,13 +74,13 @@ class BrowserTest(unittest.TestCase):
 
 
 def seconds(page):
-    """Simulated time, as the page shows it."""
+    """The simulated time that the page shows, in seconds."""
     minutes, rest = page.tab.locator("#clock").inner_text().split(":")
     return 60 * int(minutes) + float(rest)
 
 
 class Running(BrowserTest):
-    """Tests of a simulation that runs."""
+    """Tests of running simulations."""
 
     def running(self, **options):
         """A page whose simulation runs in real time."""

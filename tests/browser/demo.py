@@ -1,4 +1,4 @@
-"""The demo as a newcomer has it: `./server.sh start demo`, in a copy of the project with ports of its own."""
+"""The demo as a newcomer starts it: `./server.sh start demo`, in a copy of the project with its own ports."""
 
 import json
 import os
@@ -12,32 +12,32 @@ import tempfile
 
 from fleet import BIN, ROOT, free_ports
 
-# How long server.sh may take for anything.
+# Timeout of every call of server.sh, in seconds.
 LIMIT = 90
-# How many simulation servers there can be, and how many ports each may take.
+# The maximum number of simulation servers, and the ports reserved for each.
 MOST, EACH = 3, 24
 
 
 class Demo:
-    """The running demo: use it with `with`."""
+    """The running demo; a context manager."""
 
     def __init__(self, session=None, simulation=None, user=None):
-        """Starts it, as a user of this number; the other arguments are further keys of its configuration."""
+        """Starts it, as the user with this id; the other arguments are further keys of its configuration."""
         self.become = ["setpriv", f"--reuid={user}", f"--regid={user}", "--clear-groups"] if user else []
         self.temporary = pathlib.Path(tempfile.mkdtemp(prefix="fleet-demo-"))
         self.folder = self.temporary / "webots-fleet"
         self.folder.mkdir()
         shutil.copy(ROOT / "server.sh", self.folder)
         shutil.copytree(ROOT / "config", self.folder / "config")
-        # Where server.sh puts what it builds.
+        # The build folder of server.sh.
         (self.folder / "target").mkdir()
         (self.folder / "target/release").symlink_to(BIN)
-        # Each simulation server needs some ports after its own.
+        # Each simulation server needs the ports that follow its own.
         port = free_ports(1 + MOST * EACH)
         self.ports = range(port, port + 1 + MOST * EACH)
         self.servers = 1
         self.session, self.simulation = f"localhost:{port}", f"localhost:{port + 1}"
-        # Whatever else keeps this machine busy is no concern of the tests.
+        # Other load on this machine must not make the servers full.
         self.configure("session", "demo", {
             "port": port, "simulationServers": [self.simulation], "loadThreshold": 1000, **(session or {})})
         self.configure("simulation", "demo", {"port": port + 1, **(simulation or {})})
@@ -50,7 +50,7 @@ class Demo:
             raise
 
     def configure(self, kind, name, more):
-        """Makes a configuration out of the demo's."""
+        """Makes a configuration from the demo's."""
         demo = json.loads((self.folder / f"config/{kind}/demo.json").read_text())
         (self.folder / f"config/{kind}/{name}.json").write_text(json.dumps({**demo, **more}))
 
@@ -66,7 +66,7 @@ class Demo:
         os.kill(self.process("session"), signal.SIGHUP)
 
     def server_sh(self, *arguments):
-        """Runs server.sh, which has to succeed; gives back what it prints."""
+        """Runs server.sh, which must succeed; returns its output."""
         done = subprocess.run(
             [*self.become, self.folder / "server.sh", *arguments], env={**os.environ, "FLEET_BIN": str(BIN)}, timeout=LIMIT,
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -78,7 +78,7 @@ class Demo:
         return int((self.folder / f"log/{kind}/demo.pid").read_text())
 
     def leftovers(self):
-        """What is left of it: processes, files that say that one runs, folders of simulations, ports."""
+        """What is left of it: processes, PID files, folders of runs, ports."""
         left = [str(path) for path in [*self.folder.glob("log/*/*.pid"), *self.folder.glob("cache/runs/*")]]
         for process in pathlib.Path("/proc").glob("[0-9]*"):
             try:

@@ -1,4 +1,4 @@
-"""One door to a fleet: nginx with the rules of `deploy`, and a stand-in for oauth2-proxy, at which visitors sign in."""
+"""One door to a fleet: nginx with the rules of `deploy`, and a stand-in for oauth2-proxy, where visitors sign in."""
 
 import contextlib
 import http.server
@@ -12,14 +12,14 @@ import trustme
 
 from fleet import BIN, ROOT, Fleet, free_ports, until
 
-# Debian has web servers where only root looks for programs.
+# On Debian, web servers are in /usr/sbin, which only root has in its PATH.
 NGINX = shutil.which("nginx") or "/usr/sbin/nginx"
 COOKIE = "_oauth2_proxy"
 MACHINES = ["127.0.0.2", "127.0.0.3"]
 
 
 class SignIn(http.server.BaseHTTPRequestHandler):
-    """Whose cookie is a name has signed in with it."""
+    """Takes the cookie's value as the name of the signed-in user."""
 
     def do_GET(self):
         names = re.findall(f"{COOKIE}=([a-z]+)", self.headers.get("cookie", ""))
@@ -38,7 +38,7 @@ class SignIn(http.server.BaseHTTPRequestHandler):
 
 
 def adapted(text, **changes):
-    """Rules for this machine: each pattern must be there."""
+    """Adapts rules to this machine; the text must contain each pattern."""
     for what, (pattern, replacement) in changes.items():
         text, count = re.subn(pattern, lambda _: replacement, text, flags=re.DOTALL)
         assert count, f"{what}: {pattern} is not in {text}"
@@ -55,7 +55,7 @@ class OneDoor(Fleet):
         self.exits.callback(sign_in.server_close)
         threading.Thread(target=sign_in.serve_forever, daemon=True).start()
         self.exits.callback(sign_in.shutdown)
-        # Each simulation server needs some ports after its own.
+        # Each simulation server needs the ports that follow its own.
         each = places + 12
         plain, self.https, inside, *_ = ports = range(first := free_ports(3 + 2 * each), first + 3 + 2 * each)
         self.hosts = [(host, ports[3 + number * each]) for number, host in enumerate(MACHINES)]
@@ -83,7 +83,7 @@ class OneDoor(Fleet):
         certificate.private_key_pem.write_to_path(folder / "key.pem")
         users = adapted(
             (ROOT / "deploy/nginx-users.conf").read_text(), sign_in=("127.0.0.1:4180", f"127.0.0.1:{sign_in}"),
-            # The session server asks the others directly, and visitors come from this machine.
+            # The session server connects to simulation servers directly, and visitors come from this machine.
             unsigned=("allow 127.0.0.1;", ""), ports=(r"2000\|3000", "|".join(str(port) for _, port in self.hosts)))
         (folder / "users.conf").write_text(users)
         servers = "|".join(str(port) for _, port in self.hosts)
@@ -97,7 +97,7 @@ class OneDoor(Fleet):
             https=("listen 443 ssl;", f"listen 127.0.0.1:{self.https} ssl;"),
             session=("192.0.2.1:1999", self.session.address),
             machines=(r"192\\\.0\\\.2\\\.\[0-9\]\+", r"127\.0\.0\.[23]"),
-            # What the file's head says of streams that are relayed: the location of Webots' own ports goes.
+            # As the comment at the top of the file says for relayed streams, removes the location of Webots' own ports.
             streams=(r'  # Only for simulation servers with "streaming": "direct".*?\n  }\n', ""),
             servers=(r"\(\?<fleet_port>2000\)", f"(?<fleet_port>{servers})"),
             users=("  proxy_set_header X-Forwarded-User \"\";\n",
@@ -119,7 +119,7 @@ class OneDoor(Fleet):
         return f"https://{self.host}/{path}"
 
     def machine(self, server):
-        """Where the door leads to this server."""
+        """The door's URL of this server."""
         return self.url(f"{server.config['server']}/{server.port}")
 
     def logs(self):

@@ -1,6 +1,6 @@
-"""A fleet for one test run: a session server, two simulation servers, the demo simulator, and git repositories.
+"""A fleet for a class of tests: a session server, two simulation servers, the demo simulator, and git repositories.
 
-Everything is on the loopback, in folders that end with the test; the programs come from the folder FLEET_BIN.
+Everything is on the loopback, in temporary folders; the programs come from the folder FLEET_BIN.
 """
 
 import contextlib
@@ -19,16 +19,16 @@ import urllib.request
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 BIN = pathlib.Path(os.environ.get("FLEET_BIN", ROOT / "target/debug")).resolve()
-# How long anything may take that should happen soon. Far more than it needs: the machine may be busy.
+# Timeout in seconds of what should happen soon; generous because the machine may be busy.
 SOON = 60.0
 WORLD = "https://github.com/demo/worlds/blob/main/worlds/{}.wbt"
 
-# Who is ended by tests/run.sh ends what it has started, as at Ctrl-C.
+# On SIGTERM from tests/run.sh, stops all servers, as on Ctrl-C.
 signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
 def free_ports(count):
-    """The first of so many free ports in a row."""
+    """The first of this many consecutive free ports."""
     start = 22_000 + os.getpid() % 100 * 100
     for first in list(range(start, 32_000, count)) + list(range(22_000, start, count)):
         try:
@@ -42,13 +42,13 @@ def free_ports(count):
 
 
 def until(what, condition):
-    """Waits until a condition holds; gives back what it gave."""
+    """Waits until a condition is true; returns its value."""
     begin = time.monotonic()
     while not (found := condition()):
         waited = time.monotonic() - begin
         if waited > SOON:
             raise AssertionError(f"waited in vain until {what}")
-        # What is waited for long is asked for less often: each question to a page takes milliseconds of three programs.
+        # The interval grows: each check of a page costs three programs milliseconds.
         time.sleep(min(max(waited / 10, 0.02), 0.25))
     return found
 
@@ -77,7 +77,7 @@ class Server:
         self.file.write_text(json.dumps(self.config, indent=2))
 
     def reload(self, **changes):
-        """Makes it take other values of its keys."""
+        """Makes it reload its configuration with these values."""
         self.config.update(changes)
         self.write()
         self.process.send_signal(signal.SIGHUP)
@@ -106,7 +106,7 @@ class Server:
 
     @contextlib.contextmanager
     def hanging(self):
-        """Lets it do nothing, while its connections stay open."""
+        """Suspends it; its connections stay open."""
         self.process.send_signal(signal.SIGSTOP)
         try:
             yield
@@ -114,7 +114,7 @@ class Server:
             self.process.send_signal(signal.SIGCONT)
 
     def kill(self):
-        """Ends it without a warning, as a power failure would."""
+        """Kills it without a warning, like a power failure."""
         self.process.send_signal(signal.SIGKILL)
         self.process.wait()
 
@@ -128,7 +128,7 @@ class Server:
 
 
 class Client:
-    """A web client of a simulation server, at this address, that sends a message and reads nothing."""
+    """A web client of a simulation server, forwarded from this address, that sends a message and reads nothing."""
 
     def __init__(self, server, address, message):
         self.socket = socket.create_connection(("127.0.0.1", server.port))
@@ -139,7 +139,7 @@ class Client:
         if b" 101 " not in self.socket.recv(4096):
             raise AssertionError("it is no WebSocket")
         text = json.dumps(message).encode()
-        # A text with a mask of zeros, as a client has to send it.
+        # A text frame with a mask of zeros: clients must mask.
         self.socket.sendall(bytes([0x81, 0x80 | 126]) + len(text).to_bytes(2, "big") + bytes(4) + text)
 
     def close(self):
@@ -147,7 +147,7 @@ class Client:
 
 
 class Fleet:
-    """The whole: use it with `with`."""
+    """The fleet; a context manager."""
 
     def __init__(self, session=None, simulation=None, strangers=()):
         """Starts it; the arguments are further keys of the configurations, and addresses that don't answer."""
@@ -162,7 +162,7 @@ class Fleet:
             self.session = self.start("session-server", "session", {
                 "port": free_ports(1),
                 "simulationServers": [self.simulation.address, self.other.address, *strangers],
-                # Whatever else keeps this machine busy is no concern of the tests.
+                # Other load on this machine must not make the servers full.
                 "loadRefresh": 0.2, "loadThreshold": 1000,
                 "examples": [
                     {"title": "Playground", "url": WORLD.format("playground")},
@@ -176,13 +176,13 @@ class Fleet:
             raise
 
     def _forge(self):
-        """A folder that has the demonstration's worlds as https://github.com/demo/worlds does."""
+        """A folder that stands in for GitHub, with the demonstration's worlds in demo/worlds."""
         forge = self.folder / "forge"
         work = self.folder / "work"
         shutil.copytree(ROOT / "config/demo", work)
         (work / "worlds/textures").mkdir()
         (work / "worlds/textures/wood.png").write_text("a picture")
-        # Drawing takes most of the time of a machine without a graphics card.
+        # Fewer frames: without a GPU, most of the processor time is spent on drawing.
         for motion in work.glob("worlds/*.motion.json"):
             motion.write_text(json.dumps({**json.loads(motion.read_text()), "FPS": 2}))
         git = ["git", "-c", "user.name=Test", "-c", "user.email=test@localhost", "-c", "commit.gpgSign=false"]
@@ -211,7 +211,7 @@ class Fleet:
         })
 
     def start(self, program, name, config):
-        """Starts a server that ends with the fleet."""
+        """Starts a server, which is stopped with the fleet."""
         server = Server(program, self.folder / name, config)
         self.servers.append(server)
         return server

@@ -1,7 +1,7 @@
-"""Takes the pictures of README.md and docs: pictures.py FOLDER [rehearsal | pages | class]
+"""Takes the screenshots of README.md and docs: pictures.py FOLDER [rehearsal | pages | class]
 
-The rehearsal is what `rehearse` prints. The pages show the demo at work: two simulation servers and one that is down, with
-clients who have come and gone while the charts filled. The class is twelve students, and a list of 200.
+`rehearsal` is the output of `rehearse`. `pages` show the demo at work: two simulation servers and one that is down, with
+clients that came and went while the charts filled. `class` shows twelve students, and a list of 200.
 """
 
 import base64
@@ -19,10 +19,10 @@ from demo import Demo
 from fleet import BIN, SOON, until
 from students import NAMES, start_all
 
-# How many seconds the charts show.
+# The time span of the charts, in seconds.
 HISTORY = 600
 WIDTH = 1200
-# A part of a page is cut off below this height.
+# Pictures of a part of a page are cropped to this height.
 HIGHEST = 720
 PASSWORD = "open sesame"
 PLAYGROUND = "https://github.com/webots-fleet/demo/blob/main/worlds/playground.wbt"
@@ -36,7 +36,7 @@ TERMINAL = """
 
 
 def start(browser, demo, world, width=360, height=300, name=""):
-    """A page of the viewer on which somebody of this name runs a world. Small ones cost little to draw."""
+    """A viewer in which a user of this name runs a world; small, because drawing is expensive."""
     page = browser.page(width=width, height=height)
     page.tab.goto(f"http://{demo.session}/viewer?name={name}")
     expect(page.tab.locator("#light.on")).to_be_visible()
@@ -47,19 +47,19 @@ def start(browser, demo, world, width=360, height=300, name=""):
 
 
 def samples(demo):
-    """How many seconds the charts have."""
+    """The number of samples in the charts, one per second."""
     with urllib.request.urlopen(f"http://{demo.simulation}/history", timeout=SOON) as answer:
         return len(json.loads(answer.read()))
 
 
 def wait(demo, count):
-    """Waits until the charts have so many samples."""
+    """Waits until the charts have this many samples."""
     for more in range(samples(demo), count + 1, 5):
         until(f"{more} seconds have passed", lambda: samples(demo) >= more)
 
 
 def shoot(page, folder, name, hosts, part=None, margin=16, whole=True):
-    """A picture of a page, of one of its parts, or of what is in sight."""
+    """Takes a picture of a page, of one of its parts, or of the visible area."""
     if whole:
         page.tab.evaluate("scrollTo(0, 0)")
     x, y, width, height = page.tab.evaluate("[0, scrollY, innerWidth, innerHeight]")
@@ -70,7 +70,7 @@ def shoot(page, folder, name, hosts, part=None, margin=16, whole=True):
     elif whole:
         height = page.tab.evaluate("document.documentElement.scrollHeight")
     chromium = page.context.new_cdp_session(page.tab)
-    # Playwright itself knows no WebP, which takes half the room of PNG.
+    # Playwright itself does not support WebP, which takes half the size of PNG.
     taken = chromium.send("Page.captureScreenshot", {
         "format": "webp", "quality": 90, "captureBeyondViewport": True,
         "clip": {"x": x, "y": y, "width": width, "height": height, "scale": 1}})
@@ -80,7 +80,7 @@ def shoot(page, folder, name, hosts, part=None, margin=16, whole=True):
 
 
 def rehearsal(browser, demo, folder):
-    """What `rehearse` prints in a terminal, once it has ended."""
+    """Takes a picture of the output of `rehearse` in a terminal."""
     command = ["rehearse", f"http://{demo.session}", *REHEARSAL]
     done = subprocess.run([BIN / command[0], *command[1:]], stdout=subprocess.PIPE, timeout=10 * SOON, text=True, check=True)
     page = browser.page(width=900, height=100)
@@ -91,7 +91,7 @@ def rehearsal(browser, demo, folder):
 
 
 def pages(browser, demo, folder):
-    """The monitors and the viewer, once the charts are full."""
+    """Takes pictures of the monitors and the viewer, once the charts are full."""
     demo.add("third", "The machine in the attic")
     fleet = browser.page(width=WIDTH, height=860)
     fleet.tab.goto(f"http://{demo.session}/monitor")
@@ -121,7 +121,7 @@ def pages(browser, demo, folder):
 
 
 def a_class(browser, demo, folder):
-    """What a teacher has of a class: who is who, watching, stopping, announcing, a list of 200 on a phone."""
+    """Takes pictures of a teacher's pages: who is who, watching, stopping, announcing, a list of 200 on a phone."""
     hosts = {"localhost"}
     credentials = {"username": "teacher", "password": PASSWORD}
     anna = start(browser, demo, "Playground", width=WIDTH, height=860, name="Anna")
@@ -162,7 +162,7 @@ def a_class(browser, demo, folder):
 
 
 def phone(browser, demo, folder, credentials, hosts):
-    """The list of a class, with each row many times."""
+    """Takes a picture of the list of a large class, made of many copies of each row."""
     page = browser.page(width=390, height=844, http_credentials=credentials)
     page.tab.goto(f"http://{demo.simulation}/sign-in")
     row = page.tab.locator("#simulations tr").first
@@ -179,7 +179,7 @@ def phone(browser, demo, folder, credentials, hosts):
     expect(page.tab.locator("#simulations tr")).to_have_count(200)
     page.tab.get_by_label("Filter").fill("dora")
     page.tab.evaluate("document.querySelector('section:has(#simulations)').scrollIntoView()")
-    # What comes into sight is drawn in the next frame.
+    # After scrolling, the new content is drawn in the next frame.
     page.tab.evaluate("new Promise((drawn) => requestAnimationFrame(() => requestAnimationFrame(drawn)))")
     shoot(page, folder, "phone", hosts, whole=False)
     page.close()

@@ -1,9 +1,9 @@
-"""A class: who is in it, and those of it who need no page of their own, because one page starts all of their simulations."""
+"""A class: its students, and one page that starts the simulations of all students who need no page of their own."""
 
 NAMES = [
     "anna", "ben", "chloe", "dora", "emil", "fay", "gus", "hana", "ivan", "jane", "kofi", "lena", "milo", "nora", "omar", "pia", "quinn",
     "rosa", "sami", "tess", "uma", "vera", "will", "xena", "yara", "zeno", "amir", "bela", "carl", "dana"]
-# What a page does that shows nothing: it asks for a simulation server, starts a world there, and stays.
+# Run in a page: requests a simulation server, starts a world there, and keeps the connection open.
 START = """
     async ([world, name]) => {
       const server = await (await fetch(`session?url=${world}`)).text();
@@ -29,7 +29,7 @@ START = """
 
 
 def start_all(page, names, become, world):
-    """Starts a simulation for each of these names; `become` makes the browser somebody else. Gives back their streams."""
+    """Starts a simulation for each of these names; `become` signs in as another user. Returns the URLs of the streams."""
     for name in names:
         become(name)
         page.tab.evaluate(START, [world, label(name)])
@@ -37,5 +37,5 @@ def start_all(page, names, become, world):
 
 
 def label(name):
-    """What somebody who is on no page of the viewer calls itself."""
+    """The display name of a student without a page of their own."""
     return f"{name.title()} at desk {1 + NAMES.index(name)}"

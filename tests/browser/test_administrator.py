@@ -1,4 +1,4 @@
-"""What a teacher does with a class: finds who is who, stops one, tells all. And a list of 200 on a phone."""
+"""A teacher and a class: who is who, stopping a simulation, announcing. And a list of 200 on a phone."""
 
 import json
 import unittest
@@ -41,7 +41,7 @@ class Administrator(BrowserTest):
         student, server = self.student(urllib.parse.quote(LABEL))
         expect(student.tab.locator("#visitor")).to_contain_text(f"The administrator sees you as {LABEL}.")
         self.assertIn("name=Anna", student.tab.url)
-        # Who does not know the password sees no name, and can stop nothing.
+        # Without the password no names are shown, and nothing can be stopped.
         stranger = self.open(server.url("monitor"))
         expect(stranger.tab.locator("#simulations tr")).to_have_count(1)
         self.assertNotIn("Anna", stranger.tab.content())
@@ -55,7 +55,7 @@ class Administrator(BrowserTest):
         self.assertEqual(row.locator("img").count(), 0, "a name is no markup")
         self.assertNotEqual(teacher.tab.title(), "evil")
         expect(teacher.tab.locator("#live")).to_have_text("Live")
-        # The live page keeps what the password shows, and the words of the filter.
+        # Live updates keep what the password shows, and the filter.
         teacher.tab.get_by_label("Filter").fill("anna play")
         teacher.tab.get_by_role("columnheader", name="Who").first.get_by_role("button").click()
         student.tab.get_by_role("button", name="Play", exact=True).click()
@@ -66,7 +66,7 @@ class Administrator(BrowserTest):
         dialog = teacher.tab.get_by_role("dialog")
         expect(dialog).to_contain_text(LABEL)
         self.assertEqual(teacher.faults(), [])
-        # A second thought.
+        # Cancels first.
         dialog.get_by_role("button", name="Cancel").click()
         expect(dialog).to_be_hidden()
         expect(row.locator(".state")).to_have_text("running")
@@ -91,7 +91,7 @@ class Administrator(BrowserTest):
         text = "Maintenance <b onclick=alert(1)>at noon</b>"
         teacher.tab.get_by_label("Text for all open viewers").fill(text)
         teacher.tab.get_by_role("button", name="Announce").click()
-        # One character stands for another, so that it is no markup wherever it is shown.
+        # Characters of markup are replaced, so that no page can interpret the text as markup.
         expect(viewer.tab.locator("#announcement")).to_have_text(
             text.replace("<", "\u2039").replace(">", "\u203a"), timeout=2000)
         expect(stranger.tab.locator("#announcement")).to_contain_text(text, timeout=3000)
@@ -144,14 +144,14 @@ class Administrator(BrowserTest):
         head.get_by_role("button").click()
         head.get_by_role("button").click()
         expect(rows.first).to_contain_text("student199")
-        # The filter is in sight also at the end of the list.
+        # The filter stays visible at the end of the list.
         rows.last.scroll_into_view_if_needed()
         field = page.tab.get_by_label("Filter")
         expect(field).to_be_in_viewport()
         field.fill("student04")
         expect(page.tab.locator("#filtered")).to_have_text("10 of 200")
         expect(page.tab.locator("#simulations tr:visible")).to_have_count(10)
-        # Another event comes, with another row: sort order and filter are what they were.
+        # Another event with another row keeps sort order and filter.
         more.append(200)
         expect(page.tab.locator("#filtered")).to_have_text("10 of 201")
         expect(page.tab.locator("#simulations tr:visible .state").first).to_have_text("running")

@@ -12,16 +12,16 @@ from fleet import SOON, WORLD, until
 from students import NAMES, label, start_all
 
 PASSWORD = "open sesame"
-# Who has a page that shows the simulation.
+# The students whose page shows the simulation.
 TABS = NAMES[:3]
-# Whether a WebSocket is opened; who is let in plays the prank.
+# Returns whether the WebSocket was opened; if so, sends the prank.
 PRANK = """
     (url) => new Promise((resolve) => {
       const socket = new WebSocket(url);
       socket.onopen = () => { socket.send('pause'); socket.send('reset'); resolve(true); };
       socket.onerror = () => resolve(false);
     })"""
-# From now on a page knows when its announcement was shown.
+# Makes a page record the time at which an announcement appears.
 NOTICE = """
     () => {
       const place = document.getElementById('announcement');
@@ -35,11 +35,11 @@ class AClass(BrowserTest):
 
     @classmethod
     def make_fleet(cls):
-        # Half of the class on each machine, and a place for who comes late.
+        # A slot on each machine for half of the class, and one more.
         return OneDoor(places=16, session={"adminPassword": PASSWORD}, simulation={"adminPassword": PASSWORD})
 
     def visit(self, name, path, **options):
-        """A page in the browser of somebody who has signed in at the door, on a machine of its own."""
+        """A page in a separate browser profile, signed in at the door under this name."""
         context = self.browser.chromium.new_context(ignore_https_errors=True, viewport={"width": 1000, "height": 700}, **options)
         context.set_default_timeout(1000 * SOON)
         context.add_cookies([{"name": COOKIE, "value": name, "url": self.fleet.url("")}])
@@ -49,7 +49,7 @@ class AClass(BrowserTest):
         return page
 
     def student(self, name):
-        """A student whose viewer shows a simulation."""
+        """The page of a student whose viewer shows a simulation."""
         page = self.visit(name, f"viewer?name={name.title()}&url={WORLD.format('playground')}")
         expect(page.tab.locator("#visitor")).to_contain_text(f"The administrator sees you as {name.title()}.")
         expect(page.tab.locator("#light.on")).to_be_visible()
@@ -57,7 +57,7 @@ class AClass(BrowserTest):
         return page
 
     def monitors(self):
-        """What the teacher has open: the monitor of each machine, reached from that of the fleet."""
+        """The teacher's pages: the monitor of each machine, opened from the fleet's monitor."""
         credentials = {"username": "teacher", "password": PASSWORD}
         fleet = self.visit("teacher", "monitor", http_credentials=credentials)
         expect(fleet.tab.locator("#servers .state.up, #servers .state.full")).to_have_count(2)
@@ -72,7 +72,7 @@ class AClass(BrowserTest):
 
     def test_a_teacher_has_a_class_of_thirty_in_hand(self):
         students = {name: self.student(name) for name in TABS}
-        # The others are there in the background, and everybody has signed in.
+        # The others run without pages of their own; all have signed in.
         others = self.visit(NAMES[3], "viewer")
         become = lambda name: others.context.add_cookies([{"name": COOKIE, "value": name, "url": self.fleet.url("")}])
         streams = start_all(others, NAMES[3:], become, WORLD.format("carousel"))
@@ -88,7 +88,7 @@ class AClass(BrowserTest):
         self.the_prank_fails(students["ben"], anna, streams)
         self.all_are_told(fleet, [students["ben"], students["chloe"], others])
         self.one_is_stopped_with_a_reason(anna, machine)
-        # Nobody else has noticed anything.
+        # The other simulations are not affected.
         for machine in machines:
             machine.tab.get_by_label("Filter").fill("")
         until("the others run on", lambda: sum(one.tab.locator("#simulations tr").count() for one in machines) == len(NAMES) - 1)
@@ -97,7 +97,7 @@ class AClass(BrowserTest):
             self.keeps_to_the_rules(page)
 
     def every_student_has_a_name(self, machines):
-        """Who has signed in is named so; what they call themselves stands beside it, unverified."""
+        """Users appear under their sign-in names, beside the unverified names that they chose."""
         read = """table => [...table.querySelectorAll('td[data-label=Who]')]
             .map((cell) => [cell.querySelector('b')?.textContent, cell.querySelector('span')?.textContent])"""
         parts = lambda: [dict(one.tab.locator("#simulations").evaluate(read)) for one in machines]
@@ -110,7 +110,7 @@ class AClass(BrowserTest):
         self.assertGreater(min(len(one), len(other)), 8, "each machine has its part of the class")
 
     def the_teacher_finds_and_watches(self, student, machines):
-        """Gives back the monitor on which the student is."""
+        """Returns the monitor that lists the student."""
         for machine in machines:
             machine.tab.get_by_label("Filter").fill("anna@")
         found = [one for one in machines if one.tab.locator("#simulations tr:visible").count()]
@@ -130,7 +130,7 @@ class AClass(BrowserTest):
         return found[0]
 
     def the_prank_fails(self, prankster, victim, streams):
-        """Somebody of the same class reaches no simulation but the own one."""
+        """A student of the same class can't reach the simulation of another."""
         stream = next(url for url in victim.asked if "/stream/" in url)
         base, token = re.fullmatch(r"(wss://.*)/stream/([0-9a-f]+)/", stream).groups()
         machine = base.replace("wss://", "https://")
@@ -140,7 +140,7 @@ class AClass(BrowserTest):
             self.assertIsNone(one["port"])
         for secret in (token, "anna", "Anna"):
             self.assertNotIn(secret, str(status))
-        # The ports, were they guessed, and tokens that are none: of others' ids, of a part, of another machine.
+        # Guessed ports and invalid tokens: simulation ids, altered tokens, a token of another machine.
         server = next(one for one in (self.fleet.simulation, self.fleet.other) if f"/{one.config['server']}/" in base)
         elsewhere = next(url for url in streams if not url.startswith(base))
         ports = [base.replace(f"/{server.port}", f"/{port}") + "/" for port in range(server.port + 1, server.port + 17)]

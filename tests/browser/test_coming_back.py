@@ -1,4 +1,4 @@
-"""The viewer comes back: after a reload, Back, a lost connection; and says what is true meanwhile."""
+"""The viewer resumes after a reload, Back or a lost connection, and shows the correct state in between."""
 
 import json
 import re
@@ -27,7 +27,7 @@ class ComingBack(Running):
         self.assertNotIn(token, server.log.read_text())
         self.assertEqual(page.faults(), [])
         self.leaves_nothing(page, server)
-        # What has ended is not asked for again.
+        # An ended simulation is not resumed.
         page.tab.reload()
         expect(page.tab.locator("#light.on")).to_be_visible()
         expect(page.tab.get_by_role("button", name="Connect", exact=True)).to_be_enabled()
@@ -48,7 +48,7 @@ class ComingBack(Running):
         kept = page.tab.evaluate("sessionStorage.getItem('simulation')")
         other = self.browser.page()
         self.addCleanup(other.close)
-        # As a tab that the browser has duplicated.
+        # Like a tab that the browser has duplicated.
         other.tab.add_init_script(f"sessionStorage.getItem('simulation') ?? sessionStorage.setItem('simulation', {json.dumps(kept)})")
         other.tab.goto(self.fleet.session.url("viewer"))
         self.goes_on(other, server, pid, 0)
@@ -70,7 +70,7 @@ class ComingBack(Running):
     def test_a_server_that_hangs_is_told_and_the_simulation_is_found_again(self):
         page, server = self.running()
         pid, before = self.pid(server), seconds(page)
-        # The stream is silent too: it is of the same network in life.
+        # Silences the stream too: in reality it shares the network.
         page.tab.get_by_role("button", name="Pause", exact=True).click()
         expect(page.tab.locator("#mode")).to_have_text("paused")
         with server.hanging():
@@ -101,7 +101,7 @@ class ComingBack(Running):
         text = (ROOT / "docs/protocol.md").read_text()
         example = text.split("```js\n")[1].split("```")[0]
         self.assertLessEqual(len(example.splitlines()), 30)
-        # A page without a policy of its own, and without a script.
+        # A page without a content security policy and without a script.
         page = self.browser.page()
         self.addCleanup(page.close)
         tab = page.tab
@@ -132,7 +132,7 @@ class ComingBack(Running):
 
 
 class Busy(Running):
-    # Else the session server would take the port of the only place.
+    # Otherwise the session server would take the port of the only slot.
     session = {"port": free_ports(64) + 63}
     simulation = {"maxConnections": 1, "waitingLine": 0}
 

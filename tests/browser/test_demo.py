@@ -49,7 +49,7 @@ class TheDemo(BrowserTest):
         page.close()
         expect(fleet_monitor.tab.locator("#glance")).to_contain_text("0 of 10 places")
         self.assertTrue(fleet_monitor.tab.evaluate("window.same"), "the page was loaded again")
-        # It ends: what its pages complain of then is no fault.
+        # The servers stop now; console errors of these pages would not count.
         machine_monitor.close()
         fleet_monitor.close()
         self.assertNotEqual(self.fleet.leftovers(), [], "what runs is seen")

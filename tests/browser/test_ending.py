@@ -1,4 +1,4 @@
-"""Simulations that end: whose page is away for too long, that stay paused, whose tab was closed."""
+"""Simulations that end because the page was offline for too long, because they stayed paused, or because the tab was closed."""
 
 import pathlib
 import re
@@ -12,7 +12,7 @@ from fleet import WORLD, until
 
 class OfflineForLong(Running):
     may_complain = True
-    # The same as 90 s with what is usual, at a sixth.
+    # Far shorter than the defaults of 60, 20 and 60 s.
     simulation = {"timing": {"absence": 10, "ping": 1, "silence": 3}}
 
     def test_who_was_offline_for_too_long_leaves_nothing_and_is_told_why(self):
@@ -31,7 +31,7 @@ class OfflineForLong(Running):
 
 
 class Idle(Running):
-    # Twelve seconds; the last six of them are told.
+    # Twelve seconds; during the last six the page warns.
     simulation = {"idleTimeout": 0.2}
 
     def test_who_stays_paused_is_told_and_keeps_the_simulation_by_a_button(self):
@@ -65,7 +65,7 @@ class Idle(Running):
         page.tab.get_by_role("button", name="Playground").click()
         page.tab.get_by_role("button", name="Connect", exact=True).click()
         expect(page.tab.locator("[data-step=simulation].done")).to_be_visible()
-        # As Webots says to all pages, and not in its output.
+        # As Webots sends to all pages, without printing it.
         streams[-1].send("real-time")
         expect(page.tab.locator("#mode")).to_have_text("real time")
         told = page.tab.locator("#idle-text")

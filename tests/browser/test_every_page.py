@@ -1,4 +1,4 @@
-"""What holds for every page, in both schemes, wide and narrow."""
+"""Requirements on every page, in both colour schemes, wide and narrow."""
 
 import itertools
 import unittest
@@ -89,7 +89,7 @@ class Crowded(BrowserTest):
                 until("the list is scrolled", lambda: changes.evaluate("list => list.scrollTop") > 0)
 
     def test_a_fleet_of_no_servers_says_so_until_there_is_one(self):
-        # Whatever else this machine does.
+        # Other load on this machine must not make the server full.
         empty = self.fleet.start(
             "session-server", "empty", {"port": free_ports(1), "simulationServers": [], "loadThreshold": 1000})
         page = self.open(empty.url("monitor"))

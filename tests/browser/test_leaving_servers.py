@@ -1,5 +1,4 @@
-"""The viewer, where the simulation server that was chosen is about to end, is gone, or can't start anything: another one is
-asked for."""
+"""The viewer requests another simulation server if the one it was sent to drains, is gone, or can't start anything."""
 
 import pathlib
 import shutil
@@ -14,7 +13,7 @@ from fleet import BIN, Fleet, until
 
 
 class LeavingServers(BrowserTest):
-    # It hears of nothing by itself, so that it goes on to choose a server that leaves.
+    # The session server polls rarely, so that it keeps choosing a server that has left.
     session = {"loadRefresh": 600}
 
     def knows_only(self, server):
@@ -86,7 +85,7 @@ class Failing(LeavingServers):
         expect(page.tab.locator("[data-step=session]")).to_contain_text("another one is asked for")
         expect(page.tab.locator("#problem-text")).to_contain_text("Webots ended with exit code 3")
         self.assertEqual(self.failures(), 4)
-        # The next time counts from the beginning, and what works again is found.
+        # The next attempt counts from zero, and finds the repaired server.
         self.connect(page)
         expect(page.tab.locator("[data-step=session]")).to_contain_text("another one is asked for")
         self.repaired.touch()

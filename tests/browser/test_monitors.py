@@ -1,4 +1,4 @@
-"""The monitor pages: they stay true without reloading."""
+"""The monitor pages update live."""
 
 import base64
 import re
@@ -25,7 +25,7 @@ class Monitors(BrowserTest):
         lamp = page.tab.locator("#live")
         expect(lamp).to_have_text("Live")
         with self.fleet.session.hanging():
-            # No connection ends by that: the page misses the sign of life.
+            # No connection is closed; the page notices the missing heartbeat.
             expect(lamp).to_contain_text("what you see is old", timeout=60_000)
         expect(lamp).to_have_text("Live", timeout=20_000)
 
@@ -134,7 +134,7 @@ class Monitors(BrowserTest):
         expect(moment).to_have_text("now")
         chart.press("ArrowLeft")
         expect(moment).to_contain_text("at ")
-        # A screen reader reads this.
+        # For screen readers.
         self.assertRegex(chart.get_attribute("aria-valuetext"), r"^at .*: CPU load \d+\.\d %, .*Disk \d+\.\d %$")
         chart.press("Escape")
         expect(moment).to_have_text("now")
@@ -142,7 +142,7 @@ class Monitors(BrowserTest):
     def test_the_output_of_a_simulation_is_shown_on_demand(self):
         viewer, server = self.start_world()
         page = self.open(server.url("monitor"))
-        # That of an earlier visitor may still wait for its client.
+        # The simulation of an earlier visitor may still be listed, waiting for its client.
         page.tab.locator("#simulations").get_by_role("link", name="Last lines").last.click()
         dialog = page.tab.get_by_role("dialog")
         expect(dialog).to_contain_text("Output of playground.wbt")

@@ -1,4 +1,4 @@
-"""A page streams from a simulation in a network of its own, which needs pasta and an ordinary user."""
+"""A page streams from a simulation in its own network, which needs pasta and an unprivileged user."""
 
 import os
 import pathlib
@@ -16,7 +16,7 @@ NOBODY = 65534
 
 
 def shortcoming():
-    """Why there can be none here, if that is so."""
+    """The reason why this machine can't run the test, or None."""
     if not shutil.which("pasta"):
         return "pasta is not there: apt install passt"
     tun = pathlib.Path("/dev/net/tun")

@@ -1,4 +1,4 @@
-"""Streams through the simulation server, and an administrator who watches."""
+"""Streams relayed by the simulation server, and an administrator who watches."""
 
 import re
 import unittest

@@ -1,4 +1,4 @@
-"""A page that does what Webots' page does with texts of a simulation server, and a world whose name is a script."""
+"""A page that inserts texts of a simulation server as HTML, like Webots' page, and a world whose name is a script."""
 
 import json
 import unittest

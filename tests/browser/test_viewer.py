@@ -1,4 +1,4 @@
-"""The viewer: from the light to a scene that moves."""
+"""The viewer: from the status light to a moving scene."""
 
 import unittest
 
@@ -24,7 +24,7 @@ class Viewing(BrowserTest):
         page.tab.mouse.move(box["x"] + 300, box["y"] + 220)
         page.tab.mouse.up()
         until("dragging changes the view", lambda: picture(page) != before)
-        # The focus ring is part of a picture: the button takes it away.
+        # Clicking the button also removes the focus ring, which is part of the picture.
         page.tab.get_by_role("button", name="Home view").click()
         until("the view is the first again", lambda: picture(page) == first)
 
@@ -63,7 +63,7 @@ class Viewing(BrowserTest):
             connect.click()
             expect(page.tab.locator("#problem-text")).to_contain_text("does not answer", timeout=20_000)
             expect(connect).to_be_enabled()
-        # The refusal of the stranger's world comes now, before the answer to this one.
+        # The refusal of the first world arrives now, before the answer to this one.
         page.tab.get_by_role("button", name="Playground").click()
         connect.click()
         expect(page.tab.locator("[data-step=simulation].done")).to_be_visible(timeout=20_000)

@@ -1,4 +1,4 @@
-"""Webots' own viewer, taken from where Webots is installed: a stand-in for it, for no Webots is needed here."""
+"""Webots' own viewer, served from the installation of Webots; a stand-in, so that the test needs no Webots."""
 
 import pathlib
 import re
@@ -11,7 +11,7 @@ from case import BrowserTest
 from door import COOKIE, OneDoor
 from fleet import WORLD, until
 
-# As the real one does, it names its style sheet by another site and makes a script in the page.
+# Like the real one, it links a style sheet of another site and adds a script to the page.
 COMPONENT = """
 import { greeting } from './part.js';
 class WebotsView extends HTMLElement {
@@ -48,7 +48,7 @@ customElements.define('webots-view', WebotsView);
 
 
 def installed(test):
-    """What a simulation server needs to have Webots' viewer."""
+    """The keys of a simulation server that serves Webots' viewer."""
     home = pathlib.Path(test.enterClassContext(tempfile.TemporaryDirectory()))
     folder = home / "resources/web/wwi"
     (folder / "css").mkdir(parents=True)
@@ -81,7 +81,7 @@ class WebotsViewer(BrowserTest):
 
 
 class BehindTheDoor(BrowserTest):
-    """The same where streams are relayed, on several machines behind one web server at which visitors sign in."""
+    """The same with relayed streams, on several machines behind one web server where visitors sign in."""
 
     host = "localhost"
 

@@ -1,8 +1,8 @@
-"""A visitor's way through the door of a fleet on Docker Swarm: through_swarm.py http://HOST/viewer [--kill SERVICE]
+"""A visit through the door of a fleet on Docker Swarm: through_swarm.py http://HOST/viewer [--kill SERVICE]
 
-Comes as soon as the door is there, and says, in milliseconds since the machine was started, when the scene moves. With --kill the
-simulation server that was chosen is killed then, a container of that service; it says when that was, when the page has told so, and
-when the scene moves again after a click. The certificate is not looked at.
+Waits until the door answers, and prints when the scene moves, in milliseconds since boot. With --kill it then kills the container
+of the chosen simulation server, which belongs to SERVICE, and prints when it did so, when the page reported it, and when the scene
+moves again after a click. The certificate is not checked.
 """
 
 import json
@@ -22,7 +22,7 @@ def say(what):
 
 
 def opened(tab, url):
-    """Whether the page is there: the door may not be yet, nor what is behind it."""
+    """Whether the page loads: the door or the servers behind it may not run yet."""
     try:
         return tab.goto(url).ok
     except Error:
@@ -66,11 +66,11 @@ def visit(browser, url, service):
         say("told")
         connect_until_it_moves(tab)
         say("again")
-    # All that the page has asked for it has asked of the door, in the way by which it came.
+    # The page has sent all its requests to the door, with the scheme with which it was loaded.
     origin = urllib.parse.urlsplit(url)
     ways = {(one.scheme, one.netloc) for one in map(urllib.parse.urlsplit, page.asked) if one.scheme not in ("data", "blob", "about")}
     assert ways == {(origin.scheme, origin.netloc), (origin.scheme.replace("http", "ws"), origin.netloc)}, ways
-    # A page that is merely closed leaves its simulation waiting.
+    # If the page were merely closed, its simulation would wait for it.
     tab.get_by_role("button", name="Disconnect").click()
     expect(tab.get_by_role("button", name="Connect", exact=True)).to_be_enabled()
     page.close()

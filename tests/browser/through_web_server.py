@@ -1,7 +1,7 @@
-"""A visitor's way through a web server, from the first click to the end: through_web_server.py https://HOST/viewer [--own-origin]
+"""A visit through a web server, from the first click to the end: through_web_server.py https://HOST/viewer [--own-origin]
 
-The session server behind it offers a world called Arm. The certificate is not looked at: the tests of the web servers
-do that. With --own-origin the web server gives what Webots sends an origin of its own.
+The session server behind it offers a world called Arm. The certificate is not checked here, but in the tests of the web
+servers. --own-origin says that the web server sandboxes Webots' files, so that they have an opaque origin.
 """
 
 import re
@@ -15,7 +15,7 @@ from fleet import SOON, until
 
 
 def cannot_read_what_is_the_administrators(context, webots):
-    """A page of a simulation, and the output that the administrator's password protects."""
+    """Asserts that a simulation's page can't read the output that the administrator's password protects."""
     tab = context.new_page()
     tab.goto(webots + "nothing.html")
     assert tab.evaluate("window.origin") == "null"

@@ -1,7 +1,7 @@
-"""A cable between two machines: cable.py PROCESS ADDRESS/BITS PROCESS ADDRESS/BITS
+"""Connects two machines: cable.py PROCESS ADDRESS/BITS PROCESS ADDRESS/BITS
 
-Each machine is a network namespace, named by a process in it, and gets an interface with an address. What is sent on one
-comes out of the other, until this program ends.
+Each machine is a network namespace, given by a process in it, and gets an interface with an address. Packets sent on one
+arrive at the other until this program ends.
 """
 
 import ctypes
@@ -38,7 +38,7 @@ def main(one, its_address, other, others_address):
             try:
                 os.write(ends[1 - ends.index(ready)], packet)
             except OSError:
-                # A machine that goes down has its interface down first. Cables lose packets.
+                # The interface of a stopping machine goes down first; the packet is lost.
                 pass
 
 

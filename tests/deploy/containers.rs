@@ -1,9 +1,9 @@
-//! The launcher of `config/simulation/docker`: what a participant's controller meets.
+//! The launcher of `config/simulation/docker`, which runs a participant's controller.
 
 use std::path::Path;
 use std::process::Command;
 
-/// A stand-in for libController, which writes down what it is asked for. The simulation ends at the third step.
+/// A stand-in for libController that records its calls. The simulation ends at the third step.
 const LIBRARY: &str = r#"
     #include <stdio.h>
     #include <stdlib.h>

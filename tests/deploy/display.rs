@@ -1,10 +1,10 @@
-//! A real X server, and none.
+//! Checks of the display, with and without an X server.
 
 use std::process::{Child, Command, Stdio};
 
 use crate::support::display;
 
-/// A virtual X server, ended with the test.
+/// A virtual X server, stopped on drop.
 struct Xvfb {
     child: Child,
     display: String,
@@ -25,7 +25,7 @@ impl Xvfb {
 
 impl Drop for Xvfb {
     fn drop(&mut self) {
-        // In order: it removes its socket and its lock.
+        // SIGTERM lets it remove its socket and lock file.
         let pid = nix::unistd::Pid::from_raw(i32::try_from(self.child.id()).unwrap());
         nix::sys::signal::kill(pid, nix::sys::signal::Signal::SIGTERM).ok();
         self.child.wait().ok();
@@ -63,7 +63,7 @@ async fn check_tells_whether_a_display_answers() {
         // A display of another host.
         (Some("127.0.0.1:59000"), None, "warning: display: no display answers at 127.0.0.1:59000: start"),
         (Some("nonsense"), None, "warning: display: \"nonsense\" is no display"),
-        // Whether this machine has a display :0 or not.
+        // Matches both results: this machine may have a display :0.
         (None, None, "answers at :0"),
     ] {
         let keys = configured.map_or(serde_json::json!({}), |display| serde_json::json!({ "display": display }));

@@ -1,4 +1,4 @@
-//! The files of `deploy/`: what programs that read such files say of them.
+//! The files of `deploy/`, checked by programs that read such files.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -10,8 +10,8 @@ fn deploy(path: &str) -> PathBuf {
 #[test]
 fn the_units_expose_little() {
     needs!("systemd-analyze");
-    // The simulation server runs programs of others on the graphics card and a display, and can't close itself off more.
-    // A user's own manager can't take away more than system calls.
+    // The simulation server runs untrusted programs with a GPU and a display, and can't be restricted further.
+    // A user's service manager can restrict only system calls.
     for (unit, most) in [
         ("system/webots-session@.service", 1.5),
         ("system/webots-simulation@.service", 4.0),
@@ -38,7 +38,7 @@ fn the_autostart_entries_run_the_programs_of_the_units() {
         let command = text.lines().find_map(|line| line.strip_prefix("Exec=")).unwrap();
         let command = command.strip_prefix("sh -c \"").and_then(|rest| rest.strip_suffix('"')).unwrap();
         assert!(!command.contains(['\\', '$', '`', '"', '%']), "{command} would need quotes");
-        // What it runs, seen by stand-ins for the servers.
+        // Runs its command with stand-ins for the servers.
         let home = tempfile::tempdir().unwrap();
         std::os::unix::fs::symlink("/bin/echo", home.path().join(format!("{kind}-server"))).unwrap();
         let search = format!("{}:/usr/bin:/bin", home.path().display());

@@ -1,10 +1,10 @@
-"""When new simulation servers on Docker Swarm were used first: docker inspect CONTAINER... | first_use.py VISITS BEGAN OLD...
+"""First use of new simulation servers on Docker Swarm: docker inspect CONTAINER... | first_use.py VISITS BEGAN OLD...
 
-VISITS is what rehearse has written, BEGAN when it was started, OLD are containers that were there before. Says how long after
-its start each new one had its first client; fails where one had none, or only after LIMIT seconds.
+VISITS is the JSON file of rehearse, BEGAN its start time, OLD are the containers from before. Prints the time from the start of
+each new container to its first client; fails if one had none within LIMIT seconds.
 
-Five seconds are asked of a fleet. Measured were 1.3 to 4 on two cores that had other work too; what runs is also Docker, which is
-slower on a machine that does much else, so that the limit is more.
+The goal is five seconds. On two cores with other load, 1.3 to 4 were measured. The limit is higher because Docker is slow on
+a busy machine.
 """
 
 import datetime
@@ -24,7 +24,7 @@ for visit in visits:
 waits = []
 for container in json.load(sys.stdin):
     if not container["Id"].startswith(old):
-        # Python knows microseconds, Docker tells nanoseconds.
+        # Docker reports nanoseconds, Python parses microseconds.
         started = re.sub(r"(\.\d{6})\d*Z", r"\1+00:00", container["State"]["StartedAt"])
         started = datetime.datetime.fromisoformat(started).timestamp()
         addresses = [network["IPAddress"] for network in container["NetworkSettings"]["Networks"].values()]

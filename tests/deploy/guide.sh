@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
-# Follows docs/deployment.md in clean machines, with the commands that stand there: from the first to a simulation in a
-# browser over https and wss, with nginx and with Apache, on one machine and on two, and through an upgrade.
-# tests/deploy/machine.sh tells what such a machine is, and which variables count.
+# Runs the commands of docs/deployment.md in clean machines: from the first one to a simulation in a browser over https
+# and wss, with nginx and with Apache, on one machine and on two, and through an upgrade.
+# tests/deploy/machine.sh describes these machines and the environment variables.
 #
-# Without the internet some things stand in for others: the package is built before, Webots is the demo simulator in a
-# package of that name, certbot is the script beside this one, the repository of the lab's world is on the machine.
+# Without internet there are stand-ins: the package is built before, Webots is the demo simulator in a package of that
+# name, certbot is the script beside this one, the repository of the lab's world is on the machine.
 #
-# guide.sh [nginx|apache]: both parts side by side, or the one with this web server first.
+# guide.sh [nginx|apache]: both parts in parallel, or only the part that begins with this web server.
 [[ ${1-} == machine ]] || export PART=${1-}
 # shellcheck source=tests/deploy/machine.sh
 . "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/machine.sh"
@@ -14,19 +14,19 @@
 readonly FRONT=192.0.2.1 FURTHER=192.0.2.3
 readonly BROWSER=$PWD/target/test-venv/bin/python
 
-# The same without what is the session server's.
+# Filters out what concerns the session server.
 for_simulations_only() {
     awk '/tee .*\/session\// { skipped = 1 } !skipped && !/webots-session|session-server/; /^END$/ { skipped = 0 }'
 }
 
-# Lets the user of the machine run commands, with the guide's variables.
+# Runs the commands of its input as the machine's user, with the guide's variables.
 follow() { # HOST
     { commands 'What you need' | sed "s|^HOST=.*|HOST=$1|" && cat; } | in_machine tee /tmp/commands >/dev/null
     in_machine runuser -l lab -c 'bash -euxo pipefail /tmp/commands </dev/null' >"$WORK/guide.log" 2>&1 ||
         fail "$here: $(tail -n 30 "$WORK/guide.log")"
 }
 
-# A machine as it is when the guide begins, with a name in the DNS.
+# A machine as at the beginning of the guide, with its name in the hosts file in place of DNS.
 fresh() { # MACHINE ADDRESS
     boot "$1"
     nsenter --target "${inits[$1]}" --net ip address add "$2/32" dev lo
@@ -46,14 +46,14 @@ fresh() { # MACHINE ADDRESS
         install /mnt/packages/certbot /usr/local/bin/certbot' fresh "$FRONT" "$FURTHER"
 }
 
-# What stands in for what can't be had here.
+# Makes the stand-ins.
 make_stand_ins() {
     local webots=$WORK/webots
     rm -rf "$webots"
     mkdir -p "$webots/DEBIAN" "$webots/usr/local/webots" "$WORK/packages/authority"
     printf '%s\n' 'Package: webots' 'Version: 2025a' 'Architecture: amd64' 'Maintainer: Test <test@localhost>' \
         'Description: stands in for Webots' >"$webots/DEBIAN/control"
-    # Webots listens on all addresses, and opens a window.
+    # Like Webots, it listens on all addresses and needs a display.
     cat >"$webots/usr/local/webots/webots" <<'END'
 #!/bin/sh
 test -S "/tmp/.X11-unix/X${DISPLAY#:}" || { echo "there is no display $DISPLAY" && exit 1; }
@@ -66,8 +66,8 @@ END
         -keyout "$WORK/packages/authority/key.pem" -out "$WORK/packages/authority/certificate.pem" 2>/dev/null
 }
 
-# The lab's repository, which the guide's configuration names and the machine can't reach. And the machine that runs the
-# test may be busy, which is no reason to send visitors away.
+# Redirects the guide's repository, which the machine can't reach, to a local one. Other load on this machine must not make
+# the servers full.
 adapt() {
     in_machine test -e /srv/arm || make_project /srv/arm worlds/arm.wbt
     in_machine sed -i 's|"allowedRepositories"|"gitMirrors": {"https://github.com/your-lab/arm": "file:/srv/arm"}, &|' \
@@ -75,7 +75,7 @@ adapt() {
     in_machine sed -i 's|"simulationServers": \["fleet|"loadThreshold": 1000, &|' /etc/webots-fleet/session/main.json
 }
 
-# A page through the web server, as visitors get it.
+# Whether a page contains these words, through the web server.
 page() { # URL WORDS
     local answer
     answer=$(in_machine curl --silent --show-error --fail --max-time 3 "$1") && grep --quiet -- "$2" <<<"$answer"
@@ -85,7 +85,7 @@ status_of() { # URL OPTION...
     in_machine curl --silent --output /dev/null --max-time 5 --write-out '%{http_code}' "$@" || true
 }
 
-# Ports that are no part of the fleet, on which services of the machine listen.
+# Ports of the machine's services that are not part of the fleet.
 readonly PRIVATE=(1 22 2021 5432 8000)
 only_the_fleet_is_reachable() { # HOST
     local port
@@ -97,7 +97,7 @@ only_the_fleet_is_reachable() { # HOST
     [[ $(status_of "https://$1/3000/monitor") == 404 ]] || fail 'another machine is asked for, and there is none'
 }
 
-# Whether something that listens on all addresses of one machine can be reached from another.
+# Whether a service that listens on all addresses of one machine is reachable from another.
 firewall_lets_in() { # ADDRESS ITS MACHINE PORT
     local from=$here
     here=$2
@@ -107,7 +107,7 @@ firewall_lets_in() { # ADDRESS ITS MACHINE PORT
     in_machine curl --silent --fail --max-time 2 --output /dev/null "http://$1:$3/"
 }
 
-# A class of visitors with several WebSockets each, which all stay open.
+# Opens the WebSockets of a class of visitors, several each; all must stay open.
 a_class_has_room() { # HOST
     in_machine python3 - "$1" 900 <<'END' || fail "there is no room for a class: $(in_machine tail -n 5 /var/log/nginx/error.log /var/log/apache2/error.log 2>&1)"
 import resource, socket, ssl, sys
@@ -127,7 +127,7 @@ for number in range(count):
 END
 }
 
-# A visitor's way, in a browser on this machine.
+# A visit with a browser of this machine.
 visit() { # HOST
     in_machine cat /etc/hosts >"$WORK/hosts"
     # shellcheck disable=SC2016
@@ -150,7 +150,7 @@ up_to_the_servers() { # HOST FILTER...
     commands '5. Started at boot' | "$@" | follow "$host"
 }
 
-# One machine, all of the guide's steps.
+# All of the guide's steps on one machine.
 one_machine() { # MACHINE HEADING OF THE WEB SERVER
     fresh "$1" "$FRONT"
     up_to_the_servers fleet.lab.example cat
@@ -170,7 +170,7 @@ one_machine() { # MACHINE HEADING OF THE WEB SERVER
     only_the_fleet_is_reachable fleet.lab.example
 }
 
-# After a simulation: neither Webots nor its display is left.
+# After a simulation neither Webots nor its display is left.
 ended_with_all_it_had() {
     eventually no_simulation_runs
 }
@@ -179,7 +179,7 @@ no_simulation_runs() {
     ! runs 'demo-simulator|Xvfb' && [[ -z $(in_machine find /tmp/.X11-unix -type s) ]]
 }
 
-# As after a reboot: everything that is started at boot, and nothing else.
+# As after a reboot: runs only what is started at boot.
 comes_back() {
     in_machine systemctl stop 'webots-*' 'nginx*' 'apache2*'
     ! page https://fleet.lab.example/monitor html 2>/dev/null || fail 'something runs'
@@ -221,7 +221,7 @@ cable() { # MACHINE MACHINE
     eventually grep connected "$WORK/cable.log"
 }
 
-# Takes the first machine out of service, as the guide has it, so that visitors are sent to the other.
+# Drains the first machine with the guide's commands, so that visitors are sent to the other.
 visit_the_other() { # PORT ITS MACHINE
     local first=$here
     eventually knows_both

@@ -1,4 +1,4 @@
-//! `deploy/kubernetes` and the images that it names: what programs say of them that read such files. No cluster is here.
+//! `deploy/kubernetes` and the images that it names, checked by programs that read such files; without a cluster.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -17,14 +17,14 @@ fn text(output: Output) -> String {
     String::from_utf8(output.stdout).unwrap()
 }
 
-/// What kustomize makes of a folder, as text and as objects.
+/// The output of kustomize for a folder, as text and as objects.
 struct Made {
     name: &'static str,
     yaml: String,
     objects: Vec<Value>,
 }
 
-/// The base, the overlays, and the base with all that may be added. Nothing, and a word, where kubectl is too old for them.
+/// The base, the overlays, and the base with all components. Empty, with a message, if kubectl is missing or too old.
 static ALL: LazyLock<Vec<Made>> = LazyLock::new(|| {
     needs!("kubectl", Vec::new());
     let version = text(Command::new("kubectl").args(["version", "--client", "--output=json"]).output().unwrap());
@@ -39,7 +39,7 @@ static ALL: LazyLock<Vec<Made>> = LazyLock::new(|| {
         Made { name, objects: serde_saphyr::from_multiple(&yaml).unwrap(), yaml }
     };
     let folder = tempfile::tempdir().unwrap();
-    // kustomize follows relative paths alone.
+    // kustomize accepts only relative paths.
     let up = "../".repeat(folder.path().canonicalize().unwrap().components().count() - 1);
     let files = format!("{up}{}", project("deploy/kubernetes").display().to_string().trim_start_matches('/'));
     let own = format!(
@@ -55,7 +55,7 @@ fn of_kind<'all>(objects: &'all [Value], kind: &str) -> Vec<&'all Value> {
     objects.iter().filter(|object| object["kind"] == kind).collect()
 }
 
-/// What a generated map of settings holds; its name has a hash at its end.
+/// A value of a generated ConfigMap, whose name ends with a hash.
 fn settings<'all>(objects: &'all [Value], name: &str, key: &str) -> &'all str {
     let is_it = |map: &&&Value| map["metadata"]["name"].as_str().unwrap().rsplit_once('-').unwrap().0 == name;
     of_kind(objects, "ConfigMap").iter().find(is_it).unwrap()["data"][key].as_str().unwrap()
@@ -72,7 +72,7 @@ fn what_kustomize_makes_conforms_to_the_schemas() {
         let output = validate.args(["-m", "kubernetes_validate", "--strict"]).arg(file.path()).output().unwrap();
         let told = String::from_utf8_lossy(&output.stdout);
         let passed = told.lines().filter(|line| line.contains(" passed ")).count();
-        // Kinds that are not of Kubernetes itself are not known there.
+        // The schemas contain only the kinds of Kubernetes itself.
         let own = objects.iter().filter(|object| object["kind"] != "ServiceMonitor").count();
         assert!(passed == own && own >= 17, "{name}: {passed} of {own}\n{told}");
         assert!(!told.contains("ERROR") || *name == "base with components", "{name}: {told}");
@@ -137,7 +137,7 @@ fn the_configurations_are_taken_as_pods_get_them() {
                 let policies = of_kind(objects, "NetworkPolicy");
                 let policy = policies.into_iter().find(|one| one["metadata"]["name"] == "simulation").unwrap();
                 let ports = &policy["spec"]["ingress"][1]["ports"][0];
-                // Streams come through the server.
+                // Streams are relayed by the simulation server.
                 assert_eq!(config["streaming"], "relay", "{name}");
                 assert_eq!((ports["port"].as_u64(), ports["endPort"].as_u64()), (Some(first), None), "{name}");
                 let grace = deployment.unwrap()["spec"]["template"]["spec"]["terminationGracePeriodSeconds"].as_f64();
@@ -147,7 +147,7 @@ fn the_configurations_are_taken_as_pods_get_them() {
     }
 }
 
-/// `tests/swarm.sh` runs those on Swarm.
+/// `tests/swarm.sh` tests them on Swarm.
 #[test]
 fn the_servers_and_the_door_on_swarm_are_those_of_the_demo() {
     let read = |path: &str| std::fs::read_to_string(project("deploy").join(path)).unwrap();
@@ -164,7 +164,7 @@ fn the_servers_and_the_door_on_swarm_are_those_of_the_demo() {
         assert!(!rules(swarm, beginning).is_empty(), "{beginning}");
         assert_eq!(rules(swarm, beginning), rules(kubernetes, beginning));
     }
-    // What keeps secrets from Webots, and forged headers from servers, is that of every door.
+    // Every door has the same rules that keep secrets from Webots and forged headers from servers.
     for header in ["Authorization", "Cookie", "X-Forwarded-User", "X-Forwarded-For", "Forwarded", "Host", "Upgrade"] {
         let rule = format!("proxy_set_header {header} ");
         let wanted = rules(door, &rule);

@@ -1,11 +1,11 @@
-//! Where a server listens if `bind` says nothing: on all addresses of IPv4 and IPv6. Both kinds of servers listen by the same
-//! function.
+//! Without `bind`, a server listens on all IPv4 and IPv6 addresses. The session server is tested; both servers share the
+//! function that listens.
 
 use std::process::Command;
 
 use serde_json::json;
 
-/// Starts a server in a network of its own, and asks it over both families. Prints the first line of each answer.
+/// Starts a server in its own network and requests a page by IPv4 and IPv6. Prints the first line of each answer.
 const ASK: &str = r#"
     ip link set lo up
     "$1" "$2" >/dev/null &

@@ -1,11 +1,11 @@
-# Machines for the scripts beside this one: clean Debians whose systemd runs. To be sourced, with the script's own arguments.
+# Machines for the scripts beside this one: clean Debian systems with a running systemd. To be sourced, with the script's own arguments.
 #
-# The Debian is made by mmdebstrap once, and kept in target/deploy. The scripts can run side by side. Each machine looks at it through an overlay in
-# memory, in namespaces of its own (processes, mounts, network), so that nothing of a run is left, however it ends.
-# A script of several parts that run side by side exports PART, the name of this one.
+# mmdebstrap makes the Debian once, in target/deploy. The scripts can run in parallel. Each machine uses it through an overlay in memory, with its
+# own namespaces (processes, mounts, network), so that a run leaves nothing behind, however it ends.
+# A script whose parts run in parallel exports PART, the name of the part that runs.
 #
-# FLEET_DISTRIBUTION and FLEET_MIRROR, say 'jammy' and 'http://archive.ubuntu.com/ubuntu', make another system of it.
-# FLEET_BIN, an absolute path, names a folder with programs to package in place of building them.
+# FLEET_DISTRIBUTION and FLEET_MIRROR select another system, such as 'jammy' and 'http://archive.ubuntu.com/ubuntu'.
+# FLEET_BIN, an absolute path, is a folder with programs to package instead of building them.
 # shellcheck shell=bash
 set -Eeuo pipefail
 
@@ -15,13 +15,13 @@ cd "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/../.."
 . tests/debian.sh
 # shellcheck disable=SC1091
 readonly DISTRIBUTION=${FLEET_DISTRIBUTION:-$(. /etc/os-release && echo "${VERSION_CODENAME-}")}
-# Shared by all scripts, and this one's own.
+# The folders shared by all scripts; WORK is this script's own.
 readonly DEPLOY=$PWD/target/deploy
 readonly ROOT=$DEPLOY/$DISTRIBUTION
 WORK=${SCRIPT##*/}
 readonly WORK=$DEPLOY/${WORK%.sh}${PART:+-$PART}
 readonly PACKAGES=systemd,systemd-sysv,libpam-systemd,dbus,dbus-user-session,sudo,adduser,ca-certificates,openssl,curl
-# What is installed later, in machines that can't reach the internet.
+# Packages that are installed later, in machines without internet.
 readonly LATER=(git git-lfs bubblewrap xvfb ufw nginx apache2 certbot needrestart nftables passt)
 
 fail() {
@@ -29,8 +29,7 @@ fail() {
     exit 1
 }
 
-# Where this can't be tested it has not passed: it ends with 77, as skipped tests do; where everything has to be tested
-# (CI is set) it has failed.
+# Ends with 77, as skipped tests do, if this machine can't run the test; if everything must be tested (CI is set), it fails.
 skip() { # WHY
     [[ -z ${CI-} ]] || fail "this has to be tested where CI is set, and can't: $*"
     printf 'skipped: %s: %s\n' "${SCRIPT##*/}" "$*" >&2
@@ -62,14 +61,14 @@ machine() { # NAME
     mount --bind "$WORK/packages" mnt/packages
     echo "$1" >etc/hostname
     echo "127.0.0.1 localhost $1" >etc/hosts
-    # A change of root, since processes below a mere chroot may not have namespaces for users.
+    # Not chroot: it would prevent processes from creating user namespaces.
     pivot_root . mnt/old
     cd /
     umount --lazy mnt/old
     exec /usr/bin/env -i container=other PATH=/usr/sbin:/usr/bin:/sbin:/bin /lib/systemd/systemd --system
 }
 
-# --- Machines, seen from outside. Functions that name none are about the machine `here`.
+# --- Machines, seen from outside. Functions without a machine argument use the machine `here`.
 
 here=
 declare -A cgroups=() keepers=() inits=()
@@ -112,7 +111,7 @@ eventually() { # COMMAND...
     done
 }
 
-# Starts a machine, and makes it the one that is meant from now on.
+# Starts a machine and makes it the current one, `here`.
 boot() { # NAME
     local children top init=
     here=$1
@@ -122,7 +121,7 @@ boot() { # NAME
     mkdir -p "$WORK/machines/$here"
     (
         echo "$BASHPID" >"${cgroups[$here]}/cgroup.procs"
-        # Whatever ends this script ends the machine.
+        # The machine ends with this script, however that ends.
         exec setpriv --pdeathsig KILL unshare --mount --pid --fork --kill-child --cgroup --ipc --uts --net \
             "$SCRIPT" machine "$here" </dev/null
     ) &
@@ -148,7 +147,7 @@ make_root() {
     [[ -n $(debian_mirror) ]] || skip 'this is no Debian or Ubuntu with a package mirror'
     rm -rf "$ROOT"
     echo "makes a clean $DISTRIBUTION, once"
-    # What was downloaded stays, and the lists of packages. mmdebstrap itself wants no recommended packages.
+    # Keeps the downloaded packages and the package lists. mmdebstrap turns recommended packages off, so they are requested here.
     make_debian "$DISTRIBUTION" "$PACKAGES" "$ROOT" --skip=cleanup/apt \
         --customize-hook="chroot \"\$1\" apt-get --option APT::Install-Recommends=true install --quiet --yes --download-only ${LATER[*]}" >"$WORK/mmdebstrap.log" 2>&1 || {
         tail -n 5 "$WORK/mmdebstrap.log" >&2
@@ -157,14 +156,14 @@ make_root() {
     echo "$made" >"$ROOT/.complete"
 }
 
-# Whether the packages are of these programs and files. What is to be built is always packaged anew.
+# Whether the packages are up to date. Without FLEET_BIN they are always made again.
 packages_are_made() {
     [[ -n ${FLEET_BIN-} && -e $DEPLOY/packages/of && $(<"$DEPLOY/packages/of") == "$FLEET_BIN" ]] &&
         [[ -z $(find "$FLEET_BIN"/{session-server,simulation-server,demo-simulator,rehearse} Cargo.* config deploy docs server.sh templates \
             -newer "$DEPLOY/packages/of" -print -quit) ]]
 }
 
-# Two packages: what is built here, and a later version in which every program, an example and a configuration differ.
+# Makes two packages: the current version, and a later one in which every program, an example and a configuration differ.
 make_packages() {
     local file made=$DEPLOY/packages release=$DEPLOY/release unpacked=$DEPLOY/unpacked
     rm -rf "$made" "$release" "$unpacked"
@@ -175,7 +174,7 @@ make_packages() {
     mv "$release"/*.tar.gz "$made/release.tar.gz"
     dpkg-deb --raw-extract "$made/1.deb" "$unpacked"
     sed -i 's/^Version: .*-1$/Version: 999.0.0-2/' "$unpacked/DEBIAN/control"
-    # What follows a program in its file does not change what it does.
+    # Bytes appended to a program do not change its behaviour.
     for file in "$unpacked"/usr/bin/* "$unpacked/usr/share/webots-fleet/nginx.conf"; do
         printf '\n# later\n' >>"$file"
     done
@@ -186,7 +185,7 @@ make_packages() {
     echo "${FLEET_BIN-}" >"$made/of"
 }
 
-# What takes no programs under test. One script makes it, the others wait.
+# Prepares what does not need the programs under test. One script makes it, the others wait.
 prepare_root() {
     local tool lock
     [[ $(id -u) == 0 ]] || skip 'only root can make a Debian of its own'
@@ -200,7 +199,7 @@ prepare_root() {
     exec {lock}>&-
 }
 
-# Everything that machines need. The packages are made by one script, too.
+# Prepares everything that machines need. One script makes the packages, the others wait.
 prepare() {
     local lock
     prepare_root
@@ -216,7 +215,7 @@ prepare() {
 
 readonly GUIDE=docs/deployment.md
 
-# The commands of a part of the guide: all of its blocks, or the one of this number.
+# The commands of a section of the guide: all of its blocks, or the block of this number.
 commands() { # HEADING [NUMBER]
     local found
     found=$(awk -v heading="$1" -v number="${2-0}" '
@@ -227,7 +226,7 @@ commands() { # HEADING [NUMBER]
     printf '%s\n' "$found"
 }
 
-# --- What is asked of servers.
+# --- Checks of servers.
 
 answers() { # PORT PATH WORDS
     local answer
@@ -238,14 +237,14 @@ property() { # UNIT NAME
     in_machine systemctl show --property="$2" --value "$1"
 }
 
-# Whether a program runs that is called so.
+# Whether a program whose name matches this pattern runs.
 runs() { # PATTERN
     local names
     names=$(in_machine sh -c 'cat /proc/[0-9]*/comm 2>/dev/null || true')
     grep --quiet --line-regexp --extended-regexp -- "$1" <<<"$names"
 }
 
-# Whether a file is the later package's; /proc/PID/exe is the program that runs, upgraded or not.
+# Whether a file is from the later package; /proc/PID/exe is the program that runs, upgraded or not.
 is_later() { # FILE
     in_machine tail --bytes=8 "$1" | grep --quiet --text --line-regexp '# later'
 }
@@ -254,12 +253,12 @@ drains() {
     answers 2000 /status '"draining":true'
 }
 
-# Whether a unit runs, with another process than this one.
+# Whether a unit is active with a main process other than this one.
 is_another() { # UNIT PID
     [[ $(property "$1" ActiveState) == active && $(property "$1" MainPID) != "$2" ]]
 }
 
-# A git repository with a world.
+# Makes a git repository with a world.
 make_project() { # FOLDER WORLD
     # shellcheck disable=SC2016
     in_machine sh -c '
@@ -273,10 +272,10 @@ make_project() { # FOLDER WORLD
         git -c user.name=Test -c user.email=test@localhost commit --quiet --message test' project "$1" "$2"
 }
 
-# A client that asks for a simulation, and keeps its connection open until it is ended, see `leave`.
+# A client that starts a simulation and keeps its connection open until `leave` ends it.
 simulate() { # URL
     local message="{\"start\":{\"url\":\"$1\"}}" mask='\x00\x00\x00\x00' text
-    # Masked with zeros, the text of a frame is the text itself.
+    # With a mask of zeros, the text of a frame is unchanged.
     printf -v text '\\x81\\xfe\\x%02x\\x%02x%s%s' $((${#message} / 256)) $((${#message} % 256)) "$mask" "$message"
     # shellcheck disable=SC2016
     in_machine bash -c '
@@ -292,7 +291,7 @@ leave() {
     in_machine sh -c 'kill "$(cat /run/client.pid)"'
 }
 
-# Whether the client is told that its simulation is alive, as it is every few seconds.
+# Whether the client has received more messages, such as the periodic heartbeats.
 hears_more() { # LENGTH OF ITS LOG BEFORE
     (($(stat --format=%s "$WORK/client.log") > $1))
 }

@@ -1,4 +1,4 @@
-//! What a service manager, an administrator and a display see of the servers.
+//! The servers below a service manager and with displays, and the files of `deploy/`.
 
 mod containers;
 mod display;

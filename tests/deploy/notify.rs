@@ -1,4 +1,4 @@
-//! A service manager: it hears when a server is ready, has drained and stops. `tests/deploy/package.sh` has a real one.
+//! Notifications of a service manager: ready, drained, stopping. `tests/deploy/package.sh` tests with a real systemd.
 
 use nix::sys::signal::Signal;
 use tokio::net::UnixDatagram;
@@ -6,7 +6,7 @@ use tokio::net::UnixDatagram;
 use crate::support::program::{Builder, Server, demo_server, session_server};
 use crate::support::{SOON, http};
 
-/// Starts a server below a stand-in for systemd, and has it do what signals say. Each is told of before it happens.
+/// Starts a server below a stand-in for systemd and sends it signals; the server sends these messages for each.
 async fn tells(server: Builder, signals: &[(Signal, &[&str])]) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("notify");

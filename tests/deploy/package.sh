@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
 # Installs, runs, upgrades, removes and purges the Debian package in a clean Debian whose systemd runs the servers.
-# tests/deploy/machine.sh tells what such a Debian is, and which variables count.
+# tests/deploy/machine.sh describes this Debian and the environment variables.
 # shellcheck source=tests/deploy/machine.sh
 . "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/machine.sh"
 
-# Every file of the machine that has to do with the package.
+# Every file and user of the machine that belongs to the package.
 traces() {
     in_machine sh -c 'find / -xdev \( -name "*webots*" -o -name "*simulation-server*" -o -name "*session-server*" \) \
         -not -path "/mnt/*" -not -path "/proc/*" -not -path "/sys/*"; getent passwd | grep webots || true'
@@ -20,7 +20,7 @@ nothing_runs() {
     ! runs 'session-server|simulation-serv'
 }
 
-# Whether the packet filter of containers is loaded.
+# Whether the containers' packet filter is loaded.
 filters() {
     in_machine nft list table inet webots_fleet >/dev/null 2>&1
 }
@@ -29,12 +29,12 @@ user_property() { # UNIT NAME
     as_lab systemctl --user show --property="$2" --value "$1"
 }
 
-# What a user with a session of its own does.
+# Runs a command as a user with a login session.
 as_lab() { # COMMAND...
     in_machine runuser -u lab -- env HOME=/home/lab XDG_RUNTIME_DIR="/run/user/$(in_machine id -u lab)" "$@"
 }
 
-# Another unit that runs a program of the package: needrestart does restart such units.
+# Starts another unit that runs a program of the package: needrestart does restart such units.
 spared_by_needrestart_begins() {
     # shellcheck disable=SC2016
     in_machine sh -c '
@@ -74,7 +74,7 @@ main() {
     in_machine sed -i 's|"webotsHome": .*|"webots": "/usr/bin/demo-simulator", "gitMirrors": {"https://github.com/cyberbotics/demo": "file:/srv/webots-demo/project"},|; s|"xvfb": true|"xvfb": false|' \
         /etc/webots-fleet/simulation/main.json
     in_machine systemctl enable --quiet webots-session@main webots-simulation@main
-    # As the machine does when it boots.
+    # As at boot.
     in_machine systemctl start multi-user.target
     answers 2000 /health ok || fail 'a simulation server that is ready does not answer'
     answers 1999 /health ok || fail 'a session server that is ready does not answer'
@@ -95,7 +95,7 @@ main() {
     in_machine systemd-analyze verify webots-fleet-packet-filter.service || fail 'systemd finds faults in the packet filter'
     in_machine systemctl enable --quiet --now nftables webots-fleet-packet-filter
     filters || fail 'it is not loaded'
-    # Both begin with an empty set of rules.
+    # Both flush all rules first.
     in_machine systemctl reload nftables
     eventually filters
     in_machine systemctl restart nftables
@@ -216,7 +216,7 @@ main() {
     as_lab sed -i 's|"webotsHome": .*|"webots": "/usr/bin/demo-simulator", "gitMirrors": {"https://github.com/cyberbotics/demo": "file:/srv/webots-demo/project"},|; s|"xvfb": true|"xvfb": false|' \
         /home/lab/.config/webots-fleet/simulation/main.json
     commands 'Units of a user' | sed -n '/^systemctl/p' >"$WORK/packages/commands"
-    # Of a desktop session there is what starts the units of a user.
+    # A target in place of a desktop session, to start the user's units.
     in_machine sh -c 'printf "[Unit]\nBindsTo=graphical-session.target\nBefore=graphical-session.target\n" >/etc/systemd/user/desktop.target'
     as_lab systemctl --user daemon-reload
     as_lab systemd-analyze --user verify webots-session@main.service webots-simulation@main.service || fail 'systemd finds faults in units of a user'

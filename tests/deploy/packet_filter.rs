@@ -1,4 +1,4 @@
-//! `deploy/nftables/containers.nft` on a machine of network namespaces: what containers reach with it, and what without.
+//! `deploy/nftables/containers.nft` in network namespaces: what containers reach with it and without it.
 
 use std::fs::File;
 use std::io::{self, ErrorKind, Read, Write};
@@ -13,14 +13,14 @@ use webots_fleet::simulation::container::packet_filter;
 
 use crate::support::{SOON, skip};
 
-/// What clouds and carriers have at addresses of their own.
+/// Metadata services of clouds, carrier-grade NAT and private networks.
 const SPECIAL: [&str; 4] = ["169.254.169.254", "168.63.129.16", "100.64.0.9", "10.9.9.9"];
 
 /// A network namespace.
 struct Place(File);
 
 impl Place {
-    /// Nothing where none may be made.
+    /// `None` if this process may not create one.
     fn new() -> Option<Self> {
         let made = std::thread::spawn(|| {
             unshare(CloneFlags::CLONE_NEWNET).ok()?;
@@ -29,7 +29,7 @@ impl Place {
         made.join().unwrap()
     }
 
-    /// Does something there. What it starts and opens stays there.
+    /// Runs a function in the namespace. Processes that it starts and sockets that it opens stay there.
     fn within<T: Send>(&self, act: impl FnOnce() -> T + Send) -> T {
         std::thread::scope(|scope| {
             let there = scope.spawn(|| {
@@ -40,19 +40,19 @@ impl Place {
         })
     }
 
-    /// Runs commands there, each in a line.
+    /// Runs shell commands in the namespace, one per line.
     fn run(&self, commands: &str) {
         let script = format!("set -eu\n{commands}");
         let output = self.within(|| Command::new("sh").args(["-xc", &script]).output().unwrap());
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     }
 
-    /// What `ip` calls it.
+    /// Its name for `ip`.
     fn name(&self) -> String {
         format!("/proc/{}/fd/{}", std::process::id(), self.0.as_raw_fd())
     }
 
-    /// Runs nft there: whether it succeeds.
+    /// Runs nft in the namespace; returns whether it succeeds.
     fn nft(&self, arguments: &[&str]) -> bool {
         let output = self.within(|| Command::new("/usr/sbin/nft").args(arguments).output().unwrap());
         print!("{}", String::from_utf8_lossy(&output.stderr));
@@ -68,7 +68,7 @@ impl Place {
         self.within(|| TcpStream::connect_timeout(&address, SOON))
     }
 
-    /// Whether a connection can be made, or is refused at once: a filter that says nothing would cost programs minutes.
+    /// Whether a connection succeeds. Panics on a timeout: a filter must reject at once, or programs would wait for minutes.
     fn reaches(&self, address: &str) -> bool {
         match self.connect(address) {
             Ok(_) => true,
@@ -77,17 +77,17 @@ impl Place {
         }
     }
 
-    /// Whether datagrams from here arrive at a socket elsewhere, or their sender is told that they may not.
+    /// Whether datagrams from here arrive at a socket elsewhere (true), or are rejected (false).
     fn sends(&self, address: &str, to: &UdpSocket) -> bool {
         let from = self.within(|| UdpSocket::bind("0.0.0.0:0").unwrap());
         from.connect(address).unwrap();
         for socket in [&from, to] {
             socket.set_read_timeout(Some(Duration::from_millis(10))).unwrap();
         }
-        // Those of other sockets may still be under way.
+        // Datagrams of other sockets may still be in transit.
         let own = from.local_addr().unwrap().port();
         let arrives = || to.recv_from(&mut [0; 8]).is_ok_and(|(_, sender)| sender.port() == own);
-        // A sender is told of an earlier datagram that was refused.
+        // The error of a rejected datagram is reported at a later call.
         let is_told = |result: io::Result<usize>| result.is_err_and(|error| error.kind() == ErrorKind::HostUnreachable);
         let deadline = Instant::now() + SOON;
         while Instant::now() < deadline {
@@ -113,7 +113,7 @@ struct Network {
 }
 
 impl Network {
-    /// Nothing, and a word, where it can't be made.
+    /// `None`, with a message, if it can't be created.
     fn new() -> Option<Self> {
         needs!("ip", None);
         let Some(machine) = Place::new() else {
@@ -177,7 +177,7 @@ impl Network {
             self.internet.run(&format!("ip address add {address}/32 dev eth0"));
             self.machine.run(&format!("ip route add {address} dev internet"));
         }
-        // As Docker does for ports that are published.
+        // As Docker does for published ports.
         self.machine.run(
             "nft add table ip ports
             nft 'add chain ip ports arriving { type nat hook prerouting priority dstnat; }'
@@ -186,7 +186,7 @@ impl Network {
         );
     }
 
-    /// Connects a place to the machine.
+    /// Connects a namespace to the machine.
     fn cable(&self, place: &Place, device: &str, how: &str) {
         self.machine.run(&format!(
             "ip link add {device} type veth peer name eth0 netns {}
@@ -202,7 +202,7 @@ impl Network {
         assert!(self.machine.nft(&["-f", file.to_str().unwrap()]));
     }
 
-    /// What its unit runs at the end.
+    /// Runs what the systemd unit runs when it stops.
     fn unload(&self) {
         let file =
             Path::new(env!("CARGO_MANIFEST_DIR")).join("deploy/systemd/system/webots-fleet-packet-filter.service");
@@ -223,7 +223,7 @@ fn arrives(mut from: &TcpStream, mut to: &TcpStream) -> bool {
 fn containers_reach_the_internet_and_nothing_near() {
     let Some(network) = Network::new() else { return };
     let Network { machine, container, neighbour, closed, lab, internet } = &network;
-    // They take connections of both families. What listens at 2001 of the machine is Docker's proxy.
+    // They accept IPv4 and IPv6. Port 2001 of the machine stands in for Docker's proxy.
     let web = internet.listen("[::]:80");
     let _servers = [
         machine.listen("[::]:22"),
@@ -244,7 +244,7 @@ fn containers_reach_the_internet_and_nothing_near() {
     }
     let beside = |from: &Place| if std::ptr::eq(from, closed) { "172.30.0.2:2001" } else { "172.31.0.2:2001" };
 
-    // What is closed later is so by the filter alone.
+    // Without the filter everything is reachable, so only the filter blocks later.
     for from in [container, closed] {
         for address in near.iter().map(String::as_str).chain(far).chain([asked, beside(from)]) {
             assert!(from.reaches(address), "{address} without the filter");
@@ -255,7 +255,7 @@ fn containers_reach_the_internet_and_nothing_near() {
     let lasting = container.connect("203.0.113.2:80").unwrap();
     let here = lasting.local_addr().unwrap();
     let is_same = |one: SocketAddr| (one.ip().to_canonical(), one.port()) == (here.ip(), here.port());
-    // Those of before come first.
+    // Skips the earlier connections.
     let lasting_end = web.incoming().map(Result::unwrap).find(|one| is_same(one.peer_addr().unwrap())).unwrap();
 
     let is_kept = |exceptions: &[&str]| {
@@ -270,7 +270,7 @@ fn containers_reach_the_internet_and_nothing_near() {
             assert!(container.reaches(address) && !closed.reaches(address), "{address} with the filter");
         }
         assert!(container.sends(asked, &names) && !closed.sends(asked, &names));
-        // Clients reach what is published, from outside and on the machine itself, and so do answers them.
+        // Clients reach published ports, from outside and from the machine itself, and receive answers.
         for (from, address) in [
             (internet, "203.0.113.1:2001"),
             (internet, "203.0.113.1:2002"),
@@ -285,7 +285,7 @@ fn containers_reach_the_internet_and_nothing_near() {
     };
     network.load();
     is_kept(&[]);
-    // Docker, ufw and firewalld make their own rules anew now and then.
+    // Docker, ufw and firewalld replace their own rules now and then.
     assert!(machine.nft(&["add", "table", "ip", "filter"]) && machine.nft(&["flush", "table", "ip", "filter"]));
     network.load();
     is_kept(&[]);
@@ -306,7 +306,7 @@ fn a_container_does_not_reach_its_neighbour() {
     let Some(network) = Network::new() else { return };
     let shown = network.machine.within(|| std::fs::read_to_string("/proc/sys/net/bridge/bridge-nf-call-iptables"));
     if !shown.is_ok_and(|shown| shown.trim() == "1") {
-        // dockerd loads br_netfilter, without which no filter sees what goes through a bridge.
+        // Without br_netfilter, which dockerd loads, no filter sees packets that cross a bridge.
         return skip("there is no br_netfilter");
     }
     let _controller = network.neighbour.listen("[::]:2001");

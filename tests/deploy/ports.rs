@@ -1,4 +1,4 @@
-//! The patterns of ports that rules and the documentation name: they match what a fleet has, and nothing else.
+//! The port patterns in web server rules and in the documentation: they match the ports of a fleet and no others.
 
 use regex_lite::Regex;
 use serde_json::Value;
@@ -21,7 +21,7 @@ fn the_rules_forward_only_configured_ports() {
     let pattern = Regex::new(r"\^/\((?:\?<fleet_port>)?([0-9|\[\]-]+\|[0-9|\[\]-]+)\)/").unwrap();
     for (name, rules) in RULES {
         let patterns: Vec<&str> = pattern.captures_iter(rules).map(|found| found.get(1).unwrap().as_str()).collect();
-        // Of this machine, and of another in what has a '#' in front; WebSockets have rules of their own in Apache.
+        // One for this machine, and one for another machine, commented out. Apache has separate rules for WebSockets.
         let each = if name == "apache.conf" { 2 } else { 1 };
         assert_eq!(patterns.len(), 2 * each, "{name}: {patterns:?}");
         for (pattern, first) in patterns.iter().zip([port, 3000].iter().flat_map(|first| vec![first; each])) {
@@ -41,7 +41,7 @@ fn the_documentation_names_patterns_for_what_they_match() {
     for row in rows {
         let [port, places, first, last] = [1, 2, 3, 4].map(|column| row[column].parse::<u16>().unwrap());
         assert_eq!((port, port + places), (first, last), "{row:?}");
-        // A table has no bare '|'.
+        // Markdown tables escape '|'.
         assert_eq!(matched(&row[5].replace(r"\|", "|")), (first..=last).collect::<Vec<_>>(), "{row:?}");
     }
 }

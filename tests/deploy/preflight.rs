@@ -1,4 +1,4 @@
-//! `simulation-server --check`: the configuration on standard output, what the machine has and lacks beside it.
+//! `simulation-server --check`: the configuration on standard output, what the machine has and lacks on standard error.
 
 use std::os::unix::fs::symlink;
 use std::process::Command;
@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 
 use crate::support::webots::Webots;
 
-/// Runs `--check` with these keys; gives back what it prints and what it tells beside.
+/// Runs `--check` with these keys; returns the configuration and the messages on standard error.
 pub fn check(keys: &Value, change: impl FnOnce(&mut Command)) -> (Value, String) {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("config.json");
@@ -41,7 +41,7 @@ fn nothing_is_warned_about_where_all_is_there() {
          isolation: sandbox\nnetwork: ",
         webots.path().display()
     );
-    // The network is the machine's or one of each simulation's own.
+    // The network is either the machine's, or each simulation has its own.
     assert!(told.starts_with(&expected) && told.lines().count() == 6, "{told}");
 }
 

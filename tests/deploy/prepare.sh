@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Makes what the scripts beside this one share, and what takes no programs under test, so that they need not wait for it.
+# Makes what the scripts beside this one share and what needs no programs under test, so that they need not wait for it.
 # shellcheck source=tests/deploy/machine.sh
 . "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/machine.sh"
 

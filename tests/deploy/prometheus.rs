@@ -1,4 +1,4 @@
-//! `deploy/prometheus`: what promtool says of it, and whether it names what the servers export.
+//! `deploy/prometheus`, checked by promtool, and the metrics it names against those that the servers export.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -19,7 +19,7 @@ fn read(path: &str) -> String {
     std::fs::read_to_string(project(path)).unwrap()
 }
 
-/// Runs promtool, which has to be content.
+/// Runs promtool, which must succeed.
 fn promtool(arguments: &[&str], file: &Path) {
     needs!("promtool");
     let output = Command::new("promtool").args(arguments).arg(file).output().unwrap();
@@ -34,7 +34,7 @@ fn queries() -> Vec<String> {
     targets.map(|target| target["expr"].as_str().unwrap().to_owned()).collect()
 }
 
-/// The metrics of servers that a text names.
+/// The servers' metrics that a text names.
 fn named(text: &str) -> BTreeSet<String> {
     let metric = Regex::new("webots_(session|simulation|machine)_[a-z_]+").unwrap();
     metric.find_iter(text).map(|found| found.as_str().to_owned()).collect()
@@ -85,7 +85,7 @@ async fn alerts_dashboard_and_docs_name_exported_metrics() {
         assert!(named.len() > 5 && unknown.is_empty(), "{what}: {unknown:?} of {named:?}");
     }
     let docs = read("docs/operations.md");
-    // There a histogram stands for its three metrics.
+    // The documentation names a histogram instead of its three metrics.
     let parts = Regex::new("_(bucket|sum|count)$").unwrap();
     let all = all.iter().map(|name| parts.replace(name, "").into_owned()).collect();
     assert_eq!(named(&docs), all, "the docs on the left");

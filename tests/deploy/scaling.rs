@@ -1,10 +1,10 @@
-//! The commands and files for Kubernetes in docs/scaling.md as they stand, as far as they can be tried without a cluster.
-//! `tests/swarm.sh` runs those for Docker Swarm on a real one.
+//! The commands and files for Kubernetes in docs/scaling.md, as far as they can be run without a cluster.
+//! `tests/swarm.sh` runs those for Docker Swarm on a real swarm.
 //!
-//! | stands in | for | because |
+//! | stand-in | for | because |
 //! |---|---|---|
-//! | a script | `docker` | images are not built here: what is asked for has to be in the Dockerfile |
-//! | a script | `kubectl` | there is no cluster: what is applied has to be there, and kubectl itself puts it together |
+//! | a script | `docker` | no images are built: the requested stages must be in the Dockerfile |
+//! | a script | `kubectl` | there is no cluster: the applied files must exist, and the real kubectl renders them |
 
 use std::path::Path;
 use std::process::Command;
@@ -27,7 +27,7 @@ case "$1 $2" in
 *) exit 1 ;;
 esac"#;
 
-/// Runs a command in a folder, with the programs of another before those of this machine; returns what it prints.
+/// Runs a command in a folder, with `programs` first in the path; returns its output.
 fn run(folder: &Path, programs: &Path, command: &str) -> String {
     let search = format!("{}:{}", programs.display(), std::env::var("PATH").unwrap());
     let mut bash = Command::new("bash");

@@ -1,8 +1,8 @@
-//! Input of any kind: what the readers of foreign texts do with mutations of committed examples (`seeds/`). None may
-//! panic, take long, or let through what breaks a rule.
+//! Fuzzing: parsers of untrusted input get mutations of committed examples (`seeds/`). None may panic, take long, or
+//! accept input that breaks a rule.
 //!
-//! `INPUTS=1000000 cargo test --test integration inputs::` runs a million cases of each. A case that has failed is kept in
-//! `regressions.txt` beside this file, and is tried first from then on. What Webots prints is tried where it is read:
+//! `INPUTS=1000000 cargo test --test integration inputs::` runs a million cases of each. Failed cases are kept in
+//! `regressions.txt` beside this file, and later runs try them first. The parser of Webots' output has a unit test:
 //! `PROPTEST_CASES=1000000 cargo test --lib every_line_is_short`.
 
 mod mutations;
@@ -23,12 +23,12 @@ use webots_fleet::simulation::config::SimulationConfig;
 use webots_fleet::simulation::container::{ProjectKind, WebotsYml};
 use webots_fleet::simulation::protocol::{ClientRequest, error};
 
-/// How many cases of each kind are tried where nothing else is asked for.
+/// The default number of cases of each kind.
 const CASES: u32 = 3_000;
-/// How much processor time one case may take, whatever else runs on the machine. A reader that hangs takes more.
+/// Limit of the processor time of one case; other load on the machine does not count. A parser that hangs exceeds it.
 const BOUND: Duration = Duration::from_secs(2);
 
-/// Tries a check with mutations of the lines of `seeds`. The check panics where a rule is broken.
+/// Runs a check on mutations of the lines of `seeds`. The check panics if a rule is broken.
 fn try_many(seeds: &'static str, check: impl Fn(&[u8])) {
     let cases = std::env::var("INPUTS").map_or(CASES, |text| text.parse().unwrap());
     let failure_persistence = Some(Box::new(FileFailurePersistence::Direct("tests/inputs/regressions.txt")) as _);
@@ -48,12 +48,12 @@ fn processor_time() -> Duration {
     ClockId::CLOCK_THREAD_CPUTIME_ID.now().unwrap().into()
 }
 
-/// Whether a text is one line that a terminal or a page shows as it is.
+/// Whether a text is one line without control characters.
 fn is_one_line(text: &str) -> bool {
     !text.chars().any(char::is_control)
 }
 
-/// What a web client sends.
+/// A web client's messages.
 #[test]
 fn any_message_is_answered_in_the_form_of_the_protocol() {
     try_many(include_str!("seeds/client_message.txt"), |input| {
@@ -67,7 +67,7 @@ fn any_message_is_answered_in_the_form_of_the_protocol() {
             Err(wrong) => {
                 let told = error(&wrong.to_string());
                 assert!(told.starts_with("loading: Error: Wrong message: "), "{told}");
-                // Webots' page puts the text into its HTML.
+                // Webots' page inserts the text as HTML.
                 assert!(!told.contains(['<', '>', '&']) && is_one_line(&told), "{told}");
                 assert!(!told.contains("expected struct"), "{told}");
             }
@@ -98,7 +98,7 @@ fn is_read_or_refused<C: Configuration>(file: &Path) {
     }
 }
 
-/// The header in which web servers tell whom they forward; anybody can write it.
+/// The header in which web servers name the client that they forward; any client can forge it.
 #[test]
 fn only_a_trusted_proxy_is_believed_and_only_addresses_are() {
     let trusted: TrustedProxies = serde_json::from_str(r#"["127.0.0.0/8", "10.0.0.0/8"]"#).unwrap();
@@ -121,7 +121,7 @@ fn only_a_trusted_proxy_is_believed_and_only_addresses_are() {
     });
 }
 
-/// Whether a header names an address, in whatever spelling.
+/// Whether a header contains an address, in any spelling.
 fn is_named(header: &[u8], address: IpAddr) -> bool {
     let text = String::from_utf8_lossy(header);
     let pieces = || text.split([',', ';', '=', ' ', '\t', '"', '[', ']', '%']);
@@ -129,7 +129,7 @@ fn is_named(header: &[u8], address: IpAddr) -> bool {
     pieces().chain(ports).filter_map(|piece| piece.parse::<IpAddr>().ok()).any(|one| one.to_canonical() == address)
 }
 
-/// What a simulation server answers, or whatever is listed as one.
+/// Answers of a simulation server, or of any host that is listed as one.
 #[test]
 fn a_report_is_a_load_and_short_lines_whatever_a_server_answers() {
     let world = ProjectUrl::parse("https://github.com/lab/arm/blob/main/worlds/a.wbt").unwrap();
@@ -143,7 +143,7 @@ fn a_report_is_a_load_and_short_lines_whatever_a_server_answers() {
         if let Some(instances) = report.instances {
             assert!(instances.present() >= instances.running, "{report:?}");
         }
-        // It answers, whatever the rules are.
+        // It returns, whatever rules were reported.
         std::hint::black_box(report.accepts(&world));
         let again = serde_json::to_vec(&report).unwrap();
         assert!(ServerReport::parse(&again).is_ok(), "{report:?}");
@@ -163,7 +163,7 @@ fn a_load_is_a_number_from_0_whatever_a_server_answers() {
 #[test]
 fn any_webots_yml_requests_nothing_outside_of_its_project() {
     try_many(include_str!("seeds/webots_yml.txt"), |input| {
-        // Each example is a line of its file.
+        // Each example is one line of `seeds`, with escaped line ends.
         let text = String::from_utf8_lossy(input).replace("\\n", "\n").replace("\\r", "\r");
         let found = WebotsYml::parse(&text);
         assert!(found.warnings.iter().all(|warning| is_one_line(warning)), "{:?}", found.warnings);
@@ -181,7 +181,7 @@ fn any_webots_yml_requests_nothing_outside_of_its_project() {
     });
 }
 
-/// The URL of a world: no path outside of the repository, no option of git, nothing that a shell or a page would run.
+/// The URL of a world: no path outside the repository, no git option, nothing that a shell or a page would run.
 #[test]
 fn a_world_is_inside_of_its_repository_whatever_its_url_says() {
     try_many(include_str!("seeds/world_url.txt"), |input| {

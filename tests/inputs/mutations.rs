@@ -1,9 +1,9 @@
-//! Mutations of examples: pieces go, come twice, are replaced by pieces that have broken other programs, or by any bytes.
+//! Mutations of examples: parts are removed or repeated; random bytes or strings known to break programs are inserted.
 
 use proptest::prelude::*;
 use proptest::sample::{Index, select};
 
-/// Pieces that mean something to a path, a shell, git, JSON, a page or a header.
+/// Strings with a meaning in paths, shells, git, JSON, pages or headers.
 const SHORT: [&str; 36] = [
     "..", "/", "//", "%2e", "%2f", "%00", "%0a", "%", "\\", "~", "-", "ext::", "file://", "$(id)", "`id`", ";", "|",
     "&", "\"", "\\u0000", "\\ud800", "{", "}", "[", "]", ",", ":", "null", "true", "-1", "1e999", "0.1", "\n", "\r\n",
@@ -11,16 +11,16 @@ const SHORT: [&str; 36] = [
 ];
 const LONG: [&str; 4] = ["--upload-pack=id", "<img src=x>", "99999999999999999999", "\u{202e}"];
 
-/// One change of a text.
+/// One change to a text.
 #[derive(Debug, Clone)]
 enum Mutation {
-    /// These bytes come in.
+    /// Inserts these bytes.
     Insert(Index, Vec<u8>),
-    /// So many bytes go.
+    /// Removes this many bytes.
     Remove(Index, usize),
-    /// So many bytes come so often again.
+    /// Repeats this many bytes this many times.
     Repeat(Index, usize, usize),
-    /// What follows goes, and the end of another example comes.
+    /// Replaces the rest by the end of another example.
     Join(Index, Index, Index),
 }
 

@@ -1,4 +1,4 @@
-//! What `server.sh` builds, with a cargo that only notes what it is asked for and hands out the programs under test.
+//! What `server.sh` builds, with a stand-in for cargo that records its arguments and provides the programs under test.
 
 use std::process::Command;
 
@@ -10,7 +10,7 @@ mkdir -p target/release
 cp --remove-destination "$PROGRAMS"/session-server "$PROGRAMS"/simulation-server "$PROGRAMS"/demo-simulator target/release
 "#;
 
-/// What a start prints, and what it asks cargo for. The servers are stopped again.
+/// Starts and stops the servers; returns the output of the start, and the recorded calls of cargo.
 fn start(project: &Project, name: &str) -> (String, String) {
     let server_sh = |arguments: &[&str]| {
         let path = format!("{}:{}", project.path("bin-of-cargo").display(), std::env::var("PATH").unwrap());

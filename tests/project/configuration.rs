@@ -1,4 +1,4 @@
-//! The shipped configuration files, and the page that explains every key.
+//! The shipped configuration files, and `docs/configuration.md`, which explains every key.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -11,12 +11,12 @@ use webots_fleet::simulation::config::SimulationConfig;
 
 use super::copy::{root, walk};
 
-/// A server: its program, its part of the page, and other names of its keys.
+/// A server: its program, its section of the page, and the aliases of its keys.
 struct Kind {
     program: &'static str,
     heading: &'static str,
     aliases: &'static [&'static str],
-    /// The configuration with the least keys.
+    /// The configuration with the fewest keys.
     smallest: Value,
 }
 
@@ -38,14 +38,14 @@ fn kinds() -> [Kind; 2] {
 }
 
 impl Kind {
-    /// What `--check` says of a configuration.
+    /// Runs `--check` on the text of a configuration.
     fn check(&self, config: &str) -> Output {
         let file = tempfile::NamedTempFile::new().unwrap();
         std::fs::write(file.path(), config).unwrap();
         check(self.program, file.path())
     }
 
-    /// Every key with its default; of a part, as `part.key`.
+    /// Every key with its default; nested keys as `part.key`.
     fn defaults(&self) -> BTreeMap<String, Value> {
         let output = self.check(&self.smallest.to_string());
         let Value::Object(all) = serde_json::from_slice(&output.stdout).unwrap() else { panic!("{output:?}") };
@@ -61,14 +61,14 @@ impl Kind {
         keys
     }
 
-    /// Its part of the page.
+    /// Its section of the page.
     fn page(&self) -> String {
         let page = std::fs::read_to_string(root().join("docs/configuration.md")).unwrap();
         let (_, part) = page.split_once(&format!("{}\n", self.heading)).unwrap();
         part.split("\n## ").next().unwrap().to_owned()
     }
 
-    /// The rows of the tables on the page: a key, and what its row says of the default.
+    /// The rows of the page's tables: each key, and its documented default.
     fn rows(&self) -> Vec<(String, String)> {
         let page = self.page();
         let rows = page.lines().filter_map(|line| line.strip_prefix("| `"));
@@ -80,7 +80,7 @@ impl Kind {
     }
 }
 
-/// Runs `--check`, and keeps of its remarks what they say of the file.
+/// Runs `--check`; of its messages, keeps only those about the file.
 fn check(program: &str, file: &Path) -> Output {
     let output = Command::new(program).arg("--check").arg(file).env_remove("WEBOTS_HOME").output().unwrap();
     let name = file.display().to_string();

@@ -1,4 +1,4 @@
-//! A copy of the project in a folder of the test, on ports of its own, with the programs under test.
+//! A copy of the project in a temporary folder, with its own ports and the programs under test.
 
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 
 use crate::support::{holds_soon, ports};
 
-/// How long `server.sh` may take for anything.
+/// Timeout of every call of `server.sh`.
 const LIMIT: Duration = Duration::from_secs(90);
 
 /// The folder of the project under test.
@@ -16,16 +16,16 @@ pub fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// A copy of the project. Whatever runs from it ends with it, and is shown if the test fails.
+/// A copy of the project. On drop its servers are stopped, and their logs are printed if the test fails.
 pub struct Project {
     temporary: tempfile::TempDir,
-    /// Port of the session server.
+    /// The port of the session server.
     pub session: u16,
-    /// Port of the simulation server.
+    /// The port of the simulation server.
     pub simulation: u16,
 }
 
-/// What came of a command.
+/// The result of a command.
 #[derive(Debug)]
 pub struct Outcome {
     pub code: Option<i32>,
@@ -36,7 +36,7 @@ pub struct Outcome {
 impl Project {
     /// Copies what `server.sh` needs.
     pub fn copy() -> Self {
-        // Webots may take one of the ten ports that follow its own.
+        // Webots may take one of the ten ports after its own.
         let session = ports::block(24);
         let project = Self { temporary: tempfile::tempdir().unwrap(), session, simulation: session + 1 };
         copy(&root().join("server.sh"), &project.path("server.sh"));
@@ -48,7 +48,7 @@ impl Project {
                 config["bind"] = "127.0.0.1".into();
                 config["simulationServers"] = json!([format!("localhost:{}", session + 1)]);
                 config["loadRefresh"] = 0.1.into();
-                // Whatever else keeps this machine busy closes no server.
+                // Other load on this machine must not make the server full.
                 config["loadThreshold"] = 1000.into();
             });
             project.configure(&format!("simulation/{name}"), |config| {
@@ -77,7 +77,7 @@ impl Project {
         std::fs::write(&file, config.to_string()).unwrap();
     }
 
-    /// Runs `server.sh`, from another folder.
+    /// Runs `server.sh` from another working directory.
     pub async fn server_sh(&self, arguments: &[&str]) -> Outcome {
         let command = tokio::process::Command::new(self.path("server.sh"))
             .args(arguments)
@@ -92,11 +92,11 @@ impl Project {
         Outcome { code: output.status.code(), output: text(output.stdout), errors: text(output.stderr) }
     }
 
-    /// The same, for what has to succeed; gives back what it prints.
+    /// Like `server_sh`, but asserts success; returns the output.
     pub async fn done(&self, arguments: &[&str]) -> String {
         let outcome = self.server_sh(arguments).await;
         assert_eq!(outcome.code, Some(0), "{arguments:?}: {outcome:#?}");
-        // What the machine lacks and simulations can do without is no fault.
+        // Warnings that the machine lacks something optional are no errors.
         let faults =
             outcome.errors.lines().filter(|line| !line.starts_with("warning: ") || !line.contains(" is not there"));
         assert_eq!(faults.collect::<Vec<_>>(), Vec::<&str>::new(), "{arguments:?}: {outcome:#?}");
@@ -108,7 +108,7 @@ impl Project {
         format!("http://localhost:{}{path}", self.session)
     }
 
-    /// What is left of servers that have run: processes, their files, folders of simulations, ports.
+    /// What earlier servers have left: processes, PID files, folders of runs, ports that accept connections.
     pub fn leftovers(&self) -> Vec<String> {
         let mut left = processes_in(&self.folder());
         let pid_files =
@@ -123,7 +123,7 @@ impl Project {
         left
     }
 
-    /// The process of a server, `KIND`, of a configuration.
+    /// The process id of the server of this `kind` and configuration.
     pub fn pid(&self, kind: &str, name: &str) -> i32 {
         let text = std::fs::read_to_string(self.path(&format!("log/{kind}/{name}.pid"))).unwrap();
         text.trim().parse().unwrap()
@@ -153,7 +153,7 @@ pub fn programs() -> &'static Path {
     Path::new(env!("CARGO_BIN_EXE_session-server")).parent().unwrap()
 }
 
-/// The processes that work in a folder or below it.
+/// The processes whose working directory is a folder or below it.
 pub fn processes_in(folder: &Path) -> Vec<String> {
     let folder = folder.canonicalize().unwrap();
     let processes = procfs::process::all_processes().unwrap().flatten();
@@ -163,7 +163,7 @@ pub fn processes_in(folder: &Path) -> Vec<String> {
         .collect()
 }
 
-/// Waits until nothing of a project is left, and says what is.
+/// Waits until nothing of a project is left; panics with the leftovers otherwise.
 pub async fn nothing_is_left(project: &Project) {
     let nothing = holds_soon(async || project.leftovers().is_empty()).await;
     assert!(nothing, "left: {:#?}", project.leftovers());

@@ -1,4 +1,4 @@
-//! The demo, as the README has a newcomer try it.
+//! The demo, with the README's steps for a newcomer.
 
 use std::process::Stdio;
 
@@ -13,7 +13,7 @@ use crate::support::{SOON, http, until};
 
 const WORLD: &str = "https://github.com/webots-fleet/demo/blob/main/worlds/playground.wbt";
 
-/// A client whose simulation of the demo's world is ready, and the URL of its Webots.
+/// A client whose simulation of the demo's world is ready, and the URL of its stream.
 async fn simulate(project: &Project) -> (Client, String) {
     let mut client = Client::connect(&format!("ws://localhost:{}/client", project.simulation)).await;
     client.send(&serde_json::json!({"start": {"url": WORLD}}).to_string()).await;
@@ -21,9 +21,9 @@ async fn simulate(project: &Project) -> (Client, String) {
     (client, url)
 }
 
-/// What the README's client hears of a server, until a line begins so.
+/// The lines that the README's client prints, up to one that begins with `last`.
 async fn talk(project: &Project, url: &str, message: &str, last: &str) -> Vec<String> {
-    // A shell can't take back that SIGINT is ignored, as it is below `nohup tests/run.sh &`.
+    // A shell can't reset an ignored SIGINT, which it inherits from `nohup tests/run.sh &`.
     let mut child = tokio::process::Command::new("env")
         .arg("--default-signal=INT")
         .arg(project.path("tests/websocket.sh"))
@@ -98,7 +98,7 @@ async fn a_server_that_does_not_end_is_killed_with_what_it_started() {
     kill(Pid::from_raw(project.pid("simulation", "demo")), Signal::SIGSTOP).unwrap();
     let stopped = project.done(&["stop"]).await;
     assert!(stopped.contains("killed the simulation server of demo"), "{stopped}");
-    // Nobody was left to remove the folder of the run: the next start does.
+    // The killed server could not remove the folder of its run; the next start does.
     until("no process is left", async || processes_in(&project.folder()).is_empty()).await;
     project.done(&["start", "demo"]).await;
     project.done(&["stop"]).await;
@@ -110,7 +110,7 @@ async fn without_webots_a_client_is_told_what_to_do() {
     let project = Project::copy();
     let home = project.path("no webots here");
     project.configure("simulation/local", |config| config["webotsHome"] = home.to_str().unwrap().into());
-    // Without a name: local.
+    // Without a name, `server.sh` takes the configuration `local`.
     let started = project.server_sh(&["start"]).await;
     assert_eq!(started.code, Some(0), "{started:#?}");
     assert!(started.errors.contains("warning: webots: This simulation server has no Webots"), "{started:#?}");

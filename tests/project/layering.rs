@@ -1,4 +1,4 @@
-//! The rules that the source keeps, so that a reader who knows them finds the way. Each test names all offenders.
+//! The rules for the structure of the source. Each test names all offenders.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -6,8 +6,8 @@ use regex_lite::Regex;
 
 use super::copy::{root, walk};
 
-/// The rooms of each part of the library from the bottom to the top: files and folders. Each may name those before it, and
-/// what is in it; those of `session` and `simulation` also all of `shared`, and never each other.
+/// The layers of each part of the library, from bottom to top: files and folders. Each may import from itself and from
+/// layers before it; those of `session` and `simulation` also from all of `shared`, but never from each other.
 const ROOMS: [(&str, &str); 3] = [
     ("shared", "text config domain run http"),
     ("session", "placement config mail fleet state web app"),
@@ -18,7 +18,7 @@ const ROOMS: [(&str, &str); 3] = [
     ),
 ];
 
-/// All files below `src`: the path, the text as it stands, and without comments and inline tests.
+/// All files below `src`: the path, the text, and the text without comments and inline tests.
 fn sources() -> Vec<(String, String, String)> {
     let tests = Regex::new(r"(?s)#\[cfg\(test\)\]\nmod tests \{.*?\n\}\n|(?m-s:^ *//.*\n)").unwrap();
     let files = walk(&root().join("src")).into_iter().filter(|path| path.extension().is_some_and(|end| end == "rs"));
@@ -32,7 +32,7 @@ fn sources() -> Vec<(String, String, String)> {
         .collect()
 }
 
-/// What each module of the library names: `simulation::webots` and the like, with programs left out.
+/// The modules that each module of the library imports, such as `simulation::webots`; without programs.
 fn imports() -> BTreeMap<String, BTreeSet<String>> {
     let module = |path: &str| {
         let inside = path.strip_prefix("src/")?.strip_suffix(".rs")?;
@@ -41,7 +41,7 @@ fn imports() -> BTreeMap<String, BTreeSet<String>> {
     };
     let all: BTreeMap<String, String> =
         sources().into_iter().filter_map(|(path, _, shipped)| Some((module(&path)?, shipped))).collect();
-    // A path, and the names that it ends in if these are in braces.
+    // A path, and the names in braces at its end.
     let paths = Regex::new(r"\b(crate|super)((?:::\w+)*)(?:::\{([^{}]*)\})?").unwrap();
     let named = |(name, shipped): (&String, &String)| {
         assert!(!shipped.contains("super::super"), "{name}: longer ways begin with crate");
@@ -64,7 +64,7 @@ fn imports() -> BTreeMap<String, BTreeSet<String>> {
     imports
 }
 
-/// The part and the floor of a module's room; none for a part as a whole.
+/// The part and the layer number of a module; `None` for a part as a whole.
 fn room(module: &str) -> Option<(&'static str, usize)> {
     let (part, inside) = module.split_once("::")?;
     let (part, rooms) = ROOMS.iter().find(|(name, _)| *name == part)?;
@@ -91,7 +91,7 @@ fn imports_point_down_only() {
 #[test]
 fn no_modules_name_each_other() {
     let mut imports = imports();
-    // Those that name nothing that is left can be in no circle.
+    // Modules that import none of the remaining ones can't be part of a cycle.
     while let Some(free) = imports.iter().find(|(_, names)| names.is_empty()).map(|(name, _)| name.clone()) {
         imports.remove(&free);
         imports.values_mut().for_each(|names| names.retain(|name| *name != free));
@@ -102,7 +102,7 @@ fn no_modules_name_each_other() {
 #[test]
 fn no_file_has_what_its_place_forbids() {
     let impure = r"tokio|std::fs|std::net::Tcp|std::process|Instant::now\(|SystemTime::now\(";
-    // Which files, by their path or by what they say of themselves, and what they never have.
+    // A pattern of files, by their path or a line of their `//!`, and a pattern that their code must not contain.
     let rules = [
         ("^src/bin/demo_simulator/", "webots_fleet"),
         ("^src/(bin/[^d]|lib|shared|session|simulation)", "(?i)demo"),

@@ -1,5 +1,5 @@
-//! The project as a whole: `server.sh` and the demo as a newcomer meets them, the shipped configuration files and
-//! pages, and the rules that the source keeps.
+//! The project as a whole: `server.sh` and the demo, the shipped configuration files and pages, and the rules for the
+//! source.
 
 mod building;
 mod configuration;

@@ -1,4 +1,4 @@
-//! The pages for readers.
+//! The documentation pages.
 
 use std::collections::HashSet;
 use std::path::PathBuf;
@@ -33,7 +33,7 @@ fn every_guarantee_names_tests_that_exist() {
     let texts: Vec<String> = files.map(|file| std::fs::read_to_string(file).unwrap()).collect();
     let tests: HashSet<&str> =
         texts.iter().flat_map(|text| test.captures_iter(text).map(|found| found.get(1).unwrap().as_str())).collect();
-    // It runs its tests itself, one after the other.
+    // This test program has no harness, so its tests have no `#[test]`.
     let without_harness = std::fs::read_to_string(root().join("tests/simulation_limits/main.rs")).unwrap();
     let page = std::fs::read_to_string(root().join("docs/guarantees.md")).unwrap();
     let mut promises = 0;

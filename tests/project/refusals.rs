@@ -1,4 +1,4 @@
-//! What `server.sh` refuses, and that it leaves everything as it was.
+//! What `server.sh` refuses; a refusal changes nothing.
 
 use std::net::TcpListener;
 
@@ -8,7 +8,7 @@ use nix::unistd::Pid;
 use super::copy::{Outcome, Project, nothing_is_left};
 use crate::support::{http, until};
 
-/// Runs `server.sh` for what has to fail with this exit code; gives back what it says.
+/// Runs `server.sh`, which must fail with this exit code; returns its error output.
 async fn refused(project: &Project, arguments: &[&str], code: i32) -> String {
     let Outcome { code: found, output, errors } = project.server_sh(arguments).await;
     assert_eq!(found, Some(code), "{arguments:?}: {output}{errors}");
@@ -40,7 +40,7 @@ async fn what_runs_already_is_not_started_twice() {
     // The other configuration has the same ports.
     let told = refused(&project, &["start", "local"], 1).await;
     assert!(told.contains("in use") && told.contains("this runs already: demo"), "{told}");
-    // What is missing is started beside what runs.
+    // Only the missing server is started.
     let alive = project.pid("simulation", "demo");
     kill(Pid::from_raw(project.pid("session", "demo")), Signal::SIGKILL).unwrap();
     let is_gone =
@@ -88,7 +88,7 @@ async fn a_stale_pid_file_does_no_harm() {
     let project = Project::copy();
     let file = project.path("log/simulation/demo.pid");
     std::fs::create_dir_all(file.parent().unwrap()).unwrap();
-    // This very process, as if the id had been given out again.
+    // The first is the id of this test process, as if it had been reused.
     for text in [format!("{}\n", std::process::id()), "4194304\n".to_owned(), "nonsense".to_owned(), String::new()] {
         std::fs::write(&file, text).unwrap();
         assert_eq!(project.server_sh(&["status"]).await.code, Some(3));

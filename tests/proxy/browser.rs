@@ -1,4 +1,4 @@
-//! What a browser does: https pages and wss connections, from an address of one's choice on the loopback.
+//! A stand-in for a browser: https pages and wss connections, from any loopback address.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -13,7 +13,7 @@ use crate::support::SOON;
 use crate::support::client::Client;
 use crate::support::http::Answer;
 
-/// A page of which the head has come.
+/// A page whose head has been received.
 pub type Page = awc::ClientResponse;
 
 /// A browser on a machine with this address.
@@ -27,17 +27,17 @@ pub struct Browser {
 }
 
 impl Browser {
-    /// The same from another address.
+    /// The same browser at another address.
     pub fn at(&self, address: &'static str) -> Self {
         Self { address, ..self.clone() }
     }
 
-    /// A page of `https://HOST`.
+    /// Gets a page of `https://HOST`.
     pub async fn get(&self, path: &str) -> Answer {
         self.ask(&format!("https://{}{path}", self.host), &[]).await
     }
 
-    /// The beginning of a page that may go on for long.
+    /// Requests a page, whose body may be endless.
     pub async fn begin(&self, url: &str, headers: &[(&str, &str)]) -> Page {
         let connector =
             awc::Connector::new().rustls_0_23(self.trust.clone()).local_address(self.address.parse().unwrap());
@@ -49,14 +49,14 @@ impl Browser {
         request.send().await.unwrap_or_else(|error| panic!("{url}: {error}"))
     }
 
-    /// A page of any server, with headers.
+    /// Gets a page of any server, with headers.
     pub async fn ask(&self, url: &str, headers: &[(&str, &str)]) -> Answer {
         let mut answer = self.begin(url, headers).await;
         let body = answer.body().await.unwrap_or_else(|error| panic!("{url}: {error}"));
         Answer { status: answer.status(), headers: answer.headers().clone(), body }
     }
 
-    /// Asserts that a path leads to nothing: no page, nor a WebSocket.
+    /// Asserts that a path serves neither a page nor a WebSocket.
     pub async fn finds_nothing(&self, path: &str) {
         let answer = self.get(path).await;
         assert!([400, 403, 404].contains(&answer.status.as_u16()), "{path}: {}", answer.status);
@@ -64,17 +64,17 @@ impl Browser {
         assert!(self.try_open(&format!("wss://{}{path}", self.host), &[]).await.is_err(), "{path}");
     }
 
-    /// A WebSocket of `wss://HOST`.
+    /// Opens a WebSocket of `wss://HOST`.
     pub async fn connect(&self, path: &str) -> Client {
         self.open(&format!("wss://{}{path}", self.host)).await
     }
 
-    /// A WebSocket at a URL as a server gave it.
+    /// Opens a WebSocket at a URL that a server sent.
     pub async fn open(&self, url: &str) -> Client {
         self.try_open(url, &[]).await.unwrap_or_else(|error| panic!("{url}: {error}"))
     }
 
-    /// A WebSocket that may be refused, asked for with headers.
+    /// Opens a WebSocket with headers; it may be refused.
     pub async fn try_open(&self, url: &str, headers: &[(&'static str, &str)]) -> Result<Client, Box<Error>> {
         let mut request = url.into_client_request().unwrap();
         for (name, value) in headers {

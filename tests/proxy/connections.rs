@@ -1,4 +1,4 @@
-//! Long connections: quiet times, live pages, and web servers that are told to read their configuration again or are restarted.
+//! Long connections: idle times, live pages, and web servers that are reloaded or restarted.
 
 use std::time::{Duration, Instant};
 
@@ -10,10 +10,10 @@ use super::rules::Rules;
 use crate::support::SOON;
 use crate::support::client::{Client, Heard};
 
-/// Longer than the web server's patience.
+/// Longer than the web server's idle timeout.
 const QUIET: Duration = Duration::from_millis(IDLE.as_millis() as u64 * 3 / 2);
 
-/// Events come at once and go on for longer than the web server waits for a word.
+/// Events are received at once, and for longer than the web server's idle timeout.
 async fn is_told_what_happens(browser: &Browser, path: &str) {
     let url = format!("https://{}{path}", browser.host);
     let mut events = browser.begin(&url, &[("Accept", "text/event-stream")]).await;
@@ -41,7 +41,7 @@ async fn quiet_connections_last(fleet: &Fleet) {
     let mut viewer = browser.open(&format!("{stream}/")).await.with_scene().await;
     viewer.send("pause").await;
     viewer.until("paused by client").await;
-    // Nothing but pings goes over these connections; over Webots' stream not even these.
+    // Only pings are sent over these connections; over Webots' stream not even pings.
     let here = format!("/{}/events", fleet.here.port);
     let (is_silent, (), ()) = futures_util::join!(
         idle.is_silent(QUIET),
@@ -52,7 +52,7 @@ async fn quiet_connections_last(fleet: &Fleet) {
     viewer.send("real-time:-1").await;
     viewer.until("application/json:").await;
     client.until(".").await;
-    // With a URL; or with an error, if the machine that runs the tests is too busy for a simulation.
+    // The answer is a URL, or an error if this machine is too busy for a simulation.
     door.send("").await;
     while door.until("").await.len() == 1 {}
 }
@@ -61,7 +61,7 @@ async fn restarts(fleet: &mut Fleet) {
     let (mut proxied, _) = fleet.simulate(&fleet.browser, &fleet.here).await;
     let mut direct = Client::start(&fleet.here, &super::fleet::arm()).await;
     direct.until("webots:").await;
-    // It is read all the time, so that it answers pings, and ends if the connection does.
+    // Reads all the time, so that pings are answered; ends when the connection does.
     let passing_by = actix_rt::spawn(async move {
         loop {
             if let Heard::Closed(frame) = direct.next().await {
@@ -69,7 +69,7 @@ async fn restarts(fleet: &mut Fleet) {
             }
         }
     });
-    // With a new certificate, say.
+    // As after the renewal of a certificate.
     fleet.web.reload();
     let (other, _) = fleet.simulate(&fleet.browser, &fleet.here).await;
     other.leave().await;

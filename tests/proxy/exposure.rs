@@ -1,4 +1,4 @@
-//! Which ports of the machine are reachable from outside, what arrives there, and whose limits count.
+//! Which ports of the machine are reachable from outside, what arrives there, and which client a limit counts.
 
 use std::net::TcpListener;
 use std::sync::mpsc::channel;
@@ -14,8 +14,8 @@ use crate::support::http::PASSWORD;
 use crate::support::listener::listen;
 use crate::support::{Builder, until};
 
-/// A service of the machine that belongs to no fleet: a database's page of administration, say. It runs until the
-/// test program ends.
+/// A service of the machine that is not part of the fleet, such as the administration page of a database. It runs until
+/// the test program ends.
 pub fn private_service() -> u16 {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let port = listener.local_addr().unwrap().port();
@@ -23,7 +23,7 @@ pub fn private_service() -> u16 {
     port
 }
 
-/// All that one fleet can show of where requests lead, and of whom they are.
+/// Checks on one fleet where requests arrive, and which client they are attributed to.
 async fn requests_lead_to_the_fleet_and_nowhere_else(rules: Rules) {
     let keys = |server: Builder| server.set("trustedProxies", json!(["127.0.0.1"])).set("maxClientsPerAddress", 2);
     let fleet = Fleet::start_with(rules, keys).await;
@@ -57,7 +57,7 @@ async fn only_the_fleet_is_reachable(fleet: &Fleet) {
         format!("/{session}0/status"),
         format!("/assets/../{private}/"),
         "/server-status".to_owned(),
-        // What is for administrators alone.
+        // For administrators only.
         format!("/{here}/drain"),
         format!("/{here}//drain?x"),
         format!("/{here}/%64rain"),
@@ -75,35 +75,35 @@ async fn an_editor_is_at_the_port_of_its_webots_and_500_more(fleet: &Fleet) {
     });
     let answer = fleet.browser.get(&format!("/{editor}/a%20b?c")).await;
     assert_eq!((answer.status.as_u16(), answer.text().as_str()), (200, "editor"));
-    // What a participant's programs make of it can't act as the administrator's pages.
+    // A participant's programs control the editor, so it must not share the origin of the administrator's pages.
     assert_eq!(answer.header("content-security-policy"), Some("sandbox allow-scripts"));
     // The simulation server itself has no editor.
     assert_eq!(fleet.browser.get(&format!("/{}/", editor - 1)).await.status, 404);
 }
 
-/// What is asked for, and what arrives through Apache and through nginx; nothing where they refuse.
+/// The path requested, and the path that arrives through Apache and through nginx; `None` if they refuse it.
 const PATHS: [(&str, Option<&str>, Option<&str>); 11] = [
     ("/textures/my%20file.png", Some("/textures/my%20file.png"), Some("/textures/my%20file.png")),
     ("/%C3%BC+%2B.png?x=a%20b&y=%2F", Some("/%C3%BC++.png?x=a%20b&y=%2F"), Some("/%C3%BC++.png?x=a%20b&y=%2F")),
     ("/a%252fb.png", Some("/a%252fb.png"), Some("/a%252fb.png")),
-    // Apache takes a question mark in a name for an attack.
+    // Apache rejects an encoded question mark as an attack.
     ("/a%3Fb.png", None, Some("/a%3Fb.png")),
-    // A name with a slash is that of a folder, or of nothing.
+    // An encoded slash is decoded or refused.
     ("/a%2Fb.png", None, Some("/a/b.png")),
     ("/a/%2e%2e/b.png", Some("/b.png"), Some("/b.png")),
     ("/%2e%2e/b.png", None, None),
     ("/a/..%2F..%2Fb.png", None, None),
-    // What would end a line stays a part of the name.
+    // Encoded line ends stay part of the name.
     ("/a%0D%0AX:%20y.png", Some("/a%0D%0AX:%20y.png"), Some("/a%0D%0AX:%20y.png")),
     ("/a%00.png", None, None),
     ("//a.png", Some("/a.png"), Some("/a.png")),
 ];
 
-/// Names of files with blanks and letters of any language arrive at a Webots, and no way leads out of its port.
+/// File names with blanks and non-ASCII letters arrive at Webots, and no path leaves its port.
 async fn paths_arrive(fleet: &Fleet, rules: Rules) {
     let port = fleet.here.port + 2;
     let (told, asked) = channel();
-    // Once the test has ended there is nobody to tell.
+    // After the end of the test the channel is closed.
     listen(TcpListener::bind(("127.0.0.1", port)).unwrap(), move |request| {
         told.send(request.path().to_owned()).ok().map(|()| (200, "file"))
     });
@@ -119,7 +119,7 @@ async fn paths_arrive(fleet: &Fleet, rules: Rules) {
     }
 }
 
-/// Clients' addresses come from the web server, serve limits and logs, and can't be forged.
+/// Limits and logs use the clients' addresses as the web server sends them; they can't be forged.
 async fn limits_are_for_each_client(fleet: &Fleet) {
     let forged = [("x-forwarded-for", "203.0.113.9"), ("forwarded", "for=203.0.113.9")];
     let refused = async |browser: &Browser, url: &str, headers: &[(&'static str, &str)]| match browser
@@ -147,8 +147,8 @@ async fn limits_are_for_each_client(fleet: &Fleet) {
     }
 }
 
-/// A browser sends the administrator's password, and the cookie of who has signed in, to every path of their host; the web server
-/// tells simulation servers who that is.
+/// A browser sends the administrator's password and the sign-in cookie to every path of their host. Webots receives neither,
+/// and no name of a user.
 async fn no_simulation_gets_a_secret(rules: Rules) {
     let fleet = Fleet::start_with(rules, |server| server.set("adminPassword", PASSWORD)).await;
     let visitor = fleet.browser.at("127.0.0.9");
@@ -163,7 +163,7 @@ async fn no_simulation_gets_a_secret(rules: Rules) {
     let secrets = [secrets, forged].concat();
     let url = |port: u16| format!("https://{}/{port}/", fleet.browser.host);
     assert_eq!(visitor.ask(&url(webots), &secrets).await.text(), "nothing");
-    // The server itself does: it would answer 401 without the password.
+    // The server itself receives the password: without it, it would answer 401.
     let output = format!("{}output?id=none", url(fleet.here.port));
     assert_eq!(visitor.ask(&output, &secrets).await.status, 404);
 }
@@ -183,7 +183,7 @@ async fn pages_are_sent_on_to_https_and_the_bare_name(browser: &Browser) {
     let secure = format!("https://{}", browser.host);
     let www = ("Host", "www.localhost");
     let table = [(&plain, ("Host", "localhost")), (&plain, www), (&secure, www)];
-    // What was asked for arrives as it was sent; none of it becomes a header, another host or a query.
+    // The path is kept as it was sent; no part of it becomes a header, another host or a query.
     let paths = [
         "/",
         "/a%20b/%C3%BC+&?a=b&c=%20&d=%0d%0a",
@@ -197,11 +197,11 @@ async fn pages_are_sent_on_to_https_and_the_bare_name(browser: &Browser) {
             assert_eq!(answer.status, 301, "{server} {host:?} {path}");
             let location = answer.header("location").unwrap_or_default();
             let wanted = format!("https://localhost{path}");
-            // Digits in either case are the same.
+            // Hexadecimal digits may be in either case.
             assert_eq!(location.to_lowercase(), wanted.to_lowercase(), "{server} {host:?}");
             assert_eq!(answer.header("set-cookie"), None, "{server} {host:?} {path}");
         }
-        // No way to send a visitor elsewhere.
+        // No path redirects to another host.
         let answer = browser.ask(&format!("{server}//other.example/"), &[host]).await;
         assert!(answer.header("location").unwrap().starts_with("https://localhost/"), "{server} {host:?}");
     }

@@ -15,24 +15,24 @@ use crate::support::program::{Builder, Server, session_server, simulation_server
 use crate::support::until;
 use crate::support::webots::Webots;
 
-/// Everything; each part ends with it.
+/// The fleet; dropping it stops every part.
 pub struct Fleet {
     rules: Rules,
     pub browser: Browser,
     pub web: WebServer,
     pub session: Server,
-    /// On the first of the machines.
+    /// On the first machine.
     pub here: Server,
-    /// On the second.
+    /// On the second machine.
     pub there: Server,
     _authority: Authority,
     _webots: Webots,
     _forge: Forge,
 }
 
-/// How many simulations fit on each simulation server.
+/// The slots of each simulation server.
 pub const PLACES: u16 = 3;
-/// A web server's default, shortened: connections on which nothing is sent for so long are closed.
+/// The web servers' idle timeout, shortened: after this time without traffic they close a connection.
 pub const IDLE: Duration = Duration::from_secs(4);
 
 impl Fleet {
@@ -40,7 +40,7 @@ impl Fleet {
         Self::start_with(rules, |server| server).await
     }
 
-    /// A fleet whose servers have some keys in common.
+    /// A fleet; `keys` sets further keys on all its servers.
     pub async fn start_with(rules: Rules, keys: impl Fn(Builder) -> Builder) -> Self {
         let authority = Authority::new();
         let certificate = authority.issue(&["localhost", "www.localhost"]);
@@ -54,7 +54,7 @@ impl Fleet {
             } else {
                 server.set("server", host.as_str()).set("ssl", true).set("portRewrite", true)
             };
-            // A test that waits for one connection reads no other, and answers no pings there.
+            // While a test waits for one connection, it answers no pings on the others.
             keys(server.set("timing.ping", 0.5).set("timing.silence", 60))
         };
         let port = ports::block(PLACES + 12);
@@ -62,7 +62,7 @@ impl Fleet {
             let server = simulation_server(&webots.path(), forge.path(), PLACES).env("DEMO_SIMULATOR_BIND", machine);
             let server = server.set("bind", machine).set("timing.heartbeat", 0.2);
             if rules.is_door() {
-                // As engines tell a container which host it is.
+                // As a container learns its host name.
                 behind(server.port(port).set("server", "$FLEET_TEST_HOST").env("FLEET_TEST_HOST", machine)).spawn()
             } else {
                 behind(server).spawn()
@@ -76,7 +76,7 @@ impl Fleet {
         let examples = serde_json::json!([{"title": "Arm", "url": arm()}]);
         let session = session_server(&addresses)
             .set("examples", examples)
-            // The machine that runs the tests may be busy.
+            // Other load on this machine must not make the servers full.
             .set("loadThreshold", 1000)
             .set("timing.gather", 0.1)
             .set("timing.flapping", 0.1)
@@ -100,7 +100,7 @@ impl Fleet {
         fleet
     }
 
-    /// Waits until the session server has heard of both simulation servers.
+    /// Waits until both simulation servers are up.
     pub async fn both_up(&self) {
         until("both simulation servers answer", async || {
             let status = http::try_get(&self.session.url("/status")).await;
@@ -110,7 +110,7 @@ impl Fleet {
         .await;
     }
 
-    /// Starts a simulation; gives back its client, and the URL of its stream.
+    /// Starts a simulation; returns its client and the URL of its stream.
     pub async fn simulate(&self, browser: &Browser, server: &Server) -> (Client, String) {
         let mut client = browser.open(&format!("{}/client", self.wss(server))).await;
         client.send(&serde_json::json!({"start": {"url": arm()}}).to_string()).await;
@@ -123,7 +123,7 @@ impl Fleet {
         self.rules.machines()[usize::from(std::ptr::eq(server, &self.there))]
     }
 
-    /// Where a port of the machine of a simulation server is at the web server.
+    /// The web server's path of a port of a simulation server's machine.
     pub fn path(&self, server: &Server, port: u16) -> String {
         if self.rules.is_door() { format!("/{}/{port}", self.machine(server)) } else { format!("/{port}") }
     }

@@ -1,7 +1,7 @@
 //! The fleet behind real web servers: Debian's apache2 and nginx, started here on free ports of the loopback, with our
 //! rules (`deploy/`) and with those of the original documents.
 
-/// Two tests of a function that is given rules: through Apache and through nginx, with ours.
+/// Makes two tests of a function: with our rules for Apache, and with ours for nginx.
 macro_rules! through_both {
     ($test:ident) => {
         mod $test {

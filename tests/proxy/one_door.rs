@@ -1,5 +1,5 @@
 //! A fleet of several machines behind one nginx (`deploy/nginx-door.conf`, `publicUrl`). The machines are 127.0.0.2 and 127.0.0.3,
-//! whose servers have the same port. `tests/swarm.sh` has the door of `deploy/swarm`, whose rules `deploy/kubernetes` has too.
+//! whose servers have the same port. `tests/swarm.sh` tests the door of `deploy/swarm`, whose rules `deploy/kubernetes` shares.
 
 use super::exposure::private_service;
 use super::fleet::{Fleet, PLACES, arm};
@@ -23,7 +23,7 @@ async fn who_is_lost_comes_back_through_the_door() {
         tokens.push((lost.token().await, stream));
         drop(lost);
     }
-    // Each at its own machine only, and from another address.
+    // Each simulation is resumed at its own machine only, from another address.
     let browser = fleet.browser.at("127.0.0.9");
     for (number, server) in [&fleet.here, &fleet.there].into_iter().enumerate() {
         let client = format!("{}/client", fleet.wss(server));
@@ -36,7 +36,7 @@ async fn who_is_lost_comes_back_through_the_door() {
         let mut viewer = browser.open(&format!("{stream}/")).await;
         viewer.send("x3d;broadcast").await;
         viewer.until("scene load completed").await;
-        // It counts once, here and for the session server.
+        // It counts once, at its own server and at the session server.
         until("both servers say so", async || {
             let own = browser.get(&format!("{}/status", fleet.path(server, server.port))).await.json();
             let known = browser.get("/status").await.json()["servers"][number]["instances"].clone();
@@ -73,7 +73,7 @@ async fn leads_nowhere_else(fleet: &Fleet) {
         // The session server has no such path, and its port is not one of a simulation server.
         format!("/127.0.0.1/{}/status", fleet.session.port),
         format!("/{port}/"),
-        // What is for administrators alone.
+        // For administrators only.
         format!("/127.0.0.2/{port}/drain"),
         format!("/127.0.0.2/{port}/%64rain"),
     ] {

@@ -26,7 +26,7 @@ async fn streams_come_through_the_simulation_server(rules: Rules) {
         viewer.closed().await;
         until("the token is gone", async || browser.get(&of("/worlds/textures/old%20wood.png")).await.status == 404)
             .await;
-        // No log tells a token; other requests are logged.
+        // No log contains the token; other requests are logged.
         let known = format!("GET /{}/status", server.port);
         browser.get(&format!("/{}/status", server.port)).await;
         until("the request is logged", async || fleet.web.access_log().contains(&known)).await;

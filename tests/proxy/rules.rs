@@ -2,12 +2,12 @@
 
 use super::web_server::Kind;
 
-/// A set of rules, which is made to fit the machine of a test.
+/// A set of rules, adapted to a test's machine.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Rules {
     /// `deploy/apache.conf`
     Apache,
-    /// The same, where somebody has signed in.
+    /// The same, with a signed-in user.
     ApacheWithUsers,
     /// `deploy/nginx.conf`
     Nginx,
@@ -15,11 +15,11 @@ pub enum Rules {
     NginxWithUsers(u16),
     /// `deploy/nginx-door.conf`: one nginx in front of machines whose servers have the same port.
     Door,
-    /// The documents' page on a machine with a session server: every port of the machine, and three pages.
+    /// The original documents' rules for a machine with a session server: every port of the machine, and three pages.
     Documents,
 }
 
-/// What is particular to a machine.
+/// The values that differ between machines.
 pub struct Place<'a> {
     /// Of the web server.
     pub http: u16,
@@ -38,17 +38,17 @@ impl Rules {
         if matches!(self, Self::Apache | Self::ApacheWithUsers | Self::Documents) { Kind::Apache } else { Kind::Nginx }
     }
 
-    /// Whether all machines are behind one nginx on another.
+    /// Whether all machines are behind one nginx on another machine.
     pub fn is_door(self) -> bool {
         self == Self::Door
     }
 
-    /// The addresses of the machines. Where there is no door, the first is also the web server's.
+    /// The addresses of the machines. Without a door, the first is also the web server's.
     pub fn machines(self) -> [&'static str; 2] {
         if self.is_door() { ["127.0.0.2", "127.0.0.3"] } else { ["127.0.0.1", "127.0.0.2"] }
     }
 
-    /// Where a client finds the session server's door.
+    /// The path at which clients reach the session server.
     pub fn session_path(self, session: u16, path: &str) -> String {
         match self {
             Self::Documents => format!("/{session}{path}"),
@@ -60,7 +60,7 @@ impl Rules {
         let Place { http, https, session, here, there, chain, key } = place;
         let pattern = |ports: &[u16]| ports.iter().map(u16::to_string).collect::<Vec<_>>().join("|");
         let editors = |ports: &[u16]| pattern(&ports[1..].iter().map(|port| port + 500).collect::<Vec<_>>());
-        // Webots and editors of both machines, and the other machine.
+        // Webots and editors of both machines, and the address of the other machine.
         let machines: [(&str, &str); 5] = [
             ("200[1-9]|201[0-9]|2020", &pattern(&here[1..])),
             ("300[1-9]|301[0-9]|3020", &pattern(&there[1..])),
@@ -69,7 +69,7 @@ impl Rules {
             ("192.0.2.3", "127.0.0.2"),
         ];
         let any_address = |port: &str| format!("listen [::]:{port};\n");
-        // What the examples of nginx for a host on the internet have in common.
+        // Common to the nginx examples for a public host.
         let site = |text: &str, own: &[(&str, &str)]| {
             let shared: [(&str, &str); 7] = [
                 ("/etc/letsencrypt/live/fleet.example.org/fullchain.pem", chain),
@@ -153,7 +153,7 @@ impl Rules {
     }
 }
 
-/// A text in which each of some words, which must be there, is another one.
+/// Replaces each of these words in a text, which must contain all of them.
 pub fn adapt(text: &str, changes: &[(&str, &str)]) -> String {
     changes.iter().fold(text.to_owned(), |text, (from, to)| {
         assert!(text.contains(from), "{from:?} is not in\n{text}");

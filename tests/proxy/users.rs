@@ -1,4 +1,4 @@
-//! Users who sign in at the web server: a stand-in for oauth2-proxy, the real nginx, and what a simulation server makes of it.
+//! Users who sign in at the web server: a stand-in for oauth2-proxy, a real nginx, and what the simulation server shows.
 
 use std::net::TcpListener;
 
@@ -8,7 +8,7 @@ use crate::support::client::Client;
 use crate::support::http::PASSWORD;
 use crate::support::listener::serve;
 
-/// A stand-in for oauth2-proxy: whose cookie is a name has signed in with it.
+/// A stand-in for oauth2-proxy: the cookie holds the name of the signed-in user.
 pub fn oauth2_proxy() -> u16 {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let port = listener.local_addr().unwrap().port();
@@ -27,7 +27,7 @@ pub fn oauth2_proxy() -> u16 {
 async fn who_signs_in_at_the_web_server_is_known_to_the_administrator() {
     let rules = Rules::NginxWithUsers(oauth2_proxy());
     let keys = |builder: crate::support::program::Builder| builder.set("adminPassword", PASSWORD);
-    // The session server, which signs in nowhere, knows its servers all the same.
+    // The session server does not sign in, and still reaches its servers.
     let fleet = Fleet::start_with(rules, |builder| keys(builder).set("userHeader", "X-Forwarded-User")).await;
     let visitor = fleet.browser.at("127.0.0.9");
     let client = format!("{}/client", fleet.wss(&fleet.here));
@@ -38,7 +38,7 @@ async fn who_signs_in_at_the_web_server_is_known_to_the_administrator() {
     assert_eq!(visitor.get("/oauth2/sign_in").await.status.as_u16(), 200);
     assert_eq!(visitor.get("/oauth2/auth").await.status.as_u16(), 404, "nobody asks for others");
 
-    // What frames without an origin need is there for all, and leads to nothing else.
+    // Frames without an origin need assets and streams, so these are public; no path leads from there to other pages.
     let port = fleet.here.port;
     for (path, status) in [
         ("/assets/style.css".to_owned(), 200),
@@ -61,7 +61,7 @@ async fn who_signs_in_at_the_web_server_is_known_to_the_administrator() {
     let anna = [("cookie", "_oauth2_proxy=anna")];
     assert_eq!(visitor.ask(&format!("https://{}/viewer", visitor.host), &anna).await.status.as_u16(), 200);
     let mut running: Vec<Client> = Vec::new();
-    // What a visitor writes there himself is nobody's name.
+    // A `userHeader` sent by the visitor is ignored.
     for headers in [vec![anna[0]], vec![("cookie", "_oauth2_proxy=ben"), ("x-forwarded-user", "intruder")]] {
         let mut client = visitor.try_open(&client, &headers).await.unwrap();
         client.send(&serde_json::json!({"start": {"url": arm(), "name": "somebody"}}).to_string()).await;
@@ -77,7 +77,7 @@ async fn who_signs_in_at_the_web_server_is_known_to_the_administrator() {
         assert!(page.contains(name), "{name}: {page}");
     }
     assert!(!page.contains("intruder"), "{page}");
-    // The administrator's password is asked for by the simulation server itself.
+    // The simulation server itself asks for the administrator's password.
     let sign_in = format!("https://{}/{}/sign-in", visitor.host, fleet.here.port);
     let answer = visitor.ask(&sign_in, &anna).await;
     assert_eq!((answer.status.as_u16(), answer.header("www-authenticate").is_some()), (401, true));

@@ -17,7 +17,7 @@ pub enum Kind {
     Nginx,
 }
 
-/// A web server that ends with the test; its error log is printed if the test fails.
+/// A web server, killed on drop; its error log is printed if the test fails.
 pub struct WebServer {
     kind: Kind,
     child: Option<Child>,
@@ -39,7 +39,7 @@ const MODULES: &[&str] = &[
 ];
 
 impl WebServer {
-    /// Starts a web server with a site's rules. `idle` is its default for connections on which nothing is sent.
+    /// Starts a web server with a site's rules; `idle` is its default idle timeout.
     pub async fn start(kind: Kind, ports: (u16, u16), site: &str, idle: Duration) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let here = folder.path().to_str().unwrap();
@@ -62,7 +62,7 @@ impl WebServer {
         }
     }
 
-    /// Starts the program, which must not run.
+    /// Starts the program, which must not be running.
     pub async fn go(&mut self) {
         let program = self.program();
         assert!(
@@ -90,13 +90,13 @@ impl WebServer {
         assert!(listens.await, "{program} does not listen: {}", self.log());
     }
 
-    /// Reads its configuration again, as after the renewal of a certificate.
+    /// Makes it reload its configuration, as after the renewal of a certificate.
     pub fn reload(&self) {
         let signal = if self.kind == Kind::Apache { Signal::SIGUSR1 } else { Signal::SIGHUP };
         kill(self.pid(), signal).unwrap();
     }
 
-    /// Ends the program with all its connections. Whatever else goes on in the test goes on meanwhile.
+    /// Stops the program and waits until it has ended, which closes its connections.
     pub async fn stop(&mut self) {
         kill(self.pid(), Signal::SIGTERM).unwrap();
         let child = self.child.as_mut().unwrap();
@@ -117,7 +117,7 @@ impl WebServer {
         std::fs::read_to_string(self.folder.path().join("access.log")).unwrap_or_default()
     }
 
-    /// What it had to say.
+    /// Its error log.
     pub fn log(&self) -> String {
         std::fs::read_to_string(self.error_log()).unwrap_or_default()
     }
@@ -126,7 +126,7 @@ impl WebServer {
 impl Drop for WebServer {
     fn drop(&mut self) {
         if let Some(child) = &mut self.child {
-            // With all its processes: in order, Apache takes ten seconds while there are connections.
+            // Kills the process group: on SIGTERM, Apache takes ten seconds while connections are open.
             killpg(Pid::from_raw(i32::try_from(child.id()).unwrap()), Signal::SIGKILL).ok();
             child.wait().ok();
         }

@@ -1,5 +1,5 @@
-//! From the first click to the end of a simulation, through each web server with each set of rules. Whatever URLs the servers
-//! hand out lead through the web server, from wherever they were read.
+//! From the first click to the end of a simulation, through each web server with each set of rules. All URLs that the servers
+//! send lead through the web server.
 
 use tokio::net::TcpStream;
 
@@ -7,13 +7,13 @@ use super::fleet::{Fleet, arm};
 use super::rules::Rules;
 use crate::support::until;
 
-/// Gives back the fleet, for more.
+/// Returns the fleet for further checks.
 pub async fn the_whole_way(rules: Rules) -> Fleet {
     let fleet = Fleet::start(rules).await;
     let browser = &fleet.browser;
     let at_the_door = |path: &str| rules.session_path(fleet.session.port, path);
 
-    // Pages, with what they load. The servers log where they are.
+    // Pages with their assets. The servers log the URLs of their pages.
     let port = format!("/{}", fleet.session.port);
     let door = format!("https://{}{}/monitor", browser.host, if rules.is_door() { "" } else { &port });
     assert!(fleet.session.log().contains(&door), "{}", fleet.session.log());
@@ -40,7 +40,7 @@ pub async fn the_whole_way(rules: Rules) -> Fleet {
     assert_eq!(browser.get(&at_the_door("/viewer")).await.status, 200);
     until("the door is open", async || browser.get(&at_the_door("/request")).await.text() == "1").await;
 
-    // The door.
+    // The session server.
     let mut door = browser.connect(&at_the_door("/")).await;
     door.until("1").await;
     let mut session = browser.connect(&at_the_door("/session")).await;
@@ -60,7 +60,7 @@ pub async fn the_whole_way(rules: Rules) -> Fleet {
         let mut viewer = browser.open(&format!("{stream}/")).await.with_scene().await;
         let file = browser.get(&format!("{path}/worlds/textures/old%20wood.png?x=1")).await;
         assert_eq!((file.status.as_u16(), file.text().as_str()), (200, "a picture"));
-        // What Webots sends has an origin of its own, but not with the documents' rules.
+        // Files from Webots are sandboxed, except with the documents' rules.
         let policy = (rules != Rules::Documents).then_some("sandbox allow-scripts");
         assert_eq!(file.header("content-security-policy"), policy);
         viewer.send("real-time:-1").await;

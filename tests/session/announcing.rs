@@ -1,4 +1,4 @@
-//! What the administrator tells everybody: who hears it, and who does not notice.
+//! The administrator's announcements: which clients receive them, and which are unaffected.
 
 use std::time::{Duration, Instant};
 
@@ -30,15 +30,15 @@ async fn an_announcement_reaches_who_asks_for_it_in_time() {
     let page = session.monitor().await;
     assert!(page.contains(shown) && !page.contains("<b>Maint"), "{page}");
     assert!(asked.elapsed() < Duration::from_secs(2), "{:?}", asked.elapsed());
-    // Who comes later hears it too.
+    // Clients that connect later receive it too.
     Client::connect(&session.websocket(ASKS)).await.until("announcement: ").await;
-    // Another one, and its end.
+    // Another announcement, and its end.
     assert_eq!(announce(&session, &json!({"text": "R&D"})).await, 200);
     assert_eq!(viewer.until("announcement:").await, "announcement: R\u{ff06}D");
     assert!(!session.monitor().await.contains("Maintenance"));
     assert_eq!(post(&session.url("/announcement"), Some(PASSWORD), "").await, 200);
     assert_eq!(viewer.until("announcement:").await, "announcement:");
-    // Pages that know nothing of announcements have noticed nothing, and who comes when it is over neither.
+    // Pages that don't ask for announcements received none, nor do clients that connect after the end.
     old.push(Client::connect(&session.websocket(ASKS)).await);
     for client in &mut old {
         client.send("").await;

@@ -1,4 +1,4 @@
-//! Simulation servers that DNS leads to, asked of a real DNS server.
+//! Simulation servers found by DNS, with a real DNS server.
 
 use std::net::IpAddr;
 use std::time::{Duration, Instant};
@@ -31,7 +31,7 @@ fn looking_up(entries: &[String], names: &NameServer) -> Builder {
     session_server(entries).before(&names.asked()).set("clientCost", 0.001)
 }
 
-/// What `/status` tells of each server: its address and its state.
+/// The address and state of each server, from `/status`.
 async fn servers(session: &Server) -> Vec<(String, String)> {
     let status = session.status().await;
     let text = |value: &Value| value.as_str().unwrap().to_owned();
@@ -51,7 +51,7 @@ async fn servers_behind_a_name_come_and_go() {
     until_states(&session, &["up"; 3]).await;
     assert_eq!(servers(&session).await[0].0, fixed.address(), "in the order of the configuration");
 
-    // More come, one of them by IPv6.
+    // More servers are listed, one of them with an IPv6 address.
     let (third, fourth): (IpAddr, IpAddr) = ([127, 0, 0, 4].into(), "::1".parse().unwrap());
     let _more = stand_ins(&[third, fourth], port);
     let begin = Instant::now();
@@ -60,7 +60,7 @@ async fn servers_behind_a_name_come_and_go() {
     assert!(begin.elapsed() < Duration::from_secs(5), "used after {:?}", begin.elapsed());
     assert!(servers(&session).await.iter().any(|(address, _)| *address == format!("[::1]:{port}")));
 
-    // One is listed no longer, and still answers: no client goes there.
+    // One is no longer listed but still answers: no client is sent there.
     let leaving = first.remove(0);
     names.set("fleet.test", &[loopback([3]), vec![third, fourth]].concat());
     until_states(&session, &["up"; 4]).await;
@@ -68,7 +68,7 @@ async fn servers_behind_a_name_come_and_go() {
     for _ in 0..20 {
         assert_ne!(http::get(&session.url("/session")).await.text(), leaving.url());
     }
-    // It comes back, and goes for good.
+    // It is listed again, then removed for good.
     names.set("fleet.test", &[loopback([2, 3]), vec![third, fourth]].concat());
     until_states(&session, &["up"; 5]).await;
     names.set("fleet.test", &[loopback([3]), vec![third, fourth]].concat());
@@ -77,7 +77,7 @@ async fn servers_behind_a_name_come_and_go() {
     drop(leaving);
     assert_eq!(times_logged(&session, &format!("{address}: no longer watched")), 2);
     assert_eq!(times_logged(&session, &format!("{address}: down")), 0, "to leave is no failure");
-    // One that fails, and is then listed no longer, is forgotten.
+    // One that fails, and is then no longer listed, is forgotten.
     drop(first.pop());
     until_states(&session, &["up", "down", "up", "up"]).await;
     names.set("fleet.test", &[third, fourth]);
@@ -114,7 +114,7 @@ async fn a_failed_lookup_keeps_the_servers_and_is_logged_once() {
         assert!(error().await.as_str().unwrap().contains(words), "{}", error().await);
         let page = session.monitor().await;
         assert!(page.contains(&format!("{name} can't be looked up.")), "{page}");
-        // It is asked again and again meanwhile, and nobody waits for that.
+        // The session server repeats the lookup, and no client waits for it.
         let asked = servers[0].requests();
         while servers[0].requests() < asked + 40 {
             let begin = stopwatch.lap();
@@ -168,7 +168,7 @@ async fn a_name_whose_lookup_hangs_holds_up_only_its_own_server() {
     let mut session = builder.start().await;
     until_states(&session, &[vec!["down"; HANGING], vec!["up"]].concat()).await;
     assert!(session.log().contains("0.test:2000: down: no answer within 0.5 s"));
-    // Some looks later, nothing has piled up, and the others are asked as ever.
+    // After some polls, no threads have piled up, and the other server is polled as before.
     let threads = || procfs::process::Process::new(session.pid()).unwrap().stat().unwrap().num_threads;
     let before = threads();
     let (asked, begin) = (well.requests(), Instant::now());
@@ -176,7 +176,7 @@ async fn a_name_whose_lookup_hangs_holds_up_only_its_own_server() {
     let took = begin.elapsed();
     assert!(took < Duration::from_secs(5), "twenty looks, one each 0.05 s, took {took:?}");
     assert!(threads() <= before, "{} threads, {before} before", threads());
-    // Nobody waits for them at the end either.
+    // The pending lookups don't delay the stop either.
     let begin = Instant::now();
     session.stops().await;
     assert!(begin.elapsed() < Duration::from_secs(5), "the end took {:?}", begin.elapsed());

@@ -1,4 +1,4 @@
-//! What web clients get at the door.
+//! The session server's answers to web clients.
 
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
@@ -14,7 +14,7 @@ use crate::support::{SOON, http, until};
 #[actix_rt::test]
 async fn a_client_is_led_to_the_simulation_server_that_is_there() {
     let simulation = demo_server(9).start().await;
-    // Whatever else keeps this machine busy closes no server.
+    // Other load on this machine must not make the server full.
     let session = session_server(&[simulation.address()]).set("loadThreshold", 1000).start().await;
     let mut client = Client::connect(&session.websocket("/session")).await;
     client.until("1").await;
@@ -31,7 +31,7 @@ async fn a_client_is_led_to_the_simulation_server_that_is_there() {
     let answer = http::get(&session.url("/session")).await;
     assert_eq!(answer.text(), "Error: no simulation server available at the moment.");
     assert_eq!((answer.status.as_u16(), answer.header("retry-after")), (200, None), "as the Python server answers");
-    // A class that is told so comes back at different times.
+    // `Retry-After` varies, so that the clients of a class retry at different times.
     let mut seconds = BTreeSet::new();
     for _ in 0..20 {
         let answer = http::get(&session.url(&format!("/session?url={url}"))).await;
@@ -66,10 +66,10 @@ async fn many_texts_at_once_are_answered_in_order_up_to_a_limit() {
     let server = StandIn::start(Manner::of_owner("other"));
     let session = session_server(&[server.address()]).start().await;
     let mut client = Client::connect(&session.websocket("/session")).await;
-    // It is '0' until the simulation server was asked for the first time.
+    // It is '0' until the first answer of the simulation server.
     client.until("1").await;
     let told = client.heard.len();
-    // Some of the answers are known at once, others only to the registry.
+    // Some answers are known at once; for others the connection asks the registry.
     let project = |number: usize| if number.is_multiple_of(2) { "lab" } else { "other" };
     let text = |number: usize| match number % 3 {
         0 => world("lab/arm", "main", &format!("worlds/{number}.txt")),
@@ -98,11 +98,11 @@ async fn many_texts_at_once_are_answered_in_order_up_to_a_limit() {
 #[actix_rt::test]
 async fn a_draining_server_is_offered_for_less_than_a_second_more() {
     let server = demo_server(40).start().await;
-    // As the fleets of deploy/swarm and deploy/kubernetes have it.
+    // As in deploy/swarm and deploy/kubernetes.
     let config = std::fs::read(concat!(env!("CARGO_MANIFEST_DIR"), "/deploy/swarm/session.json")).unwrap();
     let config: serde_json::Value = serde_json::from_slice(&config).unwrap();
     let session = session_server(&[server.address()]).set("loadRefresh", config["loadRefresh"].clone());
-    // Neither other tests on this machine nor those who ask here close the server.
+    // Neither other tests on this machine nor the requests below make the server full.
     let session = session.set("loadThreshold", 1000).set("clientCost", 0.001).start().await;
     let offered = async || http::get(&session.url("/session")).await.text().starts_with("ws://");
     until("it is offered", offered).await;
@@ -111,7 +111,7 @@ async fn a_draining_server_is_offered_for_less_than_a_second_more() {
 
     server.signal(Signal::SIGUSR1);
     let drains = Instant::now();
-    // Who asks here is held up as well where the machine does other things for a while.
+    // If the machine is busy for a while, the requests of this test are late too: allow for that.
     let (mut asked, mut held_up) = (drains, Duration::ZERO);
     while offered().await {
         let last = asked;

@@ -16,7 +16,7 @@ fn mailing(servers: &[String], port: u16) -> Builder {
     session_server(servers).mails_to(port).set("timing", timing)
 }
 
-/// Adds the mails that come to a text until these words are in it.
+/// Appends received mails to `text` until it contains `words`.
 async fn read_until(smtp: &mut Smtp, text: &mut String, words: &str) {
     while !text.contains(words) {
         let mail = smtp.mail().await;
@@ -131,8 +131,8 @@ async fn a_silent_server_holds_up_nobody_and_leaves_nothing_open() {
     smtp.wait_for_times("closed", opened).await;
 }
 
-/// What a session server with these keys says of itself, where only the authorities of a file are trusted: its exit code, and
-/// all that it prints.
+/// The exit code and output of a session server with this option and these keys, which trusts only the authorities in
+/// the file `trusted`.
 pub async fn says(option: &str, keys: &Value, trusted: &str) -> (Option<i32>, String) {
     let mut config = json!({"port": 1, "ssl": false, "simulationServers": [], "server": "localhost"});
     config.as_object_mut().unwrap().extend(keys.as_object().unwrap().clone());
@@ -143,7 +143,7 @@ pub async fn says(option: &str, keys: &Value, trusted: &str) -> (Option<i32>, St
     (output.status.code(), String::from_utf8([output.stdout, output.stderr].concat()).unwrap())
 }
 
-/// The keys of mails to this port of this machine, with more of them.
+/// Keys that send mail to this port of this machine, and `more`.
 fn keys(port: u16, more: &Value) -> Value {
     let mut keys = json!({"administrator": "Admin <admin@example.org>", "mailServer": "127.0.0.1", "mailServerPort": port,
         "mailSender": "fleet@example.org", "mailSenderUser": "fleet"});
@@ -199,7 +199,7 @@ async fn a_password_is_sent_to_a_trusted_server_only() {
         let trusted = if is_trusted { &authority } else { "/dev/null" };
         let (_, said) = says("--test-mail", &keys(smtp.port, more), trusted).await;
         assert!(said.contains(words) && !said.contains("guess"), "{options:?}: {said}");
-        // Python's asyncio doesn't tell of a connection whose encryption fails from the first byte.
+        // Python's asyncio doesn't report a connection if TLS fails at the first byte.
         if !commands.is_empty() {
             smtp.wait_for("closed").await;
         }

@@ -1,4 +1,4 @@
-//! What clients that read nothing cost.
+//! The memory that clients cost if they read nothing.
 
 use std::io::{ErrorKind, Write};
 use std::net::TcpStream;
@@ -11,9 +11,9 @@ use crate::support::program::{Server, session_server};
 use crate::support::{http, until};
 
 const CLIENTS: usize = 25;
-/// How long they send, at most.
+/// The longest time that they send.
 const LONGEST: Duration = Duration::from_secs(5);
-/// What each of them may cost, in bytes.
+/// The memory that each of them may cost, in bytes.
 const LIMIT: u64 = 512 << 10;
 
 /// The memory of a server, in bytes.
@@ -23,7 +23,7 @@ fn memory(server: &Server) -> u64 {
     line.trim().trim_end_matches(" kB").parse::<u64>().unwrap() << 10
 }
 
-/// A client that takes little from its connection before it reads.
+/// A client with a small receive buffer.
 fn connect(server: &Server) -> TcpStream {
     let socket = Socket::new(Domain::IPV4, Type::STREAM, None).unwrap();
     socket.set_recv_buffer_size(4096).unwrap();
@@ -33,9 +33,9 @@ fn connect(server: &Server) -> TcpStream {
     socket.into()
 }
 
-/// Sends these requests again and again, as much of them as the server takes from each of the clients.
+/// Sends these requests repeatedly, as many as the server accepts from each client.
 async fn fill(clients: &mut [TcpStream], requests: &[u8]) {
-    // A server may go on taking what it ignores.
+    // A server may keep accepting bytes that it ignores.
     let (deadline, mut progress) = (Instant::now() + LONGEST, Instant::now());
     let mut sent = vec![0; clients.len()];
     while progress.elapsed() < Duration::from_secs(1) && Instant::now() < deadline {
@@ -52,7 +52,7 @@ async fn fill(clients: &mut [TcpStream], requests: &[u8]) {
     }
 }
 
-/// Fails where so many clients that send these requests and read nothing cost much.
+/// Asserts that `CLIENTS` clients that send these requests and read nothing cost little memory.
 async fn cost_little(server: &Server, requests: &str) {
     let before = memory(server);
     let mut clients: Vec<TcpStream> = (0..CLIENTS).map(|_| connect(server)).collect();
@@ -65,7 +65,7 @@ async fn cost_little(server: &Server, requests: &str) {
 
 #[actix_rt::test]
 async fn clients_that_ask_much_and_read_nothing_cost_little() {
-    // Large answers, and such that are little more than a head.
+    // Large answers, and answers that are little more than a head.
     let ask = async |request: &str| {
         let session = session_server(&["127.0.0.1:1".to_owned()]).start().await;
         until_states(&session, &["down"]).await;
@@ -80,7 +80,7 @@ async fn live_pages_that_read_nothing_cost_little() {
     let fleet: Vec<String> = (1..=1000).map(|port| format!("127.0.0.1:{port}")).collect();
     let session = session_server(&fleet).set("loadRefresh", 600).start().await;
     until_states(&session, &vec!["down"; fleet.len()]).await;
-    // The page is rendered with the first.
+    // The page is rendered for the first client.
     let request = "GET /events HTTP/1.1\r\nHost: x\r\n\r\n";
     let mut first = connect(&session);
     first.write_all(request.as_bytes()).unwrap();

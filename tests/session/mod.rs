@@ -1,4 +1,4 @@
-//! The session server, seen from outside: the built program, real sockets, stand-ins for simulation servers.
+//! Black-box tests of the session server: the built program, real sockets, stand-ins for simulation servers.
 
 mod stand_in;
 
@@ -34,7 +34,7 @@ async fn until_states(session: &Server, expected: &[&str]) {
     .await;
 }
 
-/// How often a server has logged this.
+/// The number of times that a server has logged this.
 fn times_logged(session: &Server, words: &str) -> usize {
     session.log().matches(words).count()
 }

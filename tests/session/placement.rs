@@ -1,4 +1,4 @@
-//! Whom clients are sent to.
+//! The simulation servers to which clients are sent.
 
 use std::collections::BTreeMap;
 
@@ -13,12 +13,12 @@ use crate::support::{http, until};
 
 const NOBODY: &str = "Error: no simulation server available at the moment.";
 
-/// A session server whose simulation servers report once, so that a test stands between two reports.
+/// A session server whose simulation servers report only once, so that the test runs between two reports.
 fn between_reports(servers: &[StandIn], client_cost: f64) -> Builder {
     session_server(&addresses(servers)).set("loadRefresh", 600).set("clientCost", client_cost)
 }
 
-/// Sends so many requests; how many clients each server got.
+/// Sends `count` requests; returns how many clients each server got.
 async fn requests(session: &Server, count: usize) -> BTreeMap<String, usize> {
     let client = awc::Client::default();
     let mut got = BTreeMap::new();
@@ -63,7 +63,7 @@ async fn a_server_without_a_free_slot_gets_nobody() {
 
 #[actix_rt::test]
 async fn a_world_goes_only_where_it_will_be_accepted() {
-    // One has never answered, and is waited for by nobody.
+    // One has never answered; no client waits for it.
     let servers = [Manner::of_owner("lab"), Manner::of_owner("school"), Manner::Reset].map(StandIn::start);
     let session = session_server(&addresses(&servers)).start().await;
     until_states(&session, &["up", "up", "down"]).await;
@@ -100,7 +100,7 @@ async fn somebody_who_only_asks_does_not_close_the_fleet() {
     let counting = json!({"load": 10, "instances": {"queued": 0, "starting": 0, "idle": 0, "running": 0, "places": 100,
         "arrivals": 0}});
     let servers = [StandIn::start(Manner::Status(counting))];
-    // The tests' own address is that of a proxy, which is believed on its clients' addresses. There is room for 43 clients.
+    // The tests' own address is that of a trusted proxy, which names its clients. There is room for 43 clients.
     let session = session_server(&addresses(&servers)).set("timing", json!({"placement": 0.5})).start().await;
     until_states(&session, &["up"]).await;
     let (url, client) = (session.url("/session"), awc::Client::default());

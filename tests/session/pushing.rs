@@ -1,4 +1,4 @@
-//! What connected clients are told, and which of them are sent away.
+//! The values that connected clients receive, and which clients are disconnected.
 
 use std::time::Duration;
 
@@ -20,7 +20,7 @@ async fn clients_of(session: &Server) -> u64 {
 const UPGRADE: &[u8] = b"GET /session HTTP/1.1\r\nHost: x\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
                          Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n";
 
-/// A WebSocket that is opened and then left alone.
+/// A WebSocket that is opened and never read.
 async fn deaf(session: &Server) -> TcpStream {
     let mut stream = TcpStream::connect(session.address()).await.unwrap();
     stream.write_all(UPGRADE).await.unwrap();
@@ -32,7 +32,7 @@ async fn no_value_comes_twice_however_a_server_flaps() {
     let servers = [StandIn::start(Manner::idle(1.0, 1000))];
     let session = session_server(&addresses(&servers)).set("loadRefresh", 0.01).set("clientCost", 0.1).start().await;
     let paths = ["/session", "/"].into_iter().cycle().map(|path| session.websocket(path));
-    // More than are told at a time.
+    // More clients than are notified at a time.
     let mut clients = join_all(paths.take(150).map(|url| async move { Client::connect(&url).await })).await;
     let flap = async {
         for turn in 0..60 {
@@ -47,7 +47,7 @@ async fn no_value_comes_twice_however_a_server_flaps() {
         }
     };
     flap.await;
-    // More come in the same moment as the next change.
+    // More clients connect at the moment of the next change.
     servers[0].set(Manner::idle(99.0, 10));
     let url = session.websocket("/session");
     clients.extend(join_all((0..50).map(|_| Client::connect(&url))).await);
@@ -55,7 +55,7 @@ async fn no_value_comes_twice_however_a_server_flaps() {
     servers[0].set(Manner::idle(1.0, 1000));
     until_states(&session, &["up"]).await;
     for client in &mut clients {
-        // A value for each turn of the server, and no others before this answer.
+        // A value for each change of the server, and no others before this answer.
         client.send("").await;
         client.until("ws://").await;
         let values: Vec<&String> = client.heard.iter().filter(|text| !text.starts_with("ws://")).collect();
@@ -73,14 +73,14 @@ async fn a_silent_client_is_disconnected_in_time() {
     let mut reader = Client::connect(&session.websocket("/session")).await;
     reader.until("0").await;
     let begin = std::time::Instant::now();
-    // It takes everything in, and answers no ping.
+    // It receives everything, but answers no ping.
     let (mut silent, mut rest) = (deaf(&session).await, Vec::new());
     let closed = async {
         let end = actix_rt::time::timeout(Duration::from_secs(15), silent.read_to_end(&mut rest)).await;
         assert!(end.is_ok(), "its connection is still open");
         begin.elapsed().as_secs_f64()
     };
-    // Reading is what answers pings.
+    // Pings are answered while reading.
     let (took, is_silent) = futures_util::future::join(closed, reader.is_silent(Duration::from_secs(6))).await;
     assert!((4.0..5.9).contains(&took), "closed after {took} s; the silence is 4 s");
     assert!(is_silent, "{:?}", reader.heard);
@@ -120,7 +120,7 @@ async fn too_many_clients_are_refused() {
         };
         assert!(refused.to_string().contains("503"), "{refused}");
         assert!(clients.len() >= least, "only {} clients", clients.len());
-        // Those who come all the same wait outside; the server is well, and takes others when there is room.
+        // Further connections wait; the server keeps running, and accepts clients again when there is room.
         let waiting: Vec<_> = join_all((0..300).map(|_| TcpStream::connect(session.address()))).await;
         drop((waiting, clients));
         until("there is room again", async || connect().await.is_ok()).await;
@@ -137,13 +137,13 @@ async fn a_client_that_reads_no_page_is_sent_away() {
     let session = session_server(&[]).set("timing", serde_json::json!({"ping": 0.5, "silence": 1})).start().await;
     let mut deaf = TcpStream::connect(session.address()).await.unwrap();
     let request = b"GET /assets/viewer.js HTTP/1.1\r\nHost: localhost\r\n\r\n";
-    // Until it no longer takes requests in, for its answers are not read; then until the connection is cut.
+    // The server stops reading requests because its answers are not read; then it cuts the connection.
     let flood = async { while deaf.write_all(request).await.is_ok() {} };
     actix_rt::time::timeout(Duration::from_secs(40), flood).await.expect("the connection is still open");
     assert_eq!(http::get(&session.url("/health")).await.status, 200);
 }
 
-/// A connection over which a request was answered, and that stays open.
+/// An open connection over which one request was answered.
 async fn served(session: &Server) -> Option<TcpStream> {
     let mut stream = TcpStream::connect(session.address()).await.unwrap();
     stream.write_all(b"GET /health HTTP/1.1\r\nHost: localhost\r\n\r\n").await.ok()?;
@@ -156,7 +156,7 @@ async fn an_address_has_only_so_many_connections_of_any_kind() {
     let builder = session_server(&[]).set("trustedProxies", serde_json::json!([])).set("maxClientsPerAddress", 2);
     let session = builder.start().await;
     let mut open = Vec::new();
-    // The connection over which it was asked whether it has started may still be there.
+    // The connection of the start check may still be open.
     until("two for each of two clients stay", async || {
         open.extend(served(&session).await);
         open.len() == 4

@@ -1,4 +1,4 @@
-//! What administrators and other programs see: pages, headers, logs, faults of the configuration.
+//! What administrators and other programs see: pages, headers, logs, configuration errors.
 
 use serde_json::json;
 

@@ -1,4 +1,4 @@
-//! Stand-ins for simulation servers, which behave as a test says: well, like a Python server, or badly.
+//! Stand-ins for simulation servers: correct ones, ones like the Python servers, and misbehaving ones.
 
 use std::net::SocketAddr;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -15,31 +15,31 @@ use crate::support::raise_file_limit;
 /// How a stand-in answers.
 #[derive(Debug, Clone)]
 pub enum Manner {
-    /// Tells this in `/status`.
+    /// Answers `/status` with this.
     Status(Value),
-    /// Has no `/status`; tells this in `/load`, as Python servers do.
+    /// Has no `/status`; answers `/load` with this, as Python servers do.
     Load(String),
-    /// Gives this status and body to every request.
+    /// Answers every request with this status and body.
     Body(u16, Vec<u8>),
-    /// Sends these bytes, whatever they are, and ends the connection.
+    /// Sends these bytes and closes the connection.
     Raw(Vec<u8>),
-    /// Has no `/status`; sends these bytes for `/load`, and ends the connection.
+    /// Has no `/status`; answers `/load` with these bytes and closes the connection.
     RawLoad(Vec<u8>),
-    /// Takes connections and says nothing.
+    /// Accepts connections and sends nothing.
     Hang,
-    /// Takes connections and breaks them.
+    /// Accepts connections and resets them.
     Reset,
-    /// Sends an answer byte by byte, without an end.
+    /// Sends an endless answer byte by byte.
     Drip,
 }
 
 impl Manner {
-    /// A status with a load and so many places, all free.
+    /// A status with this load and this many slots, all free.
     pub fn idle(load: f64, places: u32) -> Self {
         Self::status(load, 0, places)
     }
 
-    /// A status with so many simulations in so many places.
+    /// A status with this load, `running` simulations and this many slots.
     pub fn status(load: f64, running: u32, places: u32) -> Self {
         let instances = json!({"queued": 0, "starting": 0, "idle": 0, "running": running, "places": places,
             "arrivals": running});
@@ -75,7 +75,7 @@ impl StandIn {
 
     /// Starts one on this address of the loopback.
     pub fn start_on(address: SocketAddr, manner: Manner) -> Self {
-        // There may be a thousand of them.
+        // A test may start a thousand of them.
         raise_file_limit();
         let socket = if address.is_ipv6() { TcpSocket::new_v6() } else { TcpSocket::new_v4() }.unwrap();
         socket.set_reuseaddr(true).unwrap();
@@ -98,22 +98,22 @@ impl StandIn {
         self.address.to_string()
     }
 
-    /// What the session server tells a client that is sent here.
+    /// The URL that the session server sends to a client that it assigns here.
     pub fn url(&self) -> String {
         format!("ws://{}", self.address())
     }
 
-    /// Behaves so from now on. A connection that hangs goes on hanging.
+    /// Changes its behaviour from now on; a connection that hangs keeps hanging.
     pub fn set(&self, manner: Manner) {
         *self.shared.manner.lock().unwrap() = manner;
     }
 
-    /// How many connections it has had.
+    /// The number of connections accepted so far.
     pub fn connections(&self) -> usize {
         self.shared.connections.load(Ordering::SeqCst)
     }
 
-    /// How many requests it has had.
+    /// The number of requests received so far.
     pub fn requests(&self) -> usize {
         self.shared.requests.load(Ordering::SeqCst)
     }
@@ -133,7 +133,7 @@ async fn serve(listener: TcpListener, shared: Arc<Shared>, end: CancellationToke
     }
 }
 
-/// Answers on one connection until it ends.
+/// Answers requests on one connection until it ends.
 async fn converse(mut stream: TcpStream, shared: &Shared) -> std::io::Result<()> {
     stream.set_nodelay(true)?;
     while let Some(path) = next_request(&mut stream).await? {
@@ -146,7 +146,7 @@ async fn converse(mut stream: TcpStream, shared: &Shared) -> std::io::Result<()>
     Ok(())
 }
 
-/// The path of the next request; nothing at the end of the connection.
+/// The path of the next request; `None` at the end of the connection.
 async fn next_request(stream: &mut TcpStream) -> std::io::Result<Option<String>> {
     let mut head = Vec::new();
     while !head.ends_with(b"\r\n\r\n") {
@@ -158,7 +158,7 @@ async fn next_request(stream: &mut TcpStream) -> std::io::Result<Option<String>>
     Ok(text.split(' ').nth(1).map(str::to_owned))
 }
 
-/// Whether the connection goes on.
+/// Answers one request; returns whether the connection stays open.
 async fn answer(stream: &mut TcpStream, path: &str, manner: Manner) -> std::io::Result<bool> {
     match manner {
         Manner::Status(status) if path == "/status" => send(stream, 200, status.to_string().as_bytes()).await?,

@@ -21,7 +21,7 @@ async fn a_stop_notifies_clients_and_takes_five_seconds_at_most() {
     let url = session.websocket("/session");
     let mut clients = join_all((0..1000).map(|_| Client::connect(&url))).await;
     join_all(clients.iter_mut().map(|client| client.until("1"))).await;
-    // Connections that never end by themselves: one that says nothing, one that says half.
+    // Connections that never end by themselves: one that sends nothing, one that sends half a request.
     let silent = tokio::net::TcpStream::connect(session.address()).await.unwrap();
     let half = tokio::net::TcpStream::connect(session.address()).await.unwrap();
     half.try_write(b"GET /session HTTP/1.1\r\nHost:").unwrap();
@@ -31,7 +31,7 @@ async fn a_stop_notifies_clients_and_takes_five_seconds_at_most() {
     let codes = join_all(clients.iter_mut().map(Client::closed)).await;
     assert_eq!(codes, vec![Some(1001); 1000]);
     drop(clients);
-    // It still waits for the others, and takes nobody else.
+    // It still waits for the others, and accepts no new connection.
     until("nobody answers", async || tokio::net::TcpStream::connect(session.address()).await.is_err()).await;
     assert_eq!(session.ended().await, Some(0));
     assert!(lap.elapsed() < Duration::from_secs(5), "the end took {:?} of {:?}", lap.elapsed(), lap.wall());
@@ -74,12 +74,12 @@ async fn servers_are_added_and_removed_without_dropping_a_client() {
     until_states(&session, &["up", "up"]).await;
     assert_eq!(place().await, servers[0].url());
     assert_eq!(client.heard, ["0", "1"].map(str::to_owned)[usize::from(client.heard[0] == "1")..]);
-    // All drained is as good as none.
+    // All servers drained counts as no server available.
     session.reload(json!({"drainedServers": [one, three]}));
     assert_eq!(client.until("0").await, "0");
     session.reload(json!({"drainedServers": []}));
     client.until("1").await;
-    // A threshold that is read again counts at once, too.
+    // A reloaded threshold takes effect at once, too.
     session.reload(json!({"loadThreshold": 0.5}));
     client.until("0").await;
     let asked = servers[1].requests();
@@ -94,14 +94,14 @@ async fn a_configuration_that_can_not_be_used_changes_nothing() {
     let servers = [StandIn::start(Manner::idle(50.0, 10))];
     let session = session_server(&addresses(&servers)).set("clientCost", 0.001).start().await;
     until_states(&session, &["up"]).await;
-    // What is right beside what is wrong is not taken either.
+    // Valid keys beside an invalid one are not applied either.
     session.reload(json!({"loadThreshold": 40, "simulationServers": "none"}));
     until("it says so", async || session.log().contains("the configuration stays as it was")).await;
     let asked = servers[0].requests();
     until("it is judged anew", async || servers[0].requests() >= asked + 3).await;
     until_states(&session, &["up"]).await;
     assert_eq!(http::get(&session.url("/session")).await.text(), servers[0].url());
-    // Nor is a pipe in its place waited for.
+    // Nor does the server block on a named pipe in place of the file.
     let file = session.folder.join("config.json");
     std::fs::remove_file(&file).unwrap();
     nix::unistd::mkfifo(&file, nix::sys::stat::Mode::S_IRWXU).unwrap();

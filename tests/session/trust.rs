@@ -1,4 +1,4 @@
-//! Certificates of simulation servers: of a lab's own authority, and those that can't be trusted.
+//! Certificates of simulation servers: signed by a lab's own authority, and untrusted ones.
 
 use std::net::TcpListener;
 use std::path::Path;
@@ -28,7 +28,7 @@ fn watching(servers: &[String], trusted: &Path) -> Builder {
     builder.env("SSL_CERT_FILE", trusted.to_str().unwrap())
 }
 
-/// Waits until the first simulation server is up and the others are down; why these are.
+/// Waits until the first simulation server is up and the others are down; returns the errors of these.
 async fn errors_after_the_first(session: &Server, count: usize) -> Vec<String> {
     until_states(session, &[vec!["up"], vec!["down"; count]].concat()).await;
     let servers = session.status().await["servers"].as_array().unwrap().clone();
@@ -61,7 +61,7 @@ async fn a_certificate_that_is_not_trusted_is_named_with_the_reason() {
     let errors = errors_after_the_first(&session, 5).await;
     let (page, log) = (session.monitor().await, session.log());
     for (error, (_, words)) in errors.iter().zip(&table) {
-        // What follows has the time of the probe.
+        // The time of the probe follows.
         let words = format!("{untrusted}{words}");
         assert!(error.starts_with(&words), "{error:?} is not {words:?}");
         assert!(log.contains(&words), "{words:?} is not in the log");
@@ -79,7 +79,7 @@ async fn a_self_signed_certificate_in_the_trust_store_is_trusted() {
     std::fs::write(folder.path().join("trusted.pem"), trusted.concat()).unwrap();
     let servers = [&own, &other, &authority].map(simulation_server);
     let session = watching(&servers, &folder.path().join("trusted.pem")).start().await;
-    // Another one for the same name is not that one, nor is one that may sign others, as those of `openssl req -x509` may.
+    // Not trusted: another certificate for the same name, and one that may sign others, as `openssl req -x509` makes.
     let errors = errors_after_the_first(&session, 2).await;
     for (error, words) in errors.iter().zip(["its certificate is not trusted", "CaUsedAsEndEntity"]) {
         assert!(error.contains(words), "{error}");

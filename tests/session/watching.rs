@@ -1,4 +1,4 @@
-//! How simulation servers are watched, and what those do no harm that misbehave.
+//! How simulation servers are monitored, and that misbehaving ones do no harm.
 
 use std::time::Duration;
 
@@ -21,7 +21,7 @@ fn json(text: &str) -> Manner {
     Manner::Body(200, text.as_bytes().to_vec())
 }
 
-/// Everything that is no usable answer.
+/// Everything that is not a usable answer.
 fn bad_manners() -> Vec<Manner> {
     vec![
         Manner::Hang,
@@ -68,7 +68,7 @@ async fn no_bad_answer_is_taken_for_a_good_one() {
     until_states(&session, &vec!["down"; bad.len()]).await;
     client.until("0").await;
     assert_eq!(http::get(&session.url("/load")).await.text(), "-1");
-    // At least one more look at each of them.
+    // At least one more poll of each of them.
     let requests: Vec<usize> = servers.iter().map(StandIn::requests).collect();
     for (server, before) in servers.iter().zip(requests) {
         until("each server is looked at again", async || server.requests() > before).await;
@@ -90,7 +90,7 @@ async fn no_bad_answer_is_taken_for_a_good_one() {
 
 #[actix_rt::test]
 async fn a_crashed_server_is_noticed_within_one_refresh() {
-    // One comes back to its port, which the system gives to nobody meanwhile.
+    // One comes back on its port, which the system assigns to no other program in between.
     let port = ports::block(1);
     let mut servers = vec![StandIn::start_on(([127, 0, 0, 1], port).into(), good()), StandIn::start(good())];
     let session = session_server(&addresses(&servers)).set("loadRefresh", 1).start().await;
@@ -116,7 +116,7 @@ async fn a_crashed_server_is_noticed_within_one_refresh() {
 async fn a_hung_server_is_noticed_in_time_and_delays_nobody() {
     let servers = [(); 10].map(|()| StandIn::start(Manner::idle(5.0, 1000)));
     let timing = serde_json::json!({"answer": 2, "placement": 0.2});
-    // However many requests this machine can send, they don't use up the room.
+    // With this cost the requests of this test don't use up the capacity.
     let builder = session_server(&addresses(&servers)).set("timing", timing).set("clientCost", 0.001);
     let session = builder.start().await;
     until_states(&session, &["up"; 10]).await;

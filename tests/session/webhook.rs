@@ -1,4 +1,4 @@
-//! From a failure to a message in a messenger: the built program, a stand-in that fails, a real web server that is posted to.
+//! From a failure to a chat message: the built program, a stand-in that fails, a real web server for the webhook.
 
 use serde_json::json;
 
@@ -11,7 +11,7 @@ use crate::support::receiver::Receiver;
 use crate::support::smtp::Smtp;
 use crate::support::until;
 
-/// What nobody may read who does not write the configuration.
+/// A secret in the webhook's URL; only the configuration may show it.
 const SECRET: &str = "T0PSECRET";
 
 fn with_webhook(servers: &[StandIn], scheme: &str, port: u16) -> Builder {
@@ -42,7 +42,7 @@ async fn the_notices_of_a_mail_are_one_message_and_need_no_mail() {
     let posted = receiver.posted().remove(0);
     assert_eq!(posted.line, format!("POST /services/{SECRET}?key={SECRET} HTTP/1.1"));
     assert_eq!(posted.body.as_object().unwrap().len(), 1);
-    // What a server says of itself is no call, no link and no second line in a messenger.
+    // A server's problem text must not become a mention, a link or a second line in a chat.
     servers[0].set(Manner::idle(7.0, 10));
     until_states(&session, &["up", "down", "down"]).await;
     servers[0].set(Manner::Status(json!({"load": 100, "problem": "<!channel> & <https://evil.example|x>\nhello"})));
@@ -64,12 +64,12 @@ async fn a_webhook_and_a_mail_are_retried_independently() {
     receiver.answer("503 Busy");
     let mut smtp = Smtp::start(&[]).await;
     let session = with_webhook(&servers, "http", receiver.port).mails_to(smtp.port).start().await;
-    // The mail does not wait for the messenger.
+    // The mail does not wait for the webhook.
     assert_eq!(smtp.mail().await.subject(), "Simulation servers: 3 not responding");
     receiver.texts(3).await;
     until("it is logged", async || session.log().contains("webhook not sent, it is tried again")).await;
     assert!(session.log().contains("503 Service Unavailable"), "{}", session.log());
-    // A redirect leads notices to nobody else.
+    // Redirects are not followed: no other server receives the notices.
     receiver.answer(&format!("307 Elsewhere\r\nLocation: http://127.0.0.1:{}/", other.port));
     until("it is logged", async || session.log().contains("307 Temporary Redirect")).await;
     receiver.answer("204 Taken");

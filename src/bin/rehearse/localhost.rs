@@ -31,7 +31,7 @@ mod tests {
     fn only_own_addresses_are_this_machine() {
         let is_here = |url: &str| is_localhost(&Url::parse(url).unwrap());
         assert!(is_here("http://127.0.0.1:1999") && is_here("http://localhost:1999"));
-        // Without IPv6 too.
+        // Also on a machine without IPv6.
         assert!(is_here("http://[::1]:1999") && is_here("http://[::ffff:127.0.0.1]:1999"));
         assert!(!is_here("http://192.0.2.1:1999") && !is_here("http://fleet.invalid"));
     }

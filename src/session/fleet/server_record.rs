@@ -217,7 +217,7 @@ mod tests {
         ServerReport::load_only(Load::try_from(load).unwrap())
     }
 
-    /// What is mailed after each step: a load, or `None` for a failure.
+    /// The notice after each step, if any. A step is a load, or `None` for a failure.
     fn events(steps: &[Option<f64>]) -> Vec<Option<NoticeKind>> {
         let mut record = ServerRecord::new("host:2000".parse().unwrap());
         let change = |step: &Option<f64>| match step {

@@ -154,19 +154,19 @@ mod tests {
 
     use NoticeKind::{AvailableAgain, MaximumLoad, NotResponding, WorkingAgain};
 
-    /// When (in seconds), and what (port, event).
+    /// The second of a mail, and its notices (port, event).
     type Mail = (u64, Vec<(u16, NoticeKind)>);
 
     fn notice(port: u16, event: NoticeKind) -> Notice {
         Notice { server: format!("host:{port}"), event, load: None, error: None, at: String::new() }
     }
 
-    /// With the defaults: `gather` 10 s, `flapping` 600 s, `mailPatience` one hour.
+    /// An outbox with the defaults: `gather` 10 s, `flapping` 600 s, `mailPatience` one hour.
     fn outbox() -> Outbox {
         Outbox::new(&Timing::default())
     }
 
-    /// Plays notices (second, port, event).
+    /// Adds these notices (second, port, event) to an outbox; returns its mails.
     fn play(notices: &[(u64, u16, NoticeKind)]) -> Vec<Mail> {
         let start = Instant::now();
         let mut state = outbox();
@@ -203,7 +203,7 @@ mod tests {
                     (21, vec![(4, NotResponding)]),
                 ],
             ),
-            // A recovery is mailed once the time of flapping is over.
+            // A recovery is mailed `flapping` seconds after the failure.
             (vec![(0, 1, NotResponding), (100, 1, WorkingAgain)], vec![one(10, NotResponding), one(610, WorkingAgain)]),
             (vec![(0, 1, MaximumLoad), (590, 1, AvailableAgain)], vec![one(10, MaximumLoad), one(610, AvailableAgain)]),
             // A second failure soon after the first waits.

@@ -58,7 +58,7 @@ mod tests {
 
     #[actix_rt::test]
     async fn a_task_that_panics_again_and_again_ends_the_server() {
-        // The process that ends is this test, started once more.
+        // The process that ends is a second run of this test.
         if std::env::var_os("PANICS").is_some() {
             restarted("a task", async || panic!("this panic is part of a test")).await;
         }

@@ -95,7 +95,7 @@ mod tests {
         let mut file = RotatedFile::open(&path, MOST, "").unwrap();
         file.write_all(b"more").unwrap();
         assert_eq!(size("a.log"), before + 4);
-        // It can't be renamed.
+        // The log can't be renamed to a directory that is not empty.
         std::fs::remove_file(folder.path().join("logs/a.log.1")).unwrap();
         std::fs::create_dir_all(folder.path().join("logs/a.log.1/full")).unwrap();
         for _ in 0..200 {

@@ -130,7 +130,7 @@ mod tests {
         let expected = "# a comment\nARG IMAGE\nfrom $IMAGE \\\n  as base\nLABEL webots-fleet.owner=x\nRUN a \\\n  # inside\n  \
                         FROM b\nFROM scratch\nLABEL webots-fleet.owner=x\n";
         let found = Dockerfile::read(text, "x").unwrap();
-        // The last one counts, whatever the project says.
+        // The last label wins, so the project can't override it.
         let end = format!("{OPEN_HOME}LABEL webots-fleet.owner=x\n");
         assert_eq!(
             (found.text.strip_suffix(end.as_str()), found.bases),

@@ -72,7 +72,7 @@ mod tests {
         (0..).zip(loads).map(|(index, compute)| Gpu { index, compute: *compute, ..Gpu::default() }).collect()
     }
 
-    /// The GPUs of this number of simulations that start at once.
+    /// The GPUs assigned to `count` simulations that start at once.
     fn taken(spread: &Spread, gpus: &[Gpu], count: usize, now: Instant) -> Vec<u32> {
         (0..count).map(|_| spread.take(gpus, now).unwrap().index).collect()
     }
