@@ -4,7 +4,7 @@
 //!
 //! | reason | in which states | tested by |
 //! |---|---|---|
-//! | its client closes, the connection breaks or is half open | all but stopping, in which it has no client | `a_client_that_goes...` |
+//! | its client closes, the connection breaks or is half open | all but stopping, in which it has no client | `a_client_that_leaves_in_any_way_leaves_nothing_behind` |
 //! | Webots ends, in three ways | launching, idle, running; in others there is no Webots | `a_client_is_told_how_webots_ended` |
 //! | Webots ignores SIGTERM | stopping | `isolation::lives::a_simulation_that_ignores_sigterm_is_killed` |
 //! | git is killed, or hangs | checking out | `checkout::a_kill_in_the_middle_of_a_fetch...`, `fetching::a_git_that_is_stopped...` |
@@ -13,7 +13,6 @@
 //! | SIGTERM to the server | all | `a_server_that_stops_notifies_clients_and_leaves_nothing` |
 //! | SIGKILL to the server | all | `a_server_that_is_killed_leaves_nothing_in_any_state` |
 //! | the client's actor panics | all but stopping, in which it has ended | `simulation_limits` (`panics`) |
-//! | Webots' actor panics | launching, idle, running, stopping; in others there is none | `simulation_limits` (`panics`) |
 
 use std::time::{Duration, Instant};
 

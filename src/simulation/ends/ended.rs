@@ -28,7 +28,7 @@ pub enum EndReason {
     Crashed,
     /// Webots sent no heartbeat.
     Hung,
-    /// It has exceeded a limit of memory, disk or processes.
+    /// It has exceeded a limit of memory or disk.
     Limit,
     /// An error of this server, its machine or its Docker.
     Fault,
