@@ -41,8 +41,10 @@ const SIMULATIONS: u16 = 4;
 
 fn main() {
     let arguments: Vec<String> = std::env::args().collect();
-    let seconds =
-        arguments.iter().position(|one| one == "--seconds").map_or(20, |at| arguments[at + 1].parse().unwrap());
+    let seconds = arguments
+        .iter()
+        .position(|one| one == "--seconds")
+        .map_or(20, |at| arguments[at + 1].parse().unwrap());
     rendering();
     let time = Duration::from_secs(seconds);
     actix_rt::System::new().block_on(open_pages(time));
@@ -50,10 +52,22 @@ fn main() {
 }
 
 fn rendering() {
-    let (fleet, urls) = (fleet(), ClientUrls { ssl: false, public: None });
+    let (fleet, urls) = (
+        fleet(),
+        ClientUrls {
+            ssl: false,
+            public: None,
+        },
+    );
     let render = || {
         let view = pages::view(&fleet, 1000, &urls, "").unwrap();
-        Monitor { started: String::new(), has_actions: true, view }.render().unwrap()
+        Monitor {
+            started: String::new(),
+            has_actions: true,
+            view,
+        }
+        .render()
+        .unwrap()
     };
     let page = render();
     let mut times: Vec<Duration> = (0..50)
@@ -78,10 +92,18 @@ fn fleet() -> FleetStatus {
         "instances": {"queued": 1, "starting": 2, "idle": 3, "running": 40, "places": 100, "arrivals": 1000},
         "allowedRepositories": ["https://github.com/lab", "https://github.com/school/robots"],
     });
-    let address = |number: u16| format!("simulation{number}.example.org:{}", 2000 + number).parse().unwrap();
+    let address = |number: u16| {
+        format!("simulation{number}.example.org:{}", 2000 + number)
+            .parse()
+            .unwrap()
+    };
     let servers = (0..SERVERS).map(|number| ServerStatus {
         record: ServerRecord {
-            state: if number % 10 == 0 { ServerState::Full } else { ServerState::Up },
+            state: if number % 10 == 0 {
+                ServerState::Full
+            } else {
+                ServerState::Up
+            },
             report: Some(Arc::new(serde_json::from_value(report.clone()).unwrap())),
             latency: Some(Duration::from_millis(3)),
             answered: Some(Instant::now()),
@@ -99,7 +121,13 @@ fn fleet() -> FleetStatus {
         why: "no answer within 3 s".to_owned(),
     };
     let changes: VecDeque<StateChange> = (0..50).map(change).collect();
-    FleetStatus { available: true, mean_load: Some(42.5), servers: servers.collect(), names: Vec::new(), changes }
+    FleetStatus {
+        available: true,
+        mean_load: Some(42.5),
+        servers: servers.collect(),
+        names: Vec::new(),
+        changes,
+    }
 }
 
 /// The demo's size: three simulation servers, one of which runs simulations that clients watch.
@@ -107,14 +135,22 @@ async fn open_pages(time: Duration) {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     let mut fleet = Vec::new();
     for _ in 0..3 {
-        fleet.push(simulation_server(&webots.path(), forge.path(), SIMULATIONS).start().await);
+        fleet.push(
+            simulation_server(&webots.path(), forge.path(), SIMULATIONS)
+                .start()
+                .await,
+        );
     }
     let addresses: Vec<String> = fleet.iter().map(Server::address).collect();
     let session = session_server(&addresses).set("loadRefresh", 1).start().await;
     let mut clients = Vec::new();
     for _ in 0..SIMULATIONS {
         let mut client = Client::start(&fleet[0], &world("lab/arm", "main", "worlds/a.wbt")).await;
-        let simulator = client.until("webots:").await.replace("webots:", "").replace("localhost", "127.0.0.1");
+        let simulator = client
+            .until("webots:")
+            .await
+            .replace("webots:", "")
+            .replace("localhost", "127.0.0.1");
         let mut viewer = Client::connect(&format!("{simulator}/")).await;
         viewer.send("x3d").await;
         viewer.until("scene load completed").await;

@@ -54,16 +54,39 @@ impl Simulator {
         }
         let output = File::create(project.path().join("output")).unwrap();
         let mut command = Command::new(env!("CARGO_BIN_EXE_demo-simulator"));
-        command.args(["--batch", "--mode=pause", "--stream", "--stdout", "--stderr", &format!("--port={PORT}")]);
-        command.arg(worlds.join("a.wbt")).env("DEMO_SIMULATOR_BIND", address.to_string());
-        let child = command.stdout(output.try_clone().unwrap()).stderr(output).spawn().unwrap();
-        Self { child, address, project }
+        command.args([
+            "--batch",
+            "--mode=pause",
+            "--stream",
+            "--stdout",
+            "--stderr",
+            &format!("--port={PORT}"),
+        ]);
+        command
+            .arg(worlds.join("a.wbt"))
+            .env("DEMO_SIMULATOR_BIND", address.to_string());
+        let child = command
+            .stdout(output.try_clone().unwrap())
+            .stderr(output)
+            .spawn()
+            .unwrap();
+        Self {
+            child,
+            address,
+            project,
+        }
     }
 
     /// Connects once the simulator listens.
     async fn connect(&self) -> Client {
-        let (output, words) = (self.project.path().join("output"), format!("server listening on port {PORT}."));
-        until(&words, async || std::fs::read_to_string(&output).unwrap().contains(&words)).await;
+        let (output, words) = (
+            self.project.path().join("output"),
+            format!("server listening on port {PORT}."),
+        );
+        until(&words, async || {
+            std::fs::read_to_string(&output).unwrap().contains(&words)
+        })
+        .await;
         Client::connect(&format!("ws://{}:{PORT}/", self.address)).await
     }
 
@@ -105,10 +128,18 @@ async fn a_viewer_hears_the_whole_scene_first() {
         viewer.send(first).await;
         viewer.until("pause: 0").await;
         let scene = viewer.heard.iter().position(|text| text.starts_with("world:")).unwrap();
-        let [world, model, rest @ ..] = &viewer.heard[scene..] else { panic!("{:?}", viewer.heard) };
+        let [world, model, rest @ ..] = &viewer.heard[scene..] else {
+            panic!("{:?}", viewer.heard)
+        };
         assert_eq!(world, "world:worlds/a.wbt:worlds/a.wbt;worlds/b.wbt");
-        assert!(model.starts_with("model:<?xml version=\"1.0\" encoding=\"UTF-8\"?><X3D>"), "{model}");
-        assert!(model.contains(r#"<Robot id="n6" name="mover" translation="1 2 0" rotation="0 0 1 0"/>"#), "{model}");
+        assert!(
+            model.starts_with("model:<?xml version=\"1.0\" encoding=\"UTF-8\"?><X3D>"),
+            "{model}"
+        );
+        assert!(
+            model.contains(r#"<Robot id="n6" name="mover" translation="1 2 0" rotation="0 0 1 0"/>"#),
+            "{model}"
+        );
         assert_eq!(rest, [START, "scene load completed", "pause: 0"]);
     }
 }
@@ -122,14 +153,21 @@ async fn an_action_of_one_viewer_moves_the_world_of_all() {
     for time in ["10", "20"] {
         one.send("step").await;
         one.until("paused by client").await;
-        other.until(&format!("application/json:{{\"time\":{time},\"updates\":[{{\"id\":6,")).await;
+        other
+            .until(&format!("application/json:{{\"time\":{time},\"updates\":[{{\"id\":6,"))
+            .await;
     }
     one.send("reset").await;
     one.until("reset finished").await;
     other.until("reset finished").await;
     assert_eq!(other.heard.len(), 4, "{:?}", other.heard);
     assert_eq!(other.heard[2..], [START, "reset finished"]);
-    assert_eq!(one.heard.iter().filter(|text| !other.heard.contains(text)).count(), 3, "{:?}", one.heard);
+    assert_eq!(
+        one.heard.iter().filter(|text| !other.heard.contains(text)).count(),
+        3,
+        "{:?}",
+        one.heard
+    );
     let renamed = MODEL.replace("mover", "changed mover");
     std::fs::write(simulator.project.path().join("worlds/a.x3d"), renamed).unwrap();
     for (command, world, robot) in [

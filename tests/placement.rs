@@ -13,7 +13,10 @@ mod world;
 fn a_black_hole_takes_few_clients() {
     for scenario in compare::hole_scenarios(&[5]) {
         let [with, without] = compare::share_that_fails(&scenario);
-        assert!(with < without / 2.0, "{scenario:?}: {with:.1} % fail with ejection, {without:.1} % without");
+        assert!(
+            with < without / 2.0,
+            "{scenario:?}: {with:.1} % fail with ejection, {without:.1} % without"
+        );
     }
 }
 
@@ -26,7 +29,11 @@ fn no_rival_is_better_in_a_small_fleet() {
         for (policy, name) in compare::POLICIES.iter().enumerate().take(compare::FIRST_RIVAL) {
             // The policy that knows only loads assumes equal servers and no other programs on them.
             if policy == 0 || scenario.foreign == scenario::Foreign::None {
-                assert_eq!(compare::better_rivals(&row, policy), Vec::<String>::new(), "{name}: {scenario:?}");
+                assert_eq!(
+                    compare::better_rivals(&row, policy),
+                    Vec::<String>::new(),
+                    "{name}: {scenario:?}"
+                );
             }
         }
     }

@@ -25,7 +25,10 @@ impl Fleet {
     async fn with_places(places: u16) -> Self {
         let simulation = demo_server(places).start().await;
         // Other load on this machine must not make the server full.
-        let session = session_server(&[simulation.address()]).set("loadThreshold", 1000).start().await;
+        let session = session_server(&[simulation.address()])
+            .set("loadThreshold", 1000)
+            .start()
+            .await;
         Self { session, simulation }
     }
 
@@ -48,17 +51,28 @@ async fn rehearse(fleet: &str, arguments: &[&str]) -> Said {
 
 fn command(fleet: &str) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_rehearse"));
-    command.arg(fleet).args(["--world", &arm()]).stdin(Stdio::null()).kill_on_drop(true);
+    command
+        .arg(fleet)
+        .args(["--world", &arm()])
+        .stdin(Stdio::null())
+        .kill_on_drop(true);
     command
 }
 
 async fn said(command: &mut Command) -> Said {
-    of(actix_rt::time::timeout(BOUND, command.output()).await.expect("it ends").unwrap())
+    of(actix_rt::time::timeout(BOUND, command.output())
+        .await
+        .expect("it ends")
+        .unwrap())
 }
 
 fn of(output: Output) -> Said {
     let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
-    Said { code: output.status.code(), out: text(output.stdout), err: text(output.stderr) }
+    Said {
+        code: output.status.code(),
+        out: text(output.stdout),
+        err: text(output.stderr),
+    }
 }
 
 /// One client that stays for a second, at any pace.
@@ -69,12 +83,28 @@ async fn a_class_that_fits_is_told_so() {
     let fleet = Fleet::with_places(3).await;
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("class.json");
-    let class = ["--clients", "3", "--over", "0s", "--stay", "5s", "--real-time", "0.1", "--expect", "3", "--json"];
+    let class = [
+        "--clients",
+        "3",
+        "--over",
+        "0s",
+        "--stay",
+        "5s",
+        "--real-time",
+        "0.1",
+        "--expect",
+        "3",
+        "--json",
+    ];
     let said = fleet.rehearse(&[&class[..], &[file.to_str().unwrap()]].concat()).await;
     assert!(said.code == Some(0) && said.out.contains("All 3 fit."), "{said:?}");
     assert!(said.out.contains(": 3 clients at once, each for 5s"), "{said:?}");
     let report: Value = serde_json::from_str(&std::fs::read_to_string(file).unwrap()).unwrap();
-    assert_eq!((&report["seats"]["given"], &report["seats"]["fit"]), (&3.into(), &3.into()), "{report}");
+    assert_eq!(
+        (&report["seats"]["given"], &report["seats"]["fit"]),
+        (&3.into(), &3.into()),
+        "{report}"
+    );
     let visits = report["visits"].as_array().unwrap();
     let has_pace = |visit: &Value| ["p5", "median"].iter().all(|name| visit["realTime"][name].is_f64());
     assert!(visits.len() == 3 && visits.iter().all(has_pace), "{report}");
@@ -85,13 +115,31 @@ async fn a_class_that_does_not_fit_is_reported_with_reasons() {
     let fleet = Fleet::with_places(1).await;
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("class.json");
-    let class =
-        ["--clients", "2", "--over", "1s", "--stay", "5s", "--real-time", "0.1", "--json", file.to_str().unwrap()];
+    let class = [
+        "--clients",
+        "2",
+        "--over",
+        "1s",
+        "--stay",
+        "5s",
+        "--real-time",
+        "0.1",
+        "--json",
+        file.to_str().unwrap(),
+    ];
     let said = fleet.rehearse(&class).await;
     let report: Value = serde_json::from_str(&std::fs::read_to_string(&file).unwrap()).unwrap();
     assert_eq!(said.code, Some(0), "{report}");
-    let waiting = report["times"].as_array().unwrap().iter().find(|row| row["step"] == "waiting").unwrap();
-    assert!(waiting["worst"].as_f64().unwrap() > 1.5, "one waited until the other had left: {report}");
+    let waiting = report["times"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .find(|row| row["step"] == "waiting")
+        .unwrap();
+    assert!(
+        waiting["worst"].as_f64().unwrap() > 1.5,
+        "one waited until the other had left: {report}"
+    );
     // The first client stays longer than the second one waits.
     let stays = ["--stay", "10s", "--real-time", "0", "--patience", "5s", "--expect", "2"];
     let said = fleet.rehearse(&[&class[..4], &stays].concat()).await;
@@ -101,7 +149,18 @@ async fn a_class_that_does_not_fit_is_reported_with_reasons() {
 #[actix_rt::test]
 async fn a_class_that_reloads_comes_back_to_its_simulations() {
     let fleet = Fleet::with_places(4).await;
-    let arguments = ["--clients", "2", "--over", "0s", "--stay", "8s", "--misbehave", "return=100", "--expect", "2"];
+    let arguments = [
+        "--clients",
+        "2",
+        "--over",
+        "0s",
+        "--stay",
+        "8s",
+        "--misbehave",
+        "return=100",
+        "--expect",
+        "2",
+    ];
     let said = fleet.rehearse(&[&arguments[..], &["--real-time", "0"]].concat()).await;
     assert_eq!(said.code, Some(0), "{said:?}");
     let status = fleet.simulation.status().await;
@@ -112,8 +171,14 @@ async fn a_class_that_reloads_comes_back_to_its_simulations() {
 async fn the_acceptance_run_finds_the_demo_as_expected() {
     let fleet = Fleet::with_places(1).await;
     let Said { code, out, err } = fleet.rehearse(&["--explain"]).await;
-    assert!(code == Some(0) && out.contains("| step | at | took | expected | came | |"), "{out}{err}");
-    assert!(out.contains("| availability |") && out.matches("| ok |").count() >= 15, "{out}");
+    assert!(
+        code == Some(0) && out.contains("| step | at | took | expected | came | |"),
+        "{out}{err}"
+    );
+    assert!(
+        out.contains("| availability |") && out.matches("| ok |").count() >= 15,
+        "{out}"
+    );
 }
 
 #[actix_rt::test]
@@ -126,7 +191,11 @@ async fn a_fleet_that_can_not_be_rehearsed_is_refused_in_one_line() {
         (
             "http://192.0.2.1:1999".to_owned(),
             &ONE[..],
-            (2, "error: http://192.0.2.1:1999/ is not this machine: --yes loads it with 1 clients at once", "\n"),
+            (
+                2,
+                "error: http://192.0.2.1:1999/ is not this machine: --yes loads it with 1 clients at once",
+                "\n",
+            ),
         ),
         (fleet.simulation.url(""), &ONE[..], no_session_server),
         (fleet.simulation.url(""), &["--explain"], no_session_server),
@@ -151,9 +220,15 @@ async fn a_fleet_behind_https_is_rehearsed() {
     let class = ["--clients", "1", "--over", "0s", "--stay", "5s", "--real-time", "0"];
     let Said { code, out, err } = said(command(&url).args(class).env("SSL_CERT_FILE", lab.file())).await;
     assert!(code == Some(0) && out.contains("All 1 fit."), "{out}{err}");
-    assert!(out.contains(" 1 % "), "the load of the simulation server is seen: {out}");
+    assert!(
+        out.contains(" 1 % "),
+        "the load of the simulation server is seen: {out}"
+    );
     let Said { code, err, .. } = said(command(&url).args(ONE).env("SSL_CERT_FILE", other.file())).await;
-    assert!(code == Some(1) && err.contains("its certificate is not trusted") && err.lines().count() == 1, "{err}");
+    assert!(
+        code == Some(1) && err.contains("its certificate is not trusted") && err.lines().count() == 1,
+        "{err}"
+    );
 }
 
 #[actix_rt::test]
@@ -168,7 +243,11 @@ async fn who_gets_no_slot_waits_for_the_next_one() {
         // A permanent refusal is not retried.
         (vec![never], "1 got none: Error: no simulation server accepts", 1, 1..=1),
     ] {
-        let fleet = StandIn::start(Script { session, ..Script::default() }).await;
+        let fleet = StandIn::start(Script {
+            session,
+            ..Script::default()
+        })
+        .await;
         let patience = if code == 0 { "60s" } else { "4s" };
         let arguments = [&ONE[..], &["--patience", patience]].concat();
         let said = rehearse(&format!("http://{}", fleet.address), &arguments).await;
@@ -188,13 +267,35 @@ async fn explained(script: Script) -> String {
 
 #[actix_rt::test]
 async fn an_acceptance_run_ends_at_the_step_that_fails() {
-    let client = |text| Script { client: vec![text], ..Script::default() };
-    let webots = |texts| Script { webots: texts, ..Script::default() };
+    let client = |text| Script {
+        client: vec![text],
+        ..Script::default()
+    };
+    let webots = |texts| Script {
+        webots: texts,
+        ..Script::default()
+    };
     let cases = [
-        (client("loading: wait"), "| Webots is ready |", ["not within 6 s", "| **differs** |"]),
-        (webots(vec!["world:a"]), "| scene |", ["`world:`, ", "then not within 6 s"]),
-        (client("error: no display"), "| Webots is ready |", ["`error: no display`", ""]),
-        (webots(vec!["world:a", "error: no such world"]), "| scene |", ["`world:`, then `error: no such world`", ""]),
+        (
+            client("loading: wait"),
+            "| Webots is ready |",
+            ["not within 6 s", "| **differs** |"],
+        ),
+        (
+            webots(vec!["world:a"]),
+            "| scene |",
+            ["`world:`, ", "then not within 6 s"],
+        ),
+        (
+            client("error: no display"),
+            "| Webots is ready |",
+            ["`error: no display`", ""],
+        ),
+        (
+            webots(vec!["world:a", "error: no such world"]),
+            "| scene |",
+            ["`world:`, then `error: no such world`", ""],
+        ),
     ];
     let all = cases.map(|(script, step, words)| async move {
         let said = explained(script).await;
@@ -219,19 +320,37 @@ async fn interrupt(by: Signal) {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("class.json");
     let mut command = command(&format!("http://{}", fleet.address));
-    command.args(["--clients", "2", "--over", "10m", "--stay", "10m", "--json"]).arg(&file);
+    command
+        .args(["--clients", "2", "--over", "10m", "--stay", "10m", "--json"])
+        .arg(&file);
     let child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
-    until("the first client connects to Webots", async || !fleet.asked("/webots").is_empty()).await;
+    until("the first client connects to Webots", async || {
+        !fleet.asked("/webots").is_empty()
+    })
+    .await;
     // Waits for some polls of the load, one a second, so that the simulation runs.
     let before = fleet.asked("/load").len();
     until("time passes", async || fleet.asked("/load").len() > before + 2).await;
     signal(&child, by);
-    let said = of(actix_rt::time::timeout(SOON, child.wait_with_output()).await.expect("it ends").unwrap());
+    let said = of(actix_rt::time::timeout(SOON, child.wait_with_output())
+        .await
+        .expect("it ends")
+        .unwrap());
     assert_eq!(said.code, Some(130), "{said:?}");
-    assert!(said.out.contains(", interrupted\n") && said.out.contains("| ran, their end unseen "), "{said:?}");
+    assert!(
+        said.out.contains(", interrupted\n") && said.out.contains("| ran, their end unseen "),
+        "{said:?}"
+    );
     let report: Value = serde_json::from_str(&std::fs::read_to_string(file).unwrap()).unwrap();
-    assert_eq!((&report["seats"]["asked"], &report["seats"]["unseen"]), (&1.into(), &1.into()), "{report}");
-    assert!(report["interrupted"] == true && !report["visits"][0]["pace"].as_array().unwrap().is_empty(), "{report}");
+    assert_eq!(
+        (&report["seats"]["asked"], &report["seats"]["unseen"]),
+        (&1.into(), &1.into()),
+        "{report}"
+    );
+    assert!(
+        report["interrupted"] == true && !report["visits"][0]["pace"].as_array().unwrap().is_empty(),
+        "{report}"
+    );
 }
 
 #[actix_rt::test]
@@ -244,13 +363,30 @@ async fn what_can_not_be_done_is_told_before_anything_is_begun() {
     // No server is there: a rehearsal that began would report that instead.
     let fleet = "http://127.0.0.1:1";
     let error = told(command(fleet).args(["--json", "/nowhere/a.json"])).await;
-    assert!(error.starts_with("error: /nowhere/a.json can't be written: "), "{error}");
+    assert!(
+        error.starts_with("error: /nowhere/a.json can't be written: "),
+        "{error}"
+    );
     let error = told(&mut command("http://me:secret@127.0.0.1:1")).await;
-    assert!(error.contains("a user name or a password") && !error.contains("secret"), "{error}");
+    assert!(
+        error.contains("a user name or a password") && !error.contains("secret"),
+        "{error}"
+    );
     let mut limited = Command::new("prlimit");
-    limited.args(["--nofile=100", env!("CARGO_BIN_EXE_rehearse"), fleet, "--world", &arm(), "--clients", "50"]);
+    limited.args([
+        "--nofile=100",
+        env!("CARGO_BIN_EXE_rehearse"),
+        fleet,
+        "--world",
+        &arm(),
+        "--clients",
+        "50",
+    ]);
     let error = told(&mut limited).await;
-    assert_eq!(error, "error: 50 clients need 264 open files, and the system allows 100 (ulimit -Hn)\n");
+    assert_eq!(
+        error,
+        "error: 50 clients need 264 open files, and the system allows 100 (ulimit -Hn)\n"
+    );
 }
 
 #[actix_rt::test]
@@ -258,9 +394,18 @@ async fn no_text_of_a_server_steers_the_terminal_or_fills_it() {
     const STEERING: &str = "loading: Error: \u{1b}]0;owned\u{7}\u{1b}[31m one\r\nAll 3 fit.\u{202e}two";
     let long: &'static str = Box::leak(format!("loading: Error: {}", "x".repeat(500_000)).into_boxed_str());
     let larger: &'static str = Box::leak("x".repeat(2 << 20).into_boxed_str());
-    let session = |text| Script { session: vec![text], ..Script::default() };
-    let client = |text| Script { client: vec![text], ..Script::default() };
-    let webots = |text| Script { webots: vec![text], ..Script::default() };
+    let session = |text| Script {
+        session: vec![text],
+        ..Script::default()
+    };
+    let client = |text| Script {
+        client: vec![text],
+        ..Script::default()
+    };
+    let webots = |text| Script {
+        webots: vec![text],
+        ..Script::default()
+    };
     for script in [
         session("no \u{1b}[31mred\r\n\u{202e}"),
         session("ws://{}/\u{1b}[31mred\u{202e}"),

@@ -19,10 +19,19 @@ pub(crate) struct Bare {
 impl Bare {
     pub(crate) fn start() -> Self {
         let this = std::env::current_exe().expect("the path of this program");
-        let mut child = Command::new(this).arg(ARGUMENT).stdout(Stdio::piped()).spawn().expect("this program starts");
+        let mut child = Command::new(this)
+            .arg(ARGUMENT)
+            .stdout(Stdio::piped())
+            .spawn()
+            .expect("this program starts");
         let mut line = String::new();
-        BufReader::new(child.stdout.take().expect("its output")).read_line(&mut line).expect("its port");
-        Self { port: line.trim().parse().expect("its port"), child }
+        BufReader::new(child.stdout.take().expect("its output"))
+            .read_line(&mut line)
+            .expect("its port");
+        Self {
+            port: line.trim().parse().expect("its port"),
+            child,
+        }
     }
 
     pub(crate) fn process(&self) -> u32 {
@@ -59,7 +68,11 @@ async fn idle(request: HttpRequest, stream: web::Payload) -> Result<HttpResponse
 pub(crate) fn serve() -> std::io::Result<()> {
     actix_web::rt::System::new().block_on(async {
         let answer = || async { "ws://localhost:2000" };
-        let app = move || App::new().route("/bare", web::get().to(answer)).route("/session", web::get().to(idle));
+        let app = move || {
+            App::new()
+                .route("/bare", web::get().to(answer))
+                .route("/session", web::get().to(idle))
+        };
         let server = HttpServer::new(app).bind(("127.0.0.1", 0))?;
         println!("{}", server.addrs().first().map_or(0, std::net::SocketAddr::port));
         server.run().await

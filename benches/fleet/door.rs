@@ -31,7 +31,14 @@ impl Door {
         if hung {
             fleet.hang_first();
         }
-        Self { name, path: "/session", status: "200", _fleet: fleet, server, took: Vec::new() }
+        Self {
+            name,
+            path: "/session",
+            status: "200",
+            _fleet: fleet,
+            server,
+            took: Vec::new(),
+        }
     }
 
     /// A fleet whose servers do not accept the requested world.
@@ -39,7 +46,14 @@ impl Door {
         let fleet = StandIns::with_repositories(servers, repositories);
         let server = Server::start(&fleet.addresses);
         let path = "/session?url=https://github.com/stranger/arm/blob/main/worlds/arm.wbt";
-        Self { name, path, status: "403", _fleet: fleet, server, took: Vec::new() }
+        Self {
+            name,
+            path,
+            status: "403",
+            _fleet: fleet,
+            server,
+            took: Vec::new(),
+        }
     }
 
     fn ask(&mut self) {
@@ -67,7 +81,10 @@ impl Door {
 
 pub(crate) fn measure(verdict: &mut Verdict) {
     println!("/session, {} requests for each fleet, in turns:", ROUNDS * REQUESTS);
-    let health = |name, servers| Door { path: "/health", ..Door::open(name, servers, false) };
+    let health = |name, servers| Door {
+        path: "/health",
+        ..Door::open(name, servers, false)
+    };
     let mut doors = [
         health("10 servers, not asked (/health)", 10),
         health("1,000 servers, not asked", 1000),
@@ -81,11 +98,25 @@ pub(crate) fn measure(verdict: &mut Verdict) {
     }
     println!("  {:<32} {:>9} {:>9} {:>9}", "fleet", "p50", "p99", "p99.9");
     for door in &doors {
-        println!("  {:<32} {:>6.3} ms {:>6.3} ms {:>6.3} ms", door.name, door.at(0.5), door.at(0.99), door.at(0.999));
+        println!(
+            "  {:<32} {:>6.3} ms {:>6.3} ms {:>6.3} ms",
+            door.name,
+            door.at(0.5),
+            door.at(0.99),
+            door.at(0.999)
+        );
     }
     let [_, _, ten, hung, thousand, refusing] = &doors;
     verdict.bound("p99 with one server hung", hung.at(0.99), 5.0, "ms");
-    verdict.bound("median with 1,000 servers / with 10", thousand.at(0.5) / ten.at(0.5), 1.1, "times");
+    verdict.bound(
+        "median with 1,000 servers / with 10",
+        thousand.at(0.5) / ten.at(0.5),
+        1.1,
+        "times",
+    );
     verdict.bound("median of a refusal by 200 servers", refusing.at(0.5), 3.0, "ms");
-    println!("  p99 with 1,000 servers / with 10: {:.2} times", thousand.at(0.99) / ten.at(0.99));
+    println!(
+        "  p99 with 1,000 servers / with 10: {:.2} times",
+        thousand.at(0.99) / ten.at(0.99)
+    );
 }

@@ -34,9 +34,16 @@ fn each(process: u32, port: u16) -> f64 {
 pub(crate) fn measure() {
     println!("memory of an idle WebSocket client, of {CLIENTS}:");
     let bare = Bare::start();
-    println!("  one actor of actix for each, and nothing else: {:.1} KiB", each(bare.process(), bare.port));
+    println!(
+        "  one actor of actix for each, and nothing else: {:.1} KiB",
+        each(bare.process(), bare.port)
+    );
     let fleet = StandIns::start(1);
     let server = Server::start(&fleet.addresses);
     let found = each(server.process(), server.port);
-    goal("a client of the session server", found <= 11.0, &format!("{found:.1} KiB, aimed at 11"));
+    goal(
+        "a client of the session server",
+        found <= 11.0,
+        &format!("{found:.1} KiB, aimed at 11"),
+    );
 }

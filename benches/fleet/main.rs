@@ -41,7 +41,10 @@ impl Verdict {
     fn bound(&mut self, what: &str, value: f64, most: f64, unit: &str) {
         let kept = value <= most;
         self.failed |= !kept;
-        println!("  {} {what}: {value:.2} {unit}, bound {most} {unit}", if kept { "kept  " } else { "BROKEN" });
+        println!(
+            "  {} {what}: {value:.2} {unit}, bound {most} {unit}",
+            if kept { "kept  " } else { "BROKEN" }
+        );
     }
 }
 
@@ -51,7 +54,10 @@ fn goal(what: &str, is_reached: bool, found: &str) {
 }
 
 fn main() -> ExitCode {
-    let wanted: Vec<String> = std::env::args().skip(1).filter(|argument| !argument.starts_with('-')).collect();
+    let wanted: Vec<String> = std::env::args()
+        .skip(1)
+        .filter(|argument| !argument.starts_with('-'))
+        .collect();
     if wanted.iter().any(|name| name == bare::ARGUMENT) {
         bare::serve().expect("a port of the loopback is free");
         return ExitCode::SUCCESS;
@@ -74,5 +80,9 @@ fn main() -> ExitCode {
     if is_wanted("idle") {
         idle::measure();
     }
-    if verdict.failed { ExitCode::FAILURE } else { ExitCode::SUCCESS }
+    if verdict.failed {
+        ExitCode::FAILURE
+    } else {
+        ExitCode::SUCCESS
+    }
 }

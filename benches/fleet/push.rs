@@ -65,10 +65,14 @@ fn arrival(stream: &TcpStream, value: u8) -> Duration {
 /// When the registry logged the last change, to the millisecond, as the time since 1970.
 fn decision(server: &Server) -> Duration {
     let log = server.log();
-    let line = log.lines().rfind(|line| line.contains("simulation server is available")).expect("a decision");
+    let line = log
+        .lines()
+        .rfind(|line| line.contains("simulation server is available"))
+        .expect("a decision");
     let at = line.split(' ').next().expect("a line begins with its time");
     let at = humantime::parse_rfc3339(at).expect("a time");
-    at.duration_since(SystemTime::UNIX_EPOCH).expect("it is later than 1970")
+    at.duration_since(SystemTime::UNIX_EPOCH)
+        .expect("it is later than 1970")
 }
 
 /// The reference without a server: the milliseconds until as many plain sends arrive, on all cores. Only half of them
@@ -85,13 +89,22 @@ fn yardstick() -> f64 {
     };
     let (clients, mut servers): (Vec<_>, Vec<_>) = (0..CLIENTS / 2).map(pair).unzip();
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    let begin = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).expect("it is later than 1970");
+    let begin = SystemTime::now()
+        .duration_since(SystemTime::UNIX_EPOCH)
+        .expect("it is later than 1970");
     std::thread::scope(|scope| {
         for part in servers.chunks_mut((CLIENTS / 2).div_ceil(cores)) {
-            scope.spawn(|| part.iter_mut().for_each(|one| one.write_all(&[TEXT[0], TEXT[1], b'1']).expect("sent")));
+            scope.spawn(|| {
+                part.iter_mut()
+                    .for_each(|one| one.write_all(&[TEXT[0], TEXT[1], b'1']).expect("sent"))
+            });
         }
     });
-    let last = clients.iter().map(|client| arrival(client, b'1')).max().expect("there are clients");
+    let last = clients
+        .iter()
+        .map(|client| arrival(client, b'1'))
+        .max()
+        .expect("there are clients");
     2.0 * 1000.0 * last.saturating_sub(begin).as_secs_f64()
 }
 
@@ -115,7 +128,10 @@ pub(crate) fn measure(verdict: &mut Verdict) {
         std::thread::sleep(PAUSE);
         let arrivals: Vec<Duration> = clients.iter().map(|client| arrival(client, value)).collect();
         let decided = decision(&server);
-        let mut after: Vec<f64> = arrivals.iter().map(|at| 1000.0 * at.saturating_sub(decided).as_secs_f64()).collect();
+        let mut after: Vec<f64> = arrivals
+            .iter()
+            .map(|at| 1000.0 * at.saturating_sub(decided).as_secs_f64())
+            .collect();
         after.sort_unstable_by(f64::total_cmp);
         let [first, half, last] = [after[0], after[CLIENTS / 2], after[CLIENTS - 1]];
         println!(
@@ -130,6 +146,14 @@ pub(crate) fn measure(verdict: &mut Verdict) {
     println!("  processor time of each change, on all cores together: {all:.0} ms, {user:.0} ms of it in user code");
     worst.sort_unstable_by(f64::total_cmp);
     let median = worst[CHANGES / 2];
-    verdict.bound("the last client, median of the changes, beside the bare sends", median / bare, 2.0, "times");
-    println!("  the last client: median {median:.1} ms, worst {:.1} ms", worst[CHANGES - 1]);
+    verdict.bound(
+        "the last client, median of the changes, beside the bare sends",
+        median / bare,
+        2.0,
+        "times",
+    );
+    println!(
+        "  the last client: median {median:.1} ms, worst {:.1} ms",
+        worst[CHANGES - 1]
+    );
 }

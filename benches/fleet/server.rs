@@ -50,7 +50,11 @@ impl Server {
     pub(crate) fn wait_until(&self, condition: impl Fn(&Self) -> bool) {
         let deadline = Instant::now() + Duration::from_mins(1);
         while !condition(self) {
-            assert!(Instant::now() < deadline, "waited in vain for the session server; its log:\n{}", self.log());
+            assert!(
+                Instant::now() < deadline,
+                "waited in vain for the session server; its log:\n{}",
+                self.log()
+            );
             std::thread::sleep(Duration::from_millis(20));
         }
     }
@@ -81,7 +85,11 @@ impl Server {
     /// A whole response, including the headers.
     pub(crate) fn page(&self, path: &str) -> Option<String> {
         let mut stream = TcpStream::connect(("127.0.0.1", self.port)).ok()?;
-        write!(stream, "GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n").ok()?;
+        write!(
+            stream,
+            "GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
+        )
+        .ok()?;
         let mut text = String::new();
         stream.read_to_string(&mut text).ok()?;
         Some(text)

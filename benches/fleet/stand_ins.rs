@@ -23,25 +23,38 @@ impl StandIns {
 
     /// Starts stand-ins that each accept the repositories of this many owners.
     pub(crate) fn with_repositories(count: usize, repositories: usize) -> Self {
-        let allowed: Vec<String> = (0..repositories).map(|owner| format!("https://github.com/lab{owner}")).collect();
+        let allowed: Vec<String> = (0..repositories)
+            .map(|owner| format!("https://github.com/lab{owner}"))
+            .collect();
         let body = serde_json::json!({
             "load": 5.0, "version": "1", "allowedRepositories": allowed, "docker": false,
             "instances": {"queued": 0, "starting": 1, "idle": 2, "running": 3, "places": 100_000, "arrivals": 6},
         })
         .to_string();
         let answer: Arc<str> = format!("HTTP/1.1 200 OK\r\nContent-Length: {}\r\n\r\n{body}", body.len()).into();
-        let sockets: Vec<_> =
-            (0..count).map(|_| std::net::TcpListener::bind("127.0.0.1:0").expect("a free port")).collect();
-        let addresses = sockets.iter().map(|socket| socket.local_addr().expect("it is bound").to_string()).collect();
+        let sockets: Vec<_> = (0..count)
+            .map(|_| std::net::TcpListener::bind("127.0.0.1:0").expect("a free port"))
+            .collect();
+        let addresses = sockets
+            .iter()
+            .map(|socket| socket.local_addr().expect("it is bound").to_string())
+            .collect();
         let (hung, end) = (Arc::new(AtomicBool::new(false)), Arc::new(Notify::new()));
         let (seen, ended) = (Arc::clone(&hung), Arc::clone(&end));
         std::thread::spawn(move || {
-            let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build().expect("a runtime");
+            let runtime = tokio::runtime::Builder::new_current_thread()
+                .enable_io()
+                .build()
+                .expect("a runtime");
             runtime.block_on(async {
                 for (index, socket) in sockets.into_iter().enumerate() {
                     socket.set_nonblocking(true).expect("a socket");
                     let listener = TcpListener::from_std(socket).expect("a socket");
-                    tokio::spawn(serve(listener, Arc::clone(&answer), (index == 0).then(|| Arc::clone(&seen))));
+                    tokio::spawn(serve(
+                        listener,
+                        Arc::clone(&answer),
+                        (index == 0).then(|| Arc::clone(&seen)),
+                    ));
                 }
                 ended.notified().await;
             });

@@ -20,7 +20,8 @@ fn storm(port: u16, path: &str) -> f64 {
     let text = String::from_utf8_lossy(&done.stdout);
     assert!(done.status.success() && !text.contains("Socket errors"), "{text}");
     let rate = text.lines().find_map(|line| line.strip_prefix("Requests/sec:"));
-    rate.and_then(|rate| rate.trim().parse().ok()).expect("wrk tells a rate")
+    rate.and_then(|rate| rate.trim().parse().ok())
+        .expect("wrk tells a rate")
 }
 
 pub(crate) fn measure() {
@@ -47,5 +48,9 @@ pub(crate) fn measure() {
         println!("  {name:<24} {rate:>7.0}, {:.2} of the bare handler", rate / medians[0]);
     }
     let least = medians[2].min(medians[3]) / medians[0];
-    goal("/session, of what a bare handler answers", least >= 0.9, &format!("{least:.2}, aimed at 0.9"));
+    goal(
+        "/session, of what a bare handler answers",
+        least >= 0.9,
+        &format!("{least:.2}, aimed at 0.9"),
+    );
 }

@@ -18,7 +18,10 @@ fn needs(servers: usize) -> (f64, f64) {
     std::thread::sleep(TIME);
     let (elapsed, after) = (begin.elapsed(), server.processor_time());
     let percent = |used: Duration| 100.0 * used.as_secs_f64() / elapsed.as_secs_f64();
-    (percent(after.0.saturating_sub(before.0)), percent(after.1.saturating_sub(before.1)))
+    (
+        percent(after.0.saturating_sub(before.0)),
+        percent(after.1.saturating_sub(before.1)),
+    )
 }
 
 /// The same number of exchanges per second without a server: one thread that requests them by plain blocking calls.
@@ -41,7 +44,9 @@ fn yardstick(servers: usize) -> f64 {
     let begin = Instant::now();
     while begin.elapsed() < Duration::from_secs(3) {
         for stream in &mut streams {
-            stream.write_all(b"GET /status HTTP/1.1\r\nHost: localhost\r\n\r\n").expect("a request");
+            stream
+                .write_all(b"GET /status HTTP/1.1\r\nHost: localhost\r\n\r\n")
+                .expect("a request");
             assert!(stream.read(&mut answer).expect("an answer") > 0, "a stand-in is gone");
             exchanges += 1.0;
         }

@@ -5,8 +5,14 @@ use super::scenario::{Arrivals, Foreign, Outcome, Scenario, Sessions, Sizes};
 use super::world::run;
 
 /// The policies in the order of a [`Row`]. The first one must win.
-pub(crate) const POLICIES: [&str; 6] =
-    ["ours", "ours, load only", "least reported", "random", "two choices", "round robin"];
+pub(crate) const POLICIES: [&str; 6] = [
+    "ours",
+    "ours, load only",
+    "least reported",
+    "random",
+    "two choices",
+    "round robin",
+];
 /// Index of the first rival in a row; those before it are the project's own policy.
 pub(crate) const FIRST_RIVAL: usize = 2;
 /// Highest loads that differ by no more than this are tied: two clients, in percent.
@@ -68,7 +74,9 @@ pub(crate) fn hole_scenarios(fleets: &[usize]) -> Vec<Scenario> {
 pub(crate) fn share_that_fails(scenario: &Scenario) -> [f64; 2] {
     let servers = scenario.servers;
     let with = mean(scenario, |seed| run(scenario, seed, &mut Own::new(servers, true)));
-    let without = mean(scenario, |seed| run(scenario, seed, &mut Own::without_ejection(servers)));
+    let without = mean(scenario, |seed| {
+        run(scenario, seed, &mut Own::without_ejection(servers))
+    });
     [with.failed, without.failed]
 }
 
@@ -93,7 +101,11 @@ pub(crate) fn mean(scenario: &Scenario, run: impl Fn(u64) -> Outcome) -> Outcome
 pub(crate) fn compare(scenario: &Scenario) -> Row {
     let servers = scenario.servers;
     let own = |instances| mean(scenario, |seed| run(scenario, seed, &mut Own::new(servers, instances)));
-    let rival = |rule| mean(scenario, |seed| run(scenario, seed, &mut Rival::new(servers, rule, seed)));
+    let rival = |rule| {
+        mean(scenario, |seed| {
+            run(scenario, seed, &mut Rival::new(servers, rule, seed))
+        })
+    };
     [
         own(true),
         own(false),
@@ -115,7 +127,10 @@ pub(crate) fn better_rivals(row: &Row, policy: usize) -> Vec<String> {
         let refuses_more = rival.refused > own.refused + REFUSED_TIE;
         let loads_more = rival.highest > own.highest + HIGHEST_TIE || rival.overload > own.overload + OVERLOAD_TIE;
         if own.highest > rival.highest + HIGHEST_TIE && !refuses_more {
-            better.push(format!("{name}: highest load {:.0} < {:.0}", rival.highest, own.highest));
+            better.push(format!(
+                "{name}: highest load {:.0} < {:.0}",
+                rival.highest, own.highest
+            ));
         }
         if own.overload > rival.overload + OVERLOAD_TIE && !refuses_more {
             better.push(format!("{name}: overload {:.2} < {:.2}", rival.overload, own.overload));

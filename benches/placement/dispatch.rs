@@ -38,12 +38,20 @@ impl Own {
     pub(crate) fn new(servers: usize, instances: bool) -> Self {
         let mut fleet = LoadBalancer::new(PlacementPolicy::default());
         (0..servers).for_each(|server| fleet.add(server));
-        Self { fleet, start: Instant::now(), instances, hears_of_failures: true }
+        Self {
+            fleet,
+            start: Instant::now(),
+            instances,
+            hears_of_failures: true,
+        }
     }
 
     /// The same without the ejection of servers whose starts fail.
     pub(crate) fn without_ejection(servers: usize) -> Self {
-        Self { hears_of_failures: false, ..Self::new(servers, true) }
+        Self {
+            hears_of_failures: false,
+            ..Self::new(servers, true)
+        }
     }
 
     /// Chooses among the servers that are eligible.
@@ -58,8 +66,18 @@ impl Own {
 
 impl Dispatcher for Own {
     fn report(&mut self, server: usize, now: f64, seen: Seen) {
-        let Seen { load, present: running, arrivals, failed_starts } = seen;
-        let instances = Instances { running, places: 100_000, arrivals, ..Instances::default() };
+        let Seen {
+            load,
+            present: running,
+            arrivals,
+            failed_starts,
+        } = seen;
+        let instances = Instances {
+            running,
+            places: 100_000,
+            arrivals,
+            ..Instances::default()
+        };
         let report = ServerReport {
             load: Load::try_from(load).unwrap_or_default(),
             instances: self.instances.then_some(instances),
@@ -128,11 +146,18 @@ impl Dispatcher for Rival {
             return None;
         }
         Some(match self.rule {
-            Rule::LeastReported => *self.open.iter().min_by(|a, b| self.loads[**a].total_cmp(&self.loads[**b]))?,
+            Rule::LeastReported => *self
+                .open
+                .iter()
+                .min_by(|a, b| self.loads[**a].total_cmp(&self.loads[**b]))?,
             Rule::Random => self.any(),
             Rule::TwoChoices => {
                 let (one, other) = (self.any(), self.any());
-                if self.loads[other] < self.loads[one] { other } else { one }
+                if self.loads[other] < self.loads[one] {
+                    other
+                } else {
+                    one
+                }
             }
             Rule::RoundRobin => {
                 let next = self.open.partition_point(|server| *server <= self.last);

@@ -37,7 +37,10 @@ fn main() -> ExitCode {
     let (plain, foreign) = if quick {
         (scenarios(&[5], &[1.0, 10.0]), foreign_scenarios(&[5]))
     } else {
-        (scenarios(&[5, 50, 500], &[0.1, 1.0, 3.0, 10.0]), foreign_scenarios(&[5, 50]))
+        (
+            scenarios(&[5, 50, 500], &[0.1, 1.0, 3.0, 10.0]),
+            foreign_scenarios(&[5, 50]),
+        )
     };
     println!(
         "Each cell: highest load that clients asked of a server (%), share of the servers' time over 100 % (%), refused clients (%).\n"
@@ -50,22 +53,41 @@ fn main() -> ExitCode {
     let lost = measure(&plain);
     println!("\nThe same where other programs use the machines too, which does not decide whether this fails:\n");
     measure(&foreign);
-    replicas::measure(if quick { &[5] } else { &[5, 50] }, if quick { &[1.0] } else { &[1.0, 3.0] });
+    replicas::measure(
+        if quick { &[5] } else { &[5, 50] },
+        if quick { &[1.0] } else { &[1.0, 3.0] },
+    );
     black_hole(if quick { &[5] } else { &[5, 50] });
     speed();
-    println!("\n{} scenarios in {:.0} s", plain.len() + foreign.len(), begin.elapsed().as_secs_f64());
-    if lost == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE }
+    println!(
+        "\n{} scenarios in {:.0} s",
+        plain.len() + foreign.len(),
+        begin.elapsed().as_secs_f64()
+    );
+    if lost == 0 {
+        ExitCode::SUCCESS
+    } else {
+        ExitCode::FAILURE
+    }
 }
 
 /// Runs scenarios and prints their outcomes; returns the number of those in which a rival must not be better, but is.
 fn measure(scenarios: &[Scenario]) -> usize {
     let rows = compare_all(scenarios);
     for (scenario, row) in scenarios.iter().zip(&rows) {
-        let Scenario { arrivals, refresh, servers, sizes, sessions, .. } = scenario;
+        let Scenario {
+            arrivals,
+            refresh,
+            servers,
+            sizes,
+            sessions,
+            ..
+        } = scenario;
         let name = format!("{servers:>3} {sizes:?} {arrivals:?} {sessions:?} {refresh} s");
         println!(
             "{name:42}{}",
-            row.map(|cell| format!(" | {:6.0} {:5.2} {:4.1}", cell.highest, cell.overload, cell.refused)).concat()
+            row.map(|cell| format!(" | {:6.0} {:5.2} {:4.1}", cell.highest, cell.overload, cell.refused))
+                .concat()
         );
     }
     summary(scenarios, &rows);
@@ -78,7 +100,10 @@ fn black_hole(fleets: &[usize]) {
     println!("| servers | arrivals | with ejection | without |\n|---|---|---|---|");
     for scenario in hole_scenarios(fleets) {
         let [with, without] = share_that_fails(&scenario);
-        println!("| {} | {:?} | {with:.1} | {without:.1} |", scenario.servers, scenario.arrivals);
+        println!(
+            "| {} | {:?} | {with:.1} | {without:.1} |",
+            scenario.servers, scenario.arrivals
+        );
     }
 }
 
@@ -111,11 +136,17 @@ fn summary(scenarios: &[Scenario], rows: &[Row]) {
     println!("|---|---|{}", "---|".repeat(POLICIES.len()));
     for arrivals in Arrivals::ALL {
         for sizes in [Sizes::Equal, Sizes::Mixed] {
-            let chosen = select(scenarios, rows, |scenario| scenario.arrivals == arrivals && scenario.sizes == sizes);
+            let chosen = select(scenarios, rows, |scenario| {
+                scenario.arrivals == arrivals && scenario.sizes == sizes
+            });
             println!("| {arrivals:?} | {sizes:?} | {} |", cells(&chosen));
         }
     }
-    println!("\n| refresh | {} |\n|---|{}", POLICIES.join(" | "), "---|".repeat(POLICIES.len()));
+    println!(
+        "\n| refresh | {} |\n|---|{}",
+        POLICIES.join(" | "),
+        "---|".repeat(POLICIES.len())
+    );
     for refresh in [0.1, 1.0, 3.0, 10.0] {
         let chosen = select(scenarios, rows, |scenario| scenario.refresh == refresh);
         if !chosen.is_empty() {
@@ -125,7 +156,12 @@ fn summary(scenarios: &[Scenario], rows: &[Row]) {
 }
 
 fn select<'a>(scenarios: &[Scenario], rows: &'a [Row], wanted: impl Fn(&Scenario) -> bool) -> Vec<&'a Row> {
-    scenarios.iter().zip(rows).filter(|(scenario, _)| wanted(scenario)).map(|(_, row)| row).collect()
+    scenarios
+        .iter()
+        .zip(rows)
+        .filter(|(scenario, _)| wanted(scenario))
+        .map(|(_, row)| row)
+        .collect()
 }
 
 fn cells(rows: &[&Row]) -> String {
@@ -133,7 +169,11 @@ fn cells(rows: &[&Row]) -> String {
         let all = || rows.iter().map(|row| row[policy]);
         let worst = all().map(|outcome| outcome.highest).fold(0.0, f64::max);
         let mean = |part: fn(&Outcome) -> f64| all().map(|outcome| part(&outcome)).sum::<f64>() / rows.len() as f64;
-        format!("{worst:.0} / {:.2} / {:.1}", mean(|outcome| outcome.overload), mean(|outcome| outcome.refused))
+        format!(
+            "{worst:.0} / {:.2} / {:.1}",
+            mean(|outcome| outcome.overload),
+            mean(|outcome| outcome.refused)
+        )
     };
     (0..POLICIES.len()).map(cell).collect::<Vec<_>>().join(" | ")
 }
@@ -147,7 +187,12 @@ fn speed() {
     (0..SERVERS).for_each(|id| fleet.add(id));
     let report = |arrivals| ServerReport {
         load: Load::try_from(30.0).unwrap_or_default(),
-        instances: Some(Instances { running: 10, places: 100, arrivals, ..Instances::default() }),
+        instances: Some(Instances {
+            running: 10,
+            places: 100,
+            arrivals,
+            ..Instances::default()
+        }),
         ..ServerReport::default()
     };
     (0..SERVERS).for_each(|id| fleet.report(&id, start, &report(10), true));
@@ -160,7 +205,10 @@ fn speed() {
     for id in 0..SERVERS {
         fleet.report(&id, start + Duration::from_secs(1), &report(12), true);
     }
-    println!("\n1,000 servers: a placement takes {place:?}, a report {:?}", begin.elapsed() / SERVERS);
+    println!(
+        "\n1,000 servers: a placement takes {place:?}, a report {:?}",
+        begin.elapsed() / SERVERS
+    );
 }
 
 /// Prints where rivals are better, and returns the number of scenarios in which they must not be, but are: of all
@@ -170,7 +218,11 @@ fn verdict(scenarios: &[Scenario], rows: &[Row]) -> usize {
         "\nTied means within {HIGHEST_TIE} % of highest load, {OVERLOAD_TIE} % of overload share, {REFUSED_TIE} % of refusals."
     );
     let lost = |policy: usize, sizes: Sizes| {
-        let all: Vec<_> = scenarios.iter().zip(rows).filter(|(scenario, _)| scenario.sizes == sizes).collect();
+        let all: Vec<_> = scenarios
+            .iter()
+            .zip(rows)
+            .filter(|(scenario, _)| scenario.sizes == sizes)
+            .collect();
         let mut lost = 0;
         for (scenario, row) in &all {
             let better = better_rivals(row, policy);
@@ -180,7 +232,11 @@ fn verdict(scenarios: &[Scenario], rows: &[Row]) -> usize {
             }
         }
         let best = all.len() - lost;
-        println!("{}: best or tied in {best} of {} scenarios with {sizes:?} machines", POLICIES[policy], all.len());
+        println!(
+            "{}: best or tied in {best} of {} scenarios with {sizes:?} machines",
+            POLICIES[policy],
+            all.len()
+        );
         lost
     };
     // One cost for machines that differ by a factor of eight is wrong for most of them.

@@ -26,7 +26,9 @@ struct Replicas {
 
 impl Dispatcher for Replicas {
     fn report(&mut self, server: usize, now: f64, seen: Seen) {
-        self.policies.iter_mut().for_each(|replica| replica.report(server, now, seen));
+        self.policies
+            .iter_mut()
+            .for_each(|replica| replica.report(server, now, seen));
     }
 
     fn place(&mut self, now: f64) -> Option<usize> {
@@ -47,7 +49,16 @@ fn outcome(scenario: &Scenario, count: usize, among: Among) -> Outcome {
     mean(scenario, |seed| {
         let policies = (0..count).map(|_| Own::new(scenario.servers, true)).collect();
         let random = StdRng::seed_from_u64(seed);
-        run(scenario, seed, &mut Replicas { policies, servers: scenario.servers, among, random })
+        run(
+            scenario,
+            seed,
+            &mut Replicas {
+                policies,
+                servers: scenario.servers,
+                among,
+                random,
+            },
+        )
     })
 }
 
@@ -74,8 +85,15 @@ fn table(title: &str, among: Among, fleets: &[usize], refreshes: &[f64]) {
 }
 
 fn cell(scenarios: &[Scenario], count: usize, among: Among) -> String {
-    let all: Vec<Outcome> = scenarios.iter().map(|scenario| outcome(scenario, count, among)).collect();
+    let all: Vec<Outcome> = scenarios
+        .iter()
+        .map(|scenario| outcome(scenario, count, among))
+        .collect();
     let highest = all.iter().map(|one| one.highest).fold(0.0, f64::max);
     let share = |of: fn(&Outcome) -> f64| all.iter().map(of).sum::<f64>() / all.len() as f64;
-    format!("{highest:.0} / {:.2} / {:.1}", share(|one| one.overload), share(|one| one.refused))
+    format!(
+        "{highest:.0} / {:.2} / {:.1}",
+        share(|one| one.overload),
+        share(|one| one.refused)
+    )
 }

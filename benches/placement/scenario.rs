@@ -108,7 +108,9 @@ pub(crate) fn clients(scenario: &Scenario, capacity: f64, random: &mut StdRng) -
         Arrivals::TooMany => (1.3, 0.0, 0.0),
         Arrivals::Crowd => (0.5, 1.5 * capacity, 0.0),
     };
-    let mut times: Vec<f64> = (0..besides as usize).map(|_| BURST_AT + within * random.random::<f64>()).collect();
+    let mut times: Vec<f64> = (0..besides as usize)
+        .map(|_| BURST_AT + within * random.random::<f64>())
+        .collect();
     let rate = steady * capacity / MEAN_SESSION;
     let mut at = exponential(random) / rate;
     while at < HORIZON {

@@ -46,18 +46,27 @@ impl Machine {
         while self.starting.front().is_some_and(|(since, _)| now - since >= RAMP) {
             self.starting.pop_front();
         }
-        let not_yet: f64 = self.starting.iter().map(|(since, cost)| cost * (1.0 - (now - since) / RAMP)).sum();
+        let not_yet: f64 = self
+            .starting
+            .iter()
+            .map(|(since, cost)| cost * (1.0 - (now - since) / RAMP))
+            .sum();
         if self.samples.len() == 5 {
             self.samples.pop_front();
         }
-        self.samples.push_back((self.demand - not_yet + noise).clamp(0.0, 100.0));
+        self.samples
+            .push_back((self.demand - not_yet + noise).clamp(0.0, 100.0));
     }
 
     /// Starts or ends other programs at random; called each second.
     fn run_others(&mut self, now: f64, random: &mut StdRng) {
         let switches = random.random_range(0.0..1.0) < if self.foreign > 0.0 { 1.0 / 30.0 } else { 1.0 / 60.0 };
         if switches {
-            let load = if self.foreign > 0.0 { 0.0 } else { random.random_range(20.0..60.0) };
+            let load = if self.foreign > 0.0 {
+                0.0
+            } else {
+                random.random_range(20.0..60.0)
+            };
             self.change(now, load - self.foreign);
             self.foreign = load;
         }
@@ -111,7 +120,9 @@ pub(crate) fn run(scenario: &Scenario, seed: u64, dispatcher: &mut impl Dispatch
     loop {
         let next_report = scenario.refresh * (asked + 1) as f64 / machines.len() as f64;
         let request = clients.get(next_client).map_or(f64::INFINITY, |client| client.at);
-        let event = events.peek().map_or(f64::INFINITY, |Reverse((at, ..))| *at as f64 / 1e6);
+        let event = events
+            .peek()
+            .map_or(f64::INFINITY, |Reverse((at, ..))| *at as f64 / 1e6);
         let now = next_report.min(request).min(event).min(next_sample);
         if now > HORIZON {
             break;

@@ -57,7 +57,9 @@ pub async fn measure(verdict: &mut Verdict, levels: &[String], sizes: &[u16], ro
 /// A server with 200 slots at an isolation level; `own` is a sandbox with its own network.
 pub async fn server(forge: &Forge, level: &str) -> Server {
     let demo = std::path::Path::new(env!("CARGO_BIN_EXE_demo-simulator"));
-    at_level(simulation_server(demo, forge.path(), 200), level).start().await
+    at_level(simulation_server(demo, forge.path(), 200), level)
+        .start()
+        .await
 }
 
 /// A server at an isolation level.
@@ -83,7 +85,10 @@ pub async fn ready(server: &Server, size: u16) -> Vec<Client> {
 pub async fn leave(server: &Server, clients: Vec<Client>) {
     futures_util::future::join_all(clients.into_iter().map(Client::leave)).await;
     until("all are gone", async || {
-        http::get(&server.url("/status")).await.json()["simulations"].as_array().unwrap().is_empty()
+        http::get(&server.url("/status")).await.json()["simulations"]
+            .as_array()
+            .unwrap()
+            .is_empty()
     })
     .await;
 }
@@ -118,14 +123,29 @@ impl Bare {
         let shown = http::get(&server.url("/status")).await.json()["simulations"][0].clone();
         let process = Process::new(shown["pid"].as_i64().unwrap().try_into().unwrap()).unwrap();
         // pasta hides its environment, which is that of its children.
-        let environment = tree(process.pid()).into_iter().find_map(|pid| Process::new(pid).ok()?.environ().ok());
+        let environment = tree(process.pid())
+            .into_iter()
+            .find_map(|pid| Process::new(pid).ok()?.environ().ok());
         let environment: Vec<_> = environment.unwrap().into_iter().collect();
-        let mark = environment.iter().find(|(name, _)| name == "WEBOTS_FLEET_INSTANCE").unwrap().1.clone();
+        let mark = environment
+            .iter()
+            .find(|(name, _)| name == "WEBOTS_FLEET_INSTANCE")
+            .unwrap()
+            .1
+            .clone();
         let line = std::fs::read(format!("/proc/{}/cmdline", process.pid())).unwrap();
         let words = line.strip_suffix(b"\0").unwrap().split(|byte| *byte == 0);
         let repositories = std::fs::read_dir(server.cache().join("git")).unwrap().flatten();
-        let repository = repositories.map(|entry| entry.path()).find(|path| path.is_dir()).unwrap();
-        let commit = std::fs::read_dir(repository.join("refs/fleet")).unwrap().flatten().next().unwrap().file_name();
+        let repository = repositories
+            .map(|entry| entry.path())
+            .find(|path| path.is_dir())
+            .unwrap();
+        let commit = std::fs::read_dir(repository.join("refs/fleet"))
+            .unwrap()
+            .flatten()
+            .next()
+            .unwrap()
+            .file_name();
         let mut command: Vec<OsString> = words.map(|word| OsStr::from_bytes(word).to_owned()).collect();
         let instance = PathBuf::from(mark);
         if command[0].to_string_lossy().ends_with("/bwrap") {
@@ -134,8 +154,13 @@ impl Bare {
             let words = ["/bin/sh", "-c", "exec \"$@\" 3<\"$0\""].map(OsString::from);
             command = words.into_iter().chain([filter]).chain(command).collect();
         }
-        let plain = std::fs::read_dir(&instance).unwrap().flatten().filter(|one| one.file_type().unwrap().is_file());
-        let files = plain.map(|one| (one.file_name(), std::fs::read(one.path()).unwrap())).collect();
+        let plain = std::fs::read_dir(&instance)
+            .unwrap()
+            .flatten()
+            .filter(|one| one.file_type().unwrap().is_file());
+        let files = plain
+            .map(|one| (one.file_name(), std::fs::read(one.path()).unwrap()))
+            .collect();
         let bare = Self {
             command,
             environment,
@@ -186,7 +211,9 @@ impl Bare {
 
     /// pasta accepts connections before anything listens inside.
     fn is_ready(&self, port: u16) -> bool {
-        let Ok(mut stream) = TcpStream::connect(("127.0.0.1", port)) else { return false };
+        let Ok(mut stream) = TcpStream::connect(("127.0.0.1", port)) else {
+            return false;
+        };
         let mut answer = [0; 5];
         !self.command[0].to_string_lossy().ends_with("/pasta")
             || stream.write_all(b"GET /robots.txt HTTP/1.0\r\n\r\n").is_ok() && stream.read_exact(&mut answer).is_ok()
@@ -194,14 +221,31 @@ impl Bare {
 
     /// Finds the commit of the branch, and the world in it.
     fn find(&self) {
-        self.git(&["ls-remote", "--quiet", "--", self.remote.to_str().unwrap(), "refs/heads/main", "refs/tags/main"]);
+        self.git(&[
+            "ls-remote",
+            "--quiet",
+            "--",
+            self.remote.to_str().unwrap(),
+            "refs/heads/main",
+            "refs/tags/main",
+        ]);
         self.git(&["ls-tree", "-r", "-l", "-z", "--full-tree", &self.reference]);
     }
 
     fn git(&self, arguments: &[&str]) {
         let mut git = Command::new("git");
-        git.arg("--git-dir").arg(&self.repository).args(arguments).env("GIT_CONFIG_GLOBAL", "/dev/null");
-        assert!(git.stdout(Stdio::null()).stderr(Stdio::null()).status().unwrap().success(), "{arguments:?}");
+        git.arg("--git-dir")
+            .arg(&self.repository)
+            .args(arguments)
+            .env("GIT_CONFIG_GLOBAL", "/dev/null");
+        assert!(
+            git.stdout(Stdio::null())
+                .stderr(Stdio::null())
+                .status()
+                .unwrap()
+                .success(),
+            "{arguments:?}"
+        );
     }
 
     fn folder(&self, number: u16) -> PathBuf {
@@ -262,7 +306,11 @@ fn tree(root: i32) -> Vec<i32> {
     let mut found = vec![root];
     let mut next = 0;
     while let Some(pid) = found.get(next).copied() {
-        found.extend(children(pid).split_whitespace().map(|child| child.parse::<i32>().unwrap()));
+        found.extend(
+            children(pid)
+                .split_whitespace()
+                .map(|child| child.parse::<i32>().unwrap()),
+        );
         next += 1;
     }
     found

@@ -56,7 +56,9 @@ async fn started(server: &Server, count: u16) -> Duration {
     }
     let begin = Instant::now();
     for client in &mut clients {
-        client.send(&serde_json::json!({ "start": { "url": arm() } }).to_string()).await;
+        client
+            .send(&serde_json::json!({ "start": { "url": arm() } }).to_string())
+            .await;
     }
     for client in &mut clients {
         client.within("webots:", PATIENCE).await;
@@ -85,16 +87,31 @@ struct ByHand {
 impl ByHand {
     /// The project of the only running simulation.
     fn of(server: &Server, most: u16) -> Self {
-        let runs = std::fs::read_dir(server.cache().join("runs")).unwrap().flatten().map(|run| run.path());
+        let runs = std::fs::read_dir(server.cache().join("runs"))
+            .unwrap()
+            .flatten()
+            .map(|run| run.path());
         let instances = runs.flat_map(|run| std::fs::read_dir(run).unwrap().flatten().map(|file| file.path()));
-        let instance = instances.into_iter().find(|folder| folder.join("compose").is_dir()).unwrap();
+        let instance = instances
+            .into_iter()
+            .find(|folder| folder.join("compose").is_dir())
+            .unwrap();
         let folder = tempfile::tempdir().unwrap();
-        let copied = Command::new("cp").arg("-R").arg(instance).arg(folder.path().join("instance")).status().unwrap();
+        let copied = Command::new("cp")
+            .arg("-R")
+            .arg(instance)
+            .arg(folder.path().join("instance"))
+            .status()
+            .unwrap();
         assert!(copied.success());
         let webots = &daemon::of_service(server, "webots")[0];
         let image = daemon::ask(&["inspect", "--format", "{{.Config.Image}}", webots]);
         let first = crate::support::ports::block(most);
-        Self { folder, image, ports: (first..first + most).collect() }
+        Self {
+            folder,
+            image,
+            ports: (first..first + most).collect(),
+        }
     }
 
     fn instance(&self) -> PathBuf {
@@ -105,8 +122,10 @@ impl ByHand {
     fn up(&self, count: u16) -> Duration {
         let begin = Instant::now();
         let ports = self.ports.iter().take(count.into());
-        let children: Vec<_> =
-            ports.clone().map(|port| self.compose(*port, &["up", "--detach"]).spawn().unwrap()).collect();
+        let children: Vec<_> = ports
+            .clone()
+            .map(|port| self.compose(*port, &["up", "--detach"]).spawn().unwrap())
+            .collect();
         for mut child in children {
             assert!(child.wait().unwrap().success());
         }
@@ -129,13 +148,25 @@ impl ByHand {
         let project = std::fs::read_dir(&instance).unwrap().flatten().map(|file| file.path());
         let project = project.into_iter().find(|path| path.join("worlds").is_dir()).unwrap();
         let mut command = compose();
-        command.args(["--project-name", &format!("by-hand-{port}"), "--project-directory"]).arg(&folder);
+        command
+            .args(["--project-name", &format!("by-hand-{port}"), "--project-directory"])
+            .arg(&folder);
         // The server's own file has the port in the command.
         let own = self.folder.path().join(format!("{port}.json"));
         std::fs::write(&own, override_for(&folder, port)).unwrap();
-        command.arg("--file").arg(folder.join("docker-compose.yml")).arg("--file").arg(own).args(words);
-        command.env("PORT", port.to_string()).env("PROJECT", project).env("IMAGE", &self.image);
-        command.env("BIND", "127.0.0.1").env("PROJECT_PATH", "/usr/local/webots-project");
+        command
+            .arg("--file")
+            .arg(folder.join("docker-compose.yml"))
+            .arg("--file")
+            .arg(own)
+            .args(words);
+        command
+            .env("PORT", port.to_string())
+            .env("PROJECT", project)
+            .env("IMAGE", &self.image);
+        command
+            .env("BIND", "127.0.0.1")
+            .env("PROJECT_PATH", "/usr/local/webots-project");
         command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
         command
     }
@@ -143,9 +174,16 @@ impl ByHand {
 
 /// `docker compose` or `docker-compose`, whichever the server uses, for the daemon.
 fn compose() -> Command {
-    let plugin = Command::new("docker").args(["compose", "version"]).output().unwrap().status.success();
+    let plugin = Command::new("docker")
+        .args(["compose", "version"])
+        .output()
+        .unwrap()
+        .status
+        .success();
     let mut command = Command::new(if plugin { "docker" } else { "docker-compose" });
-    command.args(plugin.then_some("compose")).env("DOCKER_HOST", daemon::host());
+    command
+        .args(plugin.then_some("compose"))
+        .env("DOCKER_HOST", daemon::host());
     command
 }
 
@@ -163,10 +201,14 @@ fn override_for(folder: &Path, port: u16) -> String {
 
 fn answers(port: u16) -> bool {
     use std::io::{Read, Write};
-    let Ok(mut stream) = std::net::TcpStream::connect(("127.0.0.1", port)) else { return false };
+    let Ok(mut stream) = std::net::TcpStream::connect(("127.0.0.1", port)) else {
+        return false;
+    };
     stream.set_read_timeout(Some(Duration::from_secs(2))).unwrap();
     let mut answer = [0; 5];
-    stream.write_all(b"GET /robots.txt HTTP/1.0\r\nHost: localhost\r\n\r\n").is_ok()
+    stream
+        .write_all(b"GET /robots.txt HTTP/1.0\r\nHost: localhost\r\n\r\n")
+        .is_ok()
         && stream.read_exact(&mut answer).is_ok()
 }
 

@@ -66,12 +66,19 @@ pub async fn measure(verdict: &mut Verdict, levels: &[String], time: Duration) {
 
 /// Number of simulations.
 async fn standing(server: &Server) -> usize {
-    http::get(&server.url("/status")).await.json()["simulations"].as_array().unwrap().len()
+    http::get(&server.url("/status")).await.json()["simulations"]
+        .as_array()
+        .unwrap()
+        .len()
 }
 
 /// Opens the monitor page's events, and reads them.
 async fn watch(server: &Server) -> actix_rt::task::JoinHandle<()> {
-    let answer = awc::Client::builder().timeout(Duration::from_secs(10)).finish().get(server.url("/events")).send();
+    let answer = awc::Client::builder()
+        .timeout(Duration::from_secs(10))
+        .finish()
+        .get(server.url("/events"))
+        .send();
     let mut answer = answer.await.unwrap();
     assert!(answer.status().is_success());
     answer.next().await.unwrap().unwrap();

@@ -31,7 +31,11 @@ pub async fn measure(levels: &[String], sizes: &[u16]) {
             let demo = std::path::Path::new(env!("CARGO_BIN_EXE_demo-simulator"));
             let builder = simulation_server(demo, forge.path(), size).set("isolation", level.as_str());
             // Clients that wait for their turn answer no pings.
-            let server = builder.set("limits.disk", DISK).set("timing.silence", 3600).start().await;
+            let server = builder
+                .set("limits.disk", DISK)
+                .set("timing.silence", 3600)
+                .start()
+                .await;
             let mut clients = Vec::new();
             while clients.len() < usize::from(size) {
                 clients.extend(ready(&server, AT_ONCE.min(size - clients.len() as u16)).await);
@@ -44,11 +48,17 @@ pub async fn measure(levels: &[String], sizes: &[u16]) {
                 for number in 0..=DISK {
                     std::fs::write(folder.join(format!("project/filling-{number}")), vec![1; 1 << 20]).unwrap();
                 }
-                client.within("loading: Error: The simulation has written more than", SOON).await;
+                client
+                    .within("loading: Error: The simulation has written more than", SOON)
+                    .await;
                 times.push(begin.elapsed());
             }
             times.sort();
-            println!("  {level:<8}{size:>5}: {:>8.2?} {:>8.2?}", times[times.len() / 2], times[times.len() - 1]);
+            println!(
+                "  {level:<8}{size:>5}: {:>8.2?} {:>8.2?}",
+                times[times.len() / 2],
+                times[times.len() - 1]
+            );
             leave(&server, clients).await;
         }
     }
@@ -60,7 +70,12 @@ async fn folder(server: &Server, client: &Client) -> PathBuf {
     let port: u16 = url.rsplit_once(':').unwrap().1.parse().unwrap();
     let status = http::get(&server.url("/status")).await.json();
     let all = status["simulations"].as_array().unwrap();
-    let one = all.iter().find(|one| one["port"].as_u64() == Some(port.into())).unwrap();
+    let one = all
+        .iter()
+        .find(|one| one["port"].as_u64() == Some(port.into()))
+        .unwrap();
     let process = Process::new(one["pid"].as_i64().unwrap().try_into().unwrap()).unwrap();
-    process.environ().unwrap()[std::ffi::OsStr::new("WEBOTS_FLEET_INSTANCE")].clone().into()
+    process.environ().unwrap()[std::ffi::OsStr::new("WEBOTS_FLEET_INSTANCE")]
+        .clone()
+        .into()
 }

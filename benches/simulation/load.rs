@@ -28,14 +28,18 @@ pub async fn measure(verdict: &mut Verdict, requests: usize) {
         forge.commit_work_tree(&name, "main");
     }
     let demo = env!("CARGO_BIN_EXE_demo-simulator");
-    let webots =
-        Webots::script(&format!("case \"$*\" in *--port=*1) yes flood & ;; esac\n{demo} \"$@\" >/dev/null & wait"));
+    let webots = Webots::script(&format!(
+        "case \"$*\" in *--port=*1) yes flood & ;; esac\n{demo} \"$@\" >/dev/null & wait"
+    ));
     let hanging = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let mirrors = serde_json::json!({
         "https://github.com/": format!("file:{}", forge.path().display()),
         "https://github.com/lab/hangs": format!("https://127.0.0.1:{}/", hanging.local_addr().unwrap().port()),
     });
-    let server = simulation_server(&webots.path(), forge.path(), 12).set("gitMirrors", mirrors).start().await;
+    let server = simulation_server(&webots.path(), forge.path(), 12)
+        .set("gitMirrors", mirrors)
+        .start()
+        .await;
     report(verdict, "idle", &ask(server.port, requests).await);
     let _stuck = Client::start(&server, &world("lab/hangs", "main", "worlds/a.wbt")).await;
     let mut clients = Vec::new();
@@ -63,7 +67,9 @@ async fn ask(port: u16, requests: usize) -> Vec<Duration> {
         let mut times: Vec<Duration> = (0..requests)
             .map(|_| {
                 let begin = Instant::now();
-                socket.write_all(b"GET /load HTTP/1.1\r\nHost: localhost\r\n\r\n").unwrap();
+                socket
+                    .write_all(b"GET /load HTTP/1.1\r\nHost: localhost\r\n\r\n")
+                    .unwrap();
                 let length = socket.read(&mut answer).unwrap();
                 assert!(answer[..length].starts_with(b"HTTP/1.1 200"));
                 let time = begin.elapsed();
@@ -80,6 +86,11 @@ async fn ask(port: u16, requests: usize) -> Vec<Duration> {
 
 fn report(verdict: &mut Verdict, what: &str, times: &[Duration]) {
     let at = |part: f64| times[((times.len() - 1) as f64 * part) as usize];
-    println!("  {what:<26} median {:>9.3?}  p99 {:>9.3?}  worst {:>9.3?}", at(0.5), at(0.99), at(1.0));
+    println!(
+        "  {what:<26} median {:>9.3?}  p99 {:>9.3?}  worst {:>9.3?}",
+        at(0.5),
+        at(0.99),
+        at(1.0)
+    );
     verdict.bound("p99", at(0.99), BOUND);
 }

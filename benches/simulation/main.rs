@@ -105,13 +105,19 @@ impl Verdict {
     fn bound(&mut self, what: &str, value: Duration, most: Duration) {
         let kept = value <= most;
         self.failed |= !kept;
-        println!("  {} {what}: {value:.3?}, bound {most:?}", if kept { "kept  " } else { "BROKEN" });
+        println!(
+            "  {} {what}: {value:.3?}, bound {most:?}",
+            if kept { "kept  " } else { "BROKEN" }
+        );
     }
 
     fn ratio(&mut self, what: &str, value: f64, most: f64) {
         let kept = value <= most;
         self.failed |= !kept;
-        println!("  {} {what}: {value:.2}, bound {most}", if kept { "kept  " } else { "BROKEN" });
+        println!(
+            "  {} {what}: {value:.2}, bound {most}",
+            if kept { "kept  " } else { "BROKEN" }
+        );
     }
 }
 
@@ -124,7 +130,11 @@ async fn main() -> ExitCode {
     let is_wanted = |part| arguments.parts.is_empty() || arguments.parts.contains(&part);
     let mut verdict = Verdict::default();
     let all = || ["none", "sandbox"].map(str::to_owned).to_vec();
-    let levels = if arguments.level.is_empty() { all() } else { arguments.level };
+    let levels = if arguments.level.is_empty() {
+        all()
+    } else {
+        arguments.level
+    };
     if is_wanted(Part::Load) {
         load::measure(&mut verdict, arguments.requests).await;
     }
@@ -133,7 +143,11 @@ async fn main() -> ExitCode {
         start::compare_levels(&mut verdict, arguments.cached).await;
     }
     if is_wanted(Part::Class) {
-        let sizes = if arguments.size.is_empty() { vec![1, 10, 100, 200] } else { arguments.size.clone() };
+        let sizes = if arguments.size.is_empty() {
+            vec![1, 10, 100, 200]
+        } else {
+            arguments.size.clone()
+        };
         class::measure(&mut verdict, &levels, &sizes, arguments.rounds).await;
     }
     if is_wanted(Part::Idle) {
@@ -146,7 +160,11 @@ async fn main() -> ExitCode {
         stream::measure(&arguments.size, Duration::from_secs(arguments.seconds)).await;
     }
     if is_wanted(Part::Containers) {
-        let sizes = if arguments.size.is_empty() { &[1, 30][..] } else { &arguments.size };
+        let sizes = if arguments.size.is_empty() {
+            &[1, 30][..]
+        } else {
+            &arguments.size
+        };
         containers::measure(&mut verdict, sizes, arguments.rounds).await;
     }
     if is_wanted(Part::Relay) {
@@ -155,7 +173,11 @@ async fn main() -> ExitCode {
     if is_wanted(Part::Soak) {
         soak_and_tell(&mut verdict, arguments.starts).await;
     }
-    if verdict.failed { ExitCode::FAILURE } else { ExitCode::SUCCESS }
+    if verdict.failed {
+        ExitCode::FAILURE
+    } else {
+        ExitCode::SUCCESS
+    }
 }
 
 async fn soak_and_tell(verdict: &mut Verdict, starts: usize) {

@@ -42,13 +42,19 @@ fn now() -> u64 {
 
 /// Sends messages to each client on Webots' port; never returns.
 pub async fn send() {
-    let port = std::env::args().find_map(|word| word.strip_prefix("--port=")?.parse().ok()).unwrap();
-    let listener = tokio::net::TcpListener::bind((Ipv4Addr::LOCALHOST, port)).await.unwrap();
+    let port = std::env::args()
+        .find_map(|word| word.strip_prefix("--port=")?.parse().ok())
+        .unwrap();
+    let listener = tokio::net::TcpListener::bind((Ipv4Addr::LOCALHOST, port))
+        .await
+        .unwrap();
     loop {
         let (socket, _) = listener.accept().await.unwrap();
         socket.set_nodelay(true).unwrap();
         actix_rt::spawn(async move {
-            let Ok(mut client) = tokio_tungstenite::accept_async(socket).await else { return };
+            let Ok(mut client) = tokio_tungstenite::accept_async(socket).await else {
+                return;
+            };
             // Spreads the messages of the clients over time.
             actix_rt::time::sleep(Duration::from_micros(now() % 20_000)).await;
             let mut ticks = actix_rt::time::interval(Duration::from_secs(1) / MESSAGES);
@@ -70,10 +76,16 @@ pub async fn measure(verdict: &mut Verdict, time: Duration, rounds: usize) {
     let forge = Forge::with_arm();
     let program = std::env::current_exe().unwrap();
     let webots = Webots::script(&format!("{SENDER}=1 exec '{}' \"$@\"", program.display()));
-    let builder = simulation_server(&webots.path(), forge.path(), 1).set("isolation", "none").set("streaming", "relay");
+    let builder = simulation_server(&webots.path(), forge.path(), 1)
+        .set("isolation", "none")
+        .set("streaming", "relay");
     let server = builder.set("hangLimit", 3600).start().await;
     let mut client = Client::start(&server, &arm()).await;
-    let relayed = client.until("webots:").await.replace("webots:", "").replace("localhost", "127.0.0.1");
+    let relayed = client
+        .until("webots:")
+        .await
+        .replace("webots:", "")
+        .replace("localhost", "127.0.0.1");
     actix_rt::spawn(async move { while client.next_within(Duration::MAX).await.is_some() {} });
     let (port, listen) = (server.port + 1, ports::block(1));
     let site = format!(
@@ -105,7 +117,9 @@ pub async fn measure(verdict: &mut Verdict, time: Duration, rounds: usize) {
         println!("  {name:<8} p99 {:>9.3?}, {:>6.2} % of a core", latency, processor);
         medians.push((latency, processor));
     }
-    let [direct, nginx, relay] = medians[..] else { unreachable!() };
+    let [direct, nginx, relay] = medians[..] else {
+        unreachable!()
+    };
     verdict.bound("p99 beside direct", relay.0.saturating_sub(direct.0), LATER);
     verdict.ratio("processor time beside nginx", relay.1 / nginx.1, 1.0);
 }
@@ -114,7 +128,11 @@ pub async fn measure(verdict: &mut Verdict, time: Duration, rounds: usize) {
 /// percent of a core.
 async fn one(url: &str, process: i32, time: Duration) -> Taken {
     let connecting = (0..STREAMS).map(|_| tokio_tungstenite::connect_async(url));
-    let sockets: Vec<_> = join_all(connecting).await.into_iter().map(|one| one.unwrap().0).collect();
+    let sockets: Vec<_> = join_all(connecting)
+        .await
+        .into_iter()
+        .map(|one| one.unwrap().0)
+        .collect();
     let (before, begin) = (processor(process), now());
     let reading = sockets.into_iter().map(|mut socket| async move {
         let mut latencies = Vec::new();
@@ -127,7 +145,9 @@ async fn one(url: &str, process: i32, time: Duration) -> Taken {
                 }
             }
         };
-        actix_rt::time::timeout(time, reading).await.expect_err("a stream has ended");
+        actix_rt::time::timeout(time, reading)
+            .await
+            .expect_err("a stream has ended");
         latencies
     });
     let mut latencies: Vec<u64> = join_all(reading).await.concat();
@@ -147,8 +167,15 @@ struct Taken {
 /// The processor time of a process and its children so far, in seconds.
 fn processor(process: i32) -> f64 {
     let of = |one: Process| {
-        one.stat().ok().filter(|stat| stat.pid == process || (stat.ppid == process && stat.comm == "nginx"))
+        one.stat()
+            .ok()
+            .filter(|stat| stat.pid == process || (stat.ppid == process && stat.comm == "nginx"))
     };
-    let ticks: u64 = all_processes().unwrap().flatten().filter_map(of).map(|stat| stat.utime + stat.stime).sum();
+    let ticks: u64 = all_processes()
+        .unwrap()
+        .flatten()
+        .filter_map(of)
+        .map(|stat| stat.utime + stat.stime)
+        .sum();
     ticks as f64 / procfs::ticks_per_second() as f64
 }

@@ -23,7 +23,10 @@ pub async fn measure(verdict: &mut Verdict, starts: usize) {
     checkout(&server, &url).await;
     for _ in 0..starts {
         ours.push(checkout(&server, &url).await);
-        plain.push(commands(&server.folder.join("cache/git"), &forge.path().join("lab/arm")));
+        plain.push(commands(
+            &server.folder.join("cache/git"),
+            &forge.path().join("lab/arm"),
+        ));
     }
     let (ours, plain) = (median(ours), median(plain));
     println!("cached start, from the wish to the end of the checkout: {ours:.1?} (median of {starts})");
@@ -36,7 +39,11 @@ pub async fn measure(verdict: &mut Verdict, starts: usize) {
 /// Measures how much longer a program takes from its launch to its end in a sandbox.
 pub async fn compare_levels(verdict: &mut Verdict, starts: usize) {
     let forge = Forge::with_arm();
-    let at = |level: &str| simulation_server(Path::new("/bin/true"), forge.path(), 4).set("isolation", level).start();
+    let at = |level: &str| {
+        simulation_server(Path::new("/bin/true"), forge.path(), 4)
+            .set("isolation", level)
+            .start()
+    };
     let (none, sandbox) = (at("none").await, at("sandbox").await);
     let url = world("lab/arm", "main", "worlds/a.wbt");
     let (mut without, mut within) = (Vec::new(), Vec::new());
@@ -62,7 +69,9 @@ async fn launch(server: &crate::support::program::Server, url: &str) -> Duration
 async fn checkout(server: &crate::support::program::Server, url: &str) -> Duration {
     let mut client = Client::connect(&server.websocket("/client")).await;
     let begin = Instant::now();
-    client.send(&serde_json::json!({"start": {"url": url}}).to_string()).await;
+    client
+        .send(&serde_json::json!({"start": {"url": url}}).to_string())
+        .await;
     client.until("loading: checkout done").await;
     let time = begin.elapsed();
     client.closed().await;
@@ -72,7 +81,11 @@ async fn checkout(server: &crate::support::program::Server, url: &str) -> Durati
 fn commands(cache: &Path, remote: &Path) -> Duration {
     let entries = std::fs::read_dir(cache).unwrap().flatten().map(|entry| entry.path());
     let repository = entries.into_iter().find(|path| path.is_dir()).unwrap();
-    let fleet = std::fs::read_dir(repository.join("refs/fleet")).unwrap().flatten().next().unwrap();
+    let fleet = std::fs::read_dir(repository.join("refs/fleet"))
+        .unwrap()
+        .flatten()
+        .next()
+        .unwrap();
     let reference = format!("refs/fleet/{}", fleet.file_name().to_str().unwrap());
     let folder = tempfile::tempdir().unwrap();
     let run = |arguments: &[&str]| {
@@ -90,7 +103,14 @@ fn commands(cache: &Path, remote: &Path) -> Duration {
     std::fs::create_dir(folder.path().join("project")).unwrap();
     let tree = format!("--work-tree={}", folder.path().join("project").display());
     let begin = Instant::now();
-    run(&["ls-remote", "--quiet", "--", remote.to_str().unwrap(), "refs/heads/main", "refs/tags/main"]);
+    run(&[
+        "ls-remote",
+        "--quiet",
+        "--",
+        remote.to_str().unwrap(),
+        "refs/heads/main",
+        "refs/tags/main",
+    ]);
     run(&["ls-tree", "-r", "-l", "-z", "--full-tree", &reference]);
     run(&[&tree, "checkout", "--force", "--progress", &reference, "--", "."]);
     begin.elapsed()

@@ -47,13 +47,18 @@ pub async fn measure(sizes: &[u16], time: Duration) {
             let clients = ready(&server, size).await;
             let status = http::get(&server.url("/status")).await.json();
             let all = status["simulations"].as_array().unwrap();
-            let ports: Vec<u16> = all.iter().map(|one| one["port"].as_u64().unwrap().try_into().unwrap()).collect();
+            let ports: Vec<u16> = all
+                .iter()
+                .map(|one| one["port"].as_u64().unwrap().try_into().unwrap())
+                .collect();
             let root = Process::new(all[0]["pid"].as_i64().unwrap().try_into().unwrap()).unwrap();
             let resident = (root.stat().unwrap().rss * procfs::page_size()) >> 10;
             let first = ports[0];
             let (mut times, rate) = actix_rt::task::spawn_blocking(move || {
-                let threads: Vec<_> =
-                    ports.into_iter().map(|port| std::thread::spawn(move || echo(port, time))).collect();
+                let threads: Vec<_> = ports
+                    .into_iter()
+                    .map(|port| std::thread::spawn(move || echo(port, time)))
+                    .collect();
                 let times: Vec<Duration> = threads.into_iter().flat_map(|one| one.join().unwrap()).collect();
                 (times, zeros(first, time))
             })
@@ -77,7 +82,9 @@ fn open(port: u16, path: &str) -> TcpStream {
     let mut stream = TcpStream::connect(("127.0.0.1", port)).unwrap();
     stream.set_nodelay(true).unwrap();
     stream.set_read_timeout(Some(Duration::from_secs(20))).unwrap();
-    stream.write_all(format!("GET {path} HTTP/1.0\r\n\r\n").as_bytes()).unwrap();
+    stream
+        .write_all(format!("GET {path} HTTP/1.0\r\n\r\n").as_bytes())
+        .unwrap();
     let mut head = [0; 19];
     stream.read_exact(&mut head).unwrap();
     stream

@@ -60,7 +60,9 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     let serving = actix_rt::spawn(http);
     start::announce("session server", &http_url, &websocket_url, port);
     let registry = server.registry.clone();
-    actix_rt::spawn(service_manager::feed_watchdog(async move || registry.send(GetStatus).await.is_ok()));
+    actix_rt::spawn(service_manager::feed_watchdog(async move || {
+        registry.send(GetStatus).await.is_ok()
+    }));
     tokio::select! {
         () = handle_commands(&mut signals, &file, &server) => {}
         fault = permanent::stopped("Registry", server.registry.clone()) => return Err(fault.into()),
@@ -92,10 +94,17 @@ fn bound_clients(files: u64, config: &SessionConfig) -> Result<(usize, usize), S
     let all = usize::try_from(files).unwrap_or(usize::MAX);
     // The names are not resolved yet, so their servers reserve a quarter.
     let has_names = config.simulation_servers.iter().any(|entry| entry.name().is_some());
-    let servers = if has_names { all / 4 } else { FILES_PER_SERVER * config.simulation_servers.len() };
+    let servers = if has_names {
+        all / 4
+    } else {
+        FILES_PER_SERVER * config.simulation_servers.len()
+    };
     let connections = all.saturating_sub(OWN_FILES + servers);
     let possible = connections - connections / 16;
-    Ok((connections, limit_clients(files, possible, config.max_clients, "one client")?))
+    Ok((
+        connections,
+        limit_clients(files, possible, config.max_clients, "one client")?,
+    ))
 }
 
 /// Creates the server's state, and starts its actors.
@@ -105,7 +114,11 @@ fn assemble(
     phase: watch::Receiver<Phase>,
 ) -> Result<AppState, AppError> {
     let metrics = Metrics::default();
-    let picks = metrics.counter("webots_session_requests_total", "Requests for a simulation server", "outcome")?;
+    let picks = metrics.counter(
+        "webots_session_requests_total",
+        "Requests for a simulation server",
+        "outcome",
+    )?;
     for outcome in OUTCOMES {
         picks.with_label_values(&[outcome]).reset();
     }
@@ -115,7 +128,10 @@ fn assemble(
     Ok(AppState {
         registry,
         available,
-        client_urls: ClientUrls { ssl: config.ssl, public: config.public_url.clone() },
+        client_urls: ClientUrls {
+            ssl: config.ssl,
+            public: config.public_url.clone(),
+        },
         phase,
         connections,
         metrics,
@@ -138,7 +154,10 @@ fn reload(file: &Path, server: &AppState) {
             let entries = loaded.config.simulation_servers.len();
             log::info!("read {} again: {entries} entries in simulationServers", file.display());
             // `client_urls` keeps the value of `ssl` from the start, so the probes keep it too.
-            let config = SessionConfig { ssl: server.config.ssl, ..loaded.config };
+            let config = SessionConfig {
+                ssl: server.config.ssl,
+                ..loaded.config
+            };
             server.registry.do_send(Reconfigure(Arc::new(config)));
         }
         Err(error) => log::error!("the configuration stays as it was: {error}"),

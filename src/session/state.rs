@@ -53,7 +53,10 @@ impl AppState {
     /// # Errors
     /// Once the registry has stopped, and the server with it.
     pub async fn status(&self) -> Result<Arc<FleetStatus>, actix_web::Error> {
-        self.registry.send(GetStatus).await.map_err(|_| ErrorServiceUnavailable("Error: the server stops."))
+        self.registry
+            .send(GetStatus)
+            .await
+            .map_err(|_| ErrorServiceUnavailable("Error: the server stops."))
     }
 
     /// Asks the registry for a simulation server for the client at the address `from`, and returns the server's URL.
@@ -63,8 +66,14 @@ impl AppState {
     /// Why no server is available.
     pub async fn pick(&self, world: Option<&str>, from: Option<IpAddr>) -> Result<String, PickError> {
         let picked = async {
-            let world = world.filter(|text| !text.is_empty()).map(ProjectUrl::parse).transpose()?;
-            self.registry.send(Pick { world, from }).await.unwrap_or(Err(PickError::Unavailable))
+            let world = world
+                .filter(|text| !text.is_empty())
+                .map(ProjectUrl::parse)
+                .transpose()?;
+            self.registry
+                .send(Pick { world, from })
+                .await
+                .unwrap_or(Err(PickError::Unavailable))
         };
         let picked = picked.await;
         let outcome = match &picked {

@@ -56,7 +56,10 @@ pub fn without_paths(text: &str) -> String {
         // A quoted path may contain spaces.
         let quote = before.chars().next_back().filter(|letter| QUOTES.contains(letter));
         let ends = |letter: char| letter.is_whitespace() || PATH_ENDS.contains(letter);
-        let end = quote.and_then(|quote| from.find(quote)).or_else(|| from.find(ends)).unwrap_or(from.len());
+        let end = quote
+            .and_then(|quote| from.find(quote))
+            .or_else(|| from.find(ends))
+            .unwrap_or(from.len());
         let (path, after) = from.split_at(end);
         shown.push_str(before);
         let is_url = path.starts_with("//") && before.ends_with(':') && !before.ends_with("file:");
@@ -93,15 +96,30 @@ mod tests {
     #[test]
     fn paths_of_the_machine_are_cut_and_urls_are_not() {
         for (text, shown) in [
-            ("can't write /var/cache/run/instance-a1: full", "can't write instance-a1: full"),
+            (
+                "can't write /var/cache/run/instance-a1: full",
+                "can't write instance-a1: full",
+            ),
             ("fatal: '/srv/git/arm.git' is none.", "fatal: 'arm.git' is none."),
             ("at \"/home/a b/c d/webots\". Set", "at \"webots\". Set"),
-            ("file:/srv/git/arm.git and file:///srv/git/leg.git", "file:arm.git and file:leg.git"),
+            (
+                "file:/srv/git/arm.git and file:///srv/git/leg.git",
+                "file:arm.git and file:leg.git",
+            ),
             ("at /opt/webots/. Its --log=/a/b.", "at webots. Its --log=b."),
             ("PATH=/usr/bin:/bin", "PATH=bin:bin"),
-            ("https://github.com/lab/arm/blob/main/worlds/a.wbt", "https://github.com/lab/arm/blob/main/worlds/a.wbt"),
-            ("ws://localhost:2000/client, worlds/a.wbt", "ws://localhost:2000/client, worlds/a.wbt"),
-            ("controllers/arm/arm.py, ./a/b ../c and/or 3 / 4", "controllers/arm/arm.py, ./a/b ../c and/or 3 / 4"),
+            (
+                "https://github.com/lab/arm/blob/main/worlds/a.wbt",
+                "https://github.com/lab/arm/blob/main/worlds/a.wbt",
+            ),
+            (
+                "ws://localhost:2000/client, worlds/a.wbt",
+                "ws://localhost:2000/client, worlds/a.wbt",
+            ),
+            (
+                "controllers/arm/arm.py, ./a/b ../c and/or 3 / 4",
+                "controllers/arm/arm.py, ./a/b ../c and/or 3 / 4",
+            ),
             ("Step 3/9 : fetching", "Step 3/9 : fetching"),
         ] {
             assert_eq!(without_paths(text), shown, "{text:?}");
@@ -111,10 +129,16 @@ mod tests {
     #[test]
     fn nothing_hides_in_a_line() {
         for (text, line) in [
-            ("a plain text, e\u{301}t\u{e9}, \u{6587}", "a plain text, e\u{301}t\u{e9}, \u{6587}"),
+            (
+                "a plain text, e\u{301}t\u{e9}, \u{6587}",
+                "a plain text, e\u{301}t\u{e9}, \u{6587}",
+            ),
             ("one\r\ntwo\u{85}\u{2028}\u{1b}[31m", "one  two   [31m"),
             ("\u{202e}gpj.exe\u{2066}", "\u{fffd}gpj.exe\u{fffd}"),
-            ("a\u{200b}b\u{feff}\u{e0041}\u{3164}", "a\u{fffd}b\u{fffd}\u{fffd}\u{fffd}"),
+            (
+                "a\u{200b}b\u{feff}\u{e0041}\u{3164}",
+                "a\u{fffd}b\u{fffd}\u{fffd}\u{fffd}",
+            ),
         ] {
             assert_eq!(one_line(text), line, "{text:?}");
         }

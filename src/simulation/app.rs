@@ -57,7 +57,11 @@ impl Application {
         config.max_clients = bound_clients(&config)?;
         let address = SocketAddr::new(config.bind, config.port);
         let socket = server::listen(address).map_err(|error| format!("can't listen on {address}: {error}"))?;
-        Ok(Self { server: Arc::new(assemble(Arc::new(config))?), socket, signals })
+        Ok(Self {
+            server: Arc::new(assemble(Arc::new(config))?),
+            socket,
+            signals,
+        })
     }
 }
 
@@ -71,7 +75,12 @@ fn bound_clients(config: &SimulationConfig) -> Result<usize, String> {
     let wanted = config.max_clients.saturating_mul(each).saturating_add(needed);
     let files = raise_open_files(u64::try_from(wanted).unwrap_or(u64::MAX));
     let rest = usize::try_from(files).unwrap_or(usize::MAX).saturating_sub(needed);
-    limit_clients(files, rest / each, config.max_clients, &format!("{places} places and one client"))
+    limit_clients(
+        files,
+        rest / each,
+        config.max_clients,
+        &format!("{places} places and one client"),
+    )
 }
 
 /// Runs a server until a signal or an administrator stops it.
@@ -79,7 +88,11 @@ fn bound_clients(config: &SimulationConfig) -> Result<usize, String> {
 /// # Errors
 /// When the `LoadMonitor` has stopped, or the system refuses what the server needs.
 pub async fn serve(assembly: Application) -> Result<(), AppError> {
-    let Application { server, socket, mut signals } = assembly;
+    let Application {
+        server,
+        socket,
+        mut signals,
+    } = assembly;
     let owner = server.containers.as_ref().map(|containers| containers.run.0.as_str());
     let _guardian = Guardian::start(server.run.path(), owner)?;
     let shared = web::Data::from(Arc::clone(&server));
@@ -89,22 +102,35 @@ pub async fn serve(assembly: Application) -> Result<(), AppError> {
         stop: Duration::from_secs(1),
         trusted_proxies: server.config.trusted_proxies.clone(),
     };
-    let simulations = server.launcher.reached().unwrap_or_else(|| server.config.address_of_simulations());
+    let simulations = server
+        .launcher
+        .reached()
+        .unwrap_or_else(|| server.config.address_of_simulations());
     let stream_thread = StreamThread::start()?;
     let silence = options.silence;
     let app = move || {
         let upstream = Upstream::new(simulations, stream_thread.clone(), silence);
-        App::new().app_data(shared.clone()).app_data(upstream).configure(configure)
+        App::new()
+            .app_data(shared.clone())
+            .app_data(upstream)
+            .configure(configure)
     };
     let http = server::serve(socket, server.connections.clone(), options, app)?;
     let handle = http.handle();
     let serving = actix_rt::spawn(http);
     let (config, port) = (&server.config, server.config.port);
-    start::announce("simulation server", &config.http_url(), &format!("{}/client", config.websocket_url(port)), port);
+    start::announce(
+        "simulation server",
+        &config.http_url(),
+        &format!("{}/client", config.websocket_url(port)),
+        port,
+    );
     let slots = Arc::clone(&server.slots);
     actix_rt::spawn(Arc::clone(&slots).recheck());
     // This runs unless this thread is blocked, or another one holds the lock of the slots.
-    actix_rt::spawn(service_manager::feed_watchdog(async move || slots.instances().places > 0));
+    actix_rt::spawn(service_manager::feed_watchdog(async move || {
+        slots.instances().places > 0
+    }));
     let why = tokio::select! {
         why = handle_signals(&mut signals, &server) => why,
         fault = permanent::stopped("LoadMonitor", server.load_monitor.clone()) => return Err(fault.into()),
@@ -112,7 +138,10 @@ pub async fn serve(assembly: Application) -> Result<(), AppError> {
     log::info!("stopping");
     service_manager::stopping(why);
     server.phase.send_replace(Phase::Closing);
-    if actix_rt::time::timeout(server.config.timing.stop, empty(&server)).await.is_err() {
+    if actix_rt::time::timeout(server.config.timing.stop, empty(&server))
+        .await
+        .is_err()
+    {
         log::error!("some simulations have not ended in time: they are killed");
     }
     server.ends.flush().await;
@@ -141,11 +170,17 @@ async fn handle_signals(signals: &mut Signals, server: &AppState) -> &'static st
 
 /// Limit of TCP connections: those of clients, the same number for pages and other requests, and what is relayed.
 fn max_tcp(config: &SimulationConfig) -> usize {
-    config.max_clients.saturating_mul(TCP_PER_CLIENT + streams_per_client(config))
+    config
+        .max_clients
+        .saturating_mul(TCP_PER_CLIENT + streams_per_client(config))
 }
 
 fn streams_per_client(config: &SimulationConfig) -> usize {
-    if config.ports_are_public() { 0 } else { STREAMS_PER_CLIENT }
+    if config.ports_are_public() {
+        0
+    } else {
+        STREAMS_PER_CLIENT
+    }
 }
 
 /// Creates the server's state, and starts its actors.
@@ -156,7 +191,9 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
     let run = RunDir::open(&folder).map_err(cache_fault)?;
     let launcher = Launcher::start(&config)?;
     let no_containers = |why| format!("isolation is \"container\", but {why}");
-    let containers = config.docker.then(|| ContainerService::open(Arc::clone(&config), run.path()));
+    let containers = config
+        .docker
+        .then(|| ContainerService::open(Arc::clone(&config), run.path()));
     let containers = containers.transpose().map_err(no_containers)?.map(Arc::new);
     let rules = AdmissionRules {
         allowed: config.allowed_repositories.clone(),
@@ -170,20 +207,36 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
     let logs = config.log_dir.0.join("simulation");
     let ends = Ends::start(logs, launcher.level.to_string(), &metrics)?;
     let (per_address, per_user) = (config.max_places_per_address, config.max_places_per_user);
-    let slots = SlotPool::new(config.streaming_ports(), config.waiting_line, per_address, per_user, ends.clone());
-    let csv = config.monitor_log_enabled.then(|| config.log_dir.0.join("simulation/monitor.csv"));
+    let slots = SlotPool::new(
+        config.streaming_ports(),
+        config.waiting_line,
+        per_address,
+        per_user,
+        ends.clone(),
+    );
+    let csv = config
+        .monitor_log_enabled
+        .then(|| config.log_dir.0.join("simulation/monitor.csv"));
     let spread = Arc::new(Spread::over(config.displays_of_gpus().len()));
     let (load_monitor, readings) = LoadMonitor::new(slots.clone(), run.path(), csv, spread.clone())?;
     let load_monitor = LoadMonitor::start_in_arbiter(&Arbiter::new().handle(), |_| load_monitor);
     announcer::start(&config);
     let watcher = Watcher::start(run.path().to_owned(), config.disk_reserve)?;
-    let starts = metrics.counter("webots_simulation_starts_total", "Simulations that were asked for", "outcome")?;
+    let starts = metrics.counter(
+        "webots_simulation_starts_total",
+        "Simulations that were asked for",
+        "outcome",
+    )?;
     for outcome in ["ready", "refused", "full"] {
         starts.with_label_values(&[outcome]);
     }
     let failed_starts = Arc::default();
-    let problem =
-        readiness::watch(Arc::clone(&config), run.path().to_owned(), readings.clone(), Arc::clone(&failed_starts));
+    let problem = readiness::watch(
+        Arc::clone(&config),
+        run.path().to_owned(),
+        readings.clone(),
+        Arc::clone(&failed_starts),
+    );
     Ok(AppState {
         rules,
         problem,
@@ -217,7 +270,12 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
 
 /// Waits until the server is draining and has no simulation left.
 async fn drained(server: &AppState) {
-    server.phase.subscribe().wait_for(|phase| *phase == Phase::Draining).await.ok();
+    server
+        .phase
+        .subscribe()
+        .wait_for(|phase| *phase == Phase::Draining)
+        .await
+        .ok();
     empty(server).await;
 }
 

@@ -23,7 +23,10 @@ impl ClientIdentity {
     pub fn new(user: Option<&str>, label: Option<&str>) -> Self {
         let cut = |text: &str, most| one_line(text).trim().chars().take(most).collect::<String>();
         let cut = |text: Option<&str>, most| text.map(|text| cut(text, most)).filter(|text| !text.is_empty());
-        Self { user: cut(user, MAX_USER_LENGTH), label: cut(label, MAX_LABEL_LENGTH) }
+        Self {
+            user: cut(user, MAX_USER_LENGTH),
+            label: cut(label, MAX_LABEL_LENGTH),
+        }
     }
 }
 

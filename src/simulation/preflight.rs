@@ -33,10 +33,15 @@ pub fn check(config: &SimulationConfig) -> Vec<String> {
 /// The findings on what worlds' programs can access.
 fn isolation(config: &SimulationConfig, launcher: &Launcher) -> Vec<(&'static str, Result<String, String>)> {
     let mut findings = vec![match &launcher.shortcoming {
-        Some(why) => ("isolation", Err(format!("none, worlds' programs may do whatever this user may: {why}"))),
+        Some(why) => (
+            "isolation",
+            Err(format!("none, worlds' programs may do whatever this user may: {why}")),
+        ),
         None => ("isolation", Ok(launcher.level.to_string())),
     }];
-    let words = launcher.network_in_words().filter(|_| launcher.level == IsolationSetting::Sandbox);
+    let words = launcher
+        .network_in_words()
+        .filter(|_| launcher.level == IsolationSetting::Sandbox);
     findings.extend(words.map(|words| ("network", Ok(words))));
     let is_shared = launcher.network() == Some(SandboxNetwork::Shared);
     if is_shared && !config.ports_are_public() {
@@ -47,7 +52,12 @@ fn isolation(config: &SimulationConfig, launcher: &Launcher) -> Vec<(&'static st
                    contains its loopback";
         findings.push(("userHeader", Err(why.to_owned())));
     }
-    findings.extend(launcher.unenforced_limits().into_iter().map(|line| ("limits", Err(line))));
+    findings.extend(
+        launcher
+            .unenforced_limits()
+            .into_iter()
+            .map(|line| ("limits", Err(line))),
+    );
     findings
 }
 
@@ -70,7 +80,9 @@ fn streams(config: &SimulationConfig) -> Result<String, String> {
             "anybody who reaches ports {first} to {last} can control simulations: Webots shares this machine's network, \
              and no packet filter closes them (table webots_streams); see docs/deployment-web-server.md"
         )),
-        None => Ok(format!("relayed; the firewall has to close ports {first} to {last}, on which Webots listens")),
+        None => Ok(format!(
+            "relayed; the firewall has to close ports {first} to {last}, on which Webots listens"
+        )),
     }
 }
 
@@ -79,7 +91,11 @@ fn streams(config: &SimulationConfig) -> Result<String, String> {
 /// # Errors
 /// What is missing without the program.
 fn version(program: &str, effect: &str) -> Result<String, String> {
-    let printed = Command::new(program).arg("--version").output().map(|output| output.stdout).unwrap_or_default();
+    let printed = Command::new(program)
+        .arg("--version")
+        .output()
+        .map(|output| output.stdout)
+        .unwrap_or_default();
     let line = String::from_utf8_lossy(&printed).lines().next().map(str::to_owned);
     line.ok_or_else(|| format!("{program} is not there: {effect}"))
 }

@@ -136,13 +136,19 @@ pub fn nothing_to_reset() -> String {
 /// Why a simulation can't start here; another server may accept its client.
 pub fn elsewhere(why: &str) -> String {
     let why = why.trim_end_matches('.');
-    error(&format!("{why}. Connect again: the session server chooses another simulation server"))
+    error(&format!(
+        "{why}. Connect again: the session server chooses another simulation server"
+    ))
 }
 
 /// Why an administrator has stopped a simulation, without the prefix of an error.
 pub fn stopped_by_teacher(reason: &str) -> String {
     let words = "Your teacher has stopped this simulation";
-    if reason.is_empty() { words.to_owned() } else { format!("{words}: {reason}") }
+    if reason.is_empty() {
+        words.to_owned()
+    } else {
+        format!("{words}: {reason}")
+    }
 }
 
 /// The id of a simulation.
@@ -157,7 +163,10 @@ pub fn queue(ahead: usize) -> [String; 2] {
         1 => "1 client is ahead".to_owned(),
         more => format!("{more} clients are ahead"),
     };
-    [format!("queue: {ahead}"), loading(&format!("waiting for a place, {clients}"))]
+    [
+        format!("queue: {ahead}"),
+        loading(&format!("waiting for a place, {clients}")),
+    ]
 }
 
 /// The time limit of the simulation, in seconds.
@@ -187,7 +196,9 @@ pub fn idle(seconds: Option<u64>) -> String {
 
 /// Why a client can't resume a simulation, with the reason for its end if it is known.
 pub fn ended(why: Option<&str>) -> String {
-    error(&why.map_or("this simulation has ended".to_owned(), |why| format!("this simulation has ended: {why}")))
+    error(&why.map_or("this simulation has ended".to_owned(), |why| {
+        format!("this simulation has ended: {why}")
+    }))
 }
 
 /// Why a connection is closed: another one has used its token.
@@ -217,24 +228,70 @@ mod tests {
     #[test]
     fn requests_are_read() {
         let start = |mode, resumable, name: Option<&str>| {
-            let start = Start { url: "https://x".to_owned(), mode, resumable, name: name.map(str::to_owned) };
-            ClientRequest { start: Some(start), ..ClientRequest::default() }
+            let start = Start {
+                url: "https://x".to_owned(),
+                mode,
+                resumable,
+                name: name.map(str::to_owned),
+            };
+            ClientRequest {
+                start: Some(start),
+                ..ClientRequest::default()
+            }
         };
         let (nothing, file) = (ClientRequest::default(), Some("a/a.py".to_owned()));
         let table = [
             (r#"{"start":{"url":"https://x"}}"#, start(None, None, None)),
-            (r#"{"start":{"url":"https://x","mode":"mjpeg","more":1}}"#, start(Some(Mode::Mjpeg), None, None)),
-            (r#"{"start":{"url":"https://x","mode":"w3d"}}"#, start(Some(Mode::W3d), None, None)),
-            (r#"{"start":{"url":"https://x","resumable":true}}"#, start(None, Some(true), None)),
-            (r#"{"start":{"url":"https://x","name":"Anna"}}"#, start(None, None, Some("Anna"))),
-            (r#"{"resume":"any text"}"#, ClientRequest { resume: Some("any text".to_owned()), ..nothing.clone() }),
-            (r#"{"keep":true}"#, ClientRequest { keep: true, ..nothing.clone() }),
-            (r#"{ "reset controller" : "a/a.py" }"#, ClientRequest { reset_controller: file, ..nothing }),
+            (
+                r#"{"start":{"url":"https://x","mode":"mjpeg","more":1}}"#,
+                start(Some(Mode::Mjpeg), None, None),
+            ),
+            (
+                r#"{"start":{"url":"https://x","mode":"w3d"}}"#,
+                start(Some(Mode::W3d), None, None),
+            ),
+            (
+                r#"{"start":{"url":"https://x","resumable":true}}"#,
+                start(None, Some(true), None),
+            ),
+            (
+                r#"{"start":{"url":"https://x","name":"Anna"}}"#,
+                start(None, None, Some("Anna")),
+            ),
+            (
+                r#"{"resume":"any text"}"#,
+                ClientRequest {
+                    resume: Some("any text".to_owned()),
+                    ..nothing.clone()
+                },
+            ),
+            (
+                r#"{"keep":true}"#,
+                ClientRequest {
+                    keep: true,
+                    ..nothing.clone()
+                },
+            ),
+            (
+                r#"{ "reset controller" : "a/a.py" }"#,
+                ClientRequest {
+                    reset_controller: file,
+                    ..nothing
+                },
+            ),
         ];
         for (text, request) in table {
             assert_eq!(ClientRequest::parse(text), Ok(request), "{text}");
         }
-        for text in ["{}", "[1]", "5", "null", r#"{"init":["host","project"]}"#, r#""start""#, r#"{"keep":false}"#] {
+        for text in [
+            "{}",
+            "[1]",
+            "5",
+            "null",
+            r#"{"init":["host","project"]}"#,
+            r#""start""#,
+            r#"{"keep":false}"#,
+        ] {
             assert_eq!(ClientRequest::parse(text), Ok(ClientRequest::default()), "{text}");
         }
     }
@@ -250,17 +307,32 @@ mod tests {
                 r#"{"start":{"url":"x","mode":"vr"}}"#,
                 "start.mode: unknown variant `vr`, expected one of `x3d`, `w3d`, `mjpeg`",
             ),
-            (r#"{"start":{"url":5}}"#, "start.url: invalid type: integer `5`, expected a string"),
+            (
+                r#"{"start":{"url":5}}"#,
+                "start.url: invalid type: integer `5`, expected a string",
+            ),
             (
                 r#"{"start":{"url":"x","resumable":1}}"#,
                 "start.resumable: invalid type: integer `1`, expected a boolean",
             ),
-            (r#"{"start":{"url":"x","name":{}}}"#, "start.name: invalid type: map, expected a string"),
+            (
+                r#"{"start":{"url":"x","name":{}}}"#,
+                "start.name: invalid type: map, expected a string",
+            ),
             (r#"{"resume":null}"#, "resume: invalid type: null, expected a string"),
-            (r#"{"start":"URL"}"#, "start: invalid type: string \"URL\", expected an object with a url"),
-            (r#"{"resume":5}"#, "resume: invalid type: integer `5`, expected a string"),
+            (
+                r#"{"start":"URL"}"#,
+                "start: invalid type: string \"URL\", expected an object with a url",
+            ),
+            (
+                r#"{"resume":5}"#,
+                "resume: invalid type: integer `5`, expected a string",
+            ),
             (r#"{"keep":5}"#, "keep: invalid type: integer `5`, expected a boolean"),
-            (r#"{"reset controller":5}"#, "reset controller: invalid type: integer `5`, expected a string"),
+            (
+                r#"{"reset controller":5}"#,
+                "reset controller: invalid type: integer `5`, expected a string",
+            ),
         ];
         for (text, words) in table {
             let error = ClientRequest::parse(text).unwrap_err().to_string();

@@ -63,7 +63,11 @@ pub fn watch(
     publish(&sender, first, &failed_starts);
     actix_rt::spawn(async move {
         while !sender.is_closed() {
-            let pause = if sender.borrow().is_some() { PERIOD_WHILE_NOT_READY } else { PERIOD };
+            let pause = if sender.borrow().is_some() {
+                PERIOD_WHILE_NOT_READY
+            } else {
+                PERIOD
+            };
             actix_rt::time::sleep(pause).await;
             let (config, run, readings) = (Arc::clone(&config), run.clone(), Arc::clone(&readings.borrow()));
             let all = move || check(&config, &run, Some(&readings)).err();
@@ -71,7 +75,11 @@ pub fn watch(
             let found = if let Ok(found) = actix_rt::time::timeout(HUNG, &mut checked).await {
                 found
             } else {
-                publish(&sender, Some("This server's disk or Docker does not answer".to_owned()), &failed_starts);
+                publish(
+                    &sender,
+                    Some("This server's disk or Docker does not answer".to_owned()),
+                    &failed_starts,
+                );
                 checked.await
             };
             if let Ok(found) = found {
@@ -117,7 +125,10 @@ fn check(config: &SimulationConfig, run: &Path, readings: Option<&Readings>) -> 
         find_xvfb()?;
     } else if config.webots.is_none() && !config.docker {
         // Webots itself always needs a display. A replacement (`webots`) may not.
-        let found = config.all_displays().iter().try_for_each(|display| display::check(display));
+        let found = config
+            .all_displays()
+            .iter()
+            .try_for_each(|display| display::check(display));
         found.map_err(|error| format!("Webots can't open its window: {error}"))?;
     }
     Ok(())
@@ -127,9 +138,9 @@ fn check(config: &SimulationConfig, run: &Path, readings: Option<&Readings>) -> 
 fn check_gpus(config: &SimulationConfig, readings: &Readings) -> Result<(), String> {
     let none = || readings.gpus.is_empty().then(|| "sees none".to_owned());
     match readings.gpu_problem.clone().or_else(none) {
-        Some(problem) if config.require_gpu => {
-            Err(format!("This simulation server requires its GPUs (requireGpu), but {problem}"))
-        }
+        Some(problem) if config.require_gpu => Err(format!(
+            "This simulation server requires its GPUs (requireGpu), but {problem}"
+        )),
         _ => Ok(()),
     }
 }
@@ -172,10 +183,15 @@ pub fn webots_program(config: &SimulationConfig) -> Result<PathBuf, String> {
                WEBOTS_HOME";
     let in_home = config.webots_home.as_ref().map(|home| home.0.join("webots"));
     let Some(program) = config.webots.as_ref().map(|program| program.0.clone()).or(in_home) else {
-        return Err(format!("This simulation server does not know where Webots is installed. {how}."));
+        return Err(format!(
+            "This simulation server does not know where Webots is installed. {how}."
+        ));
     };
     let program = std::path::absolute(&program).unwrap_or(program);
     which(&program).map_err(|_| {
-        format!("This simulation server has no Webots that it can run at \"{}\". {how}.", program.display())
+        format!(
+            "This simulation server has no Webots that it can run at \"{}\". {how}.",
+            program.display()
+        )
     })
 }

@@ -24,19 +24,26 @@ impl SimulationId {
     /// Returns a new id; unique on this server.
     pub fn next() -> Self {
         let requested = SystemTime::UNIX_EPOCH.elapsed().unwrap_or_default();
-        Self { number: NEXT.fetch_add(1, Ordering::Relaxed), requested }
+        Self {
+            number: NEXT.fetch_add(1, Ordering::Relaxed),
+            requested,
+        }
     }
 
     /// Whether a text has only characters of an id, so that it is safe in a file name.
     pub fn is_like(text: &str) -> bool {
-        text.chars().all(|letter| letter.is_ascii_digit() || letter == 'T' || letter == '-')
+        text.chars()
+            .all(|letter| letter.is_ascii_digit() || letter == 'T' || letter == '-')
     }
 }
 
 impl fmt::Display for SimulationId {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         let requested = timestamp_in_milliseconds(SystemTime::UNIX_EPOCH + self.requested);
-        let requested: String = requested.chars().filter(|letter| letter.is_ascii_digit() || *letter == 'T').collect();
+        let requested: String = requested
+            .chars()
+            .filter(|letter| letter.is_ascii_digit() || *letter == 'T')
+            .collect();
         write!(out, "{requested}-{}", self.number)
     }
 }
@@ -53,7 +60,10 @@ mod tests {
 
     #[test]
     fn an_id_tells_when_and_is_the_name_of_a_file() {
-        let id = SimulationId { number: 17, requested: Duration::from_millis(1_795_385_117_042) };
+        let id = SimulationId {
+            number: 17,
+            requested: Duration::from_millis(1_795_385_117_042),
+        };
         assert_eq!(id.to_string(), "20261122T220517042-17");
         assert!(SimulationId::is_like(&id.to_string()));
         assert!(SimulationId::next() < SimulationId::next());

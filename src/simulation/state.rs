@@ -89,7 +89,11 @@ impl AppState {
 
     /// Returns the load to report: 100 % while the server is draining or can't start simulations.
     pub fn load(&self) -> Load {
-        if self.takes_nobody() { Load::FULL } else { self.readings.borrow().load.unwrap_or(Load::ZERO) }
+        if self.takes_nobody() {
+            Load::FULL
+        } else {
+            self.readings.borrow().load.unwrap_or(Load::ZERO)
+        }
     }
 
     /// Whether the server accepts no client, regardless of its world.
@@ -124,7 +128,9 @@ impl AppState {
             return Err("This simulation server is about to end, and takes no new clients".to_owned());
         }
         self.problem().map_or(Ok(()), Err)?;
-        self.rules.admit(&world, self.load()).map_err(|refusal| refusal.to_string())?;
+        self.rules
+            .admit(&world, self.load())
+            .map_err(|refusal| refusal.to_string())?;
         Ok(world)
     }
 

@@ -15,8 +15,15 @@ async fn a_projects_dockerfile_is_built_once_for_all_clients() {
     );
     let compose = ("docker-compose.yml", "services: {webots: {privileged: true}}\n");
     let server = server(2).start().await;
-    server.forge().commit("lab/arm", "main", &[("Dockerfile", &dockerfile), compose, (".env", "PORT=1\n")]);
-    let (mut one, mut two) = (Client::start(&server, &arm()).await, Client::start(&server, &arm()).await);
+    server.forge().commit(
+        "lab/arm",
+        "main",
+        &[("Dockerfile", &dockerfile), compose, (".env", "PORT=1\n")],
+    );
+    let (mut one, mut two) = (
+        Client::start(&server, &arm()).await,
+        Client::start(&server, &arm()).await,
+    );
     for client in [&mut one, &mut two] {
         client.patiently("webots:").await;
         let heard = client.heard.join("\n");
@@ -27,19 +34,31 @@ async fn a_projects_dockerfile_is_built_once_for_all_clients() {
     let mine = |name: &&str| name.starts_with(&format!("webots-fleet/{}:", owner.0));
     assert_eq!(images.lines().filter(mine).count(), 1, "{images}");
     for container in of_service(&server, "webots") {
-        let built = ask(&["exec", &container, "cat", "/usr/local/webots-project/controllers/c/built"]);
+        let built = ask(&[
+            "exec",
+            &container,
+            "cat",
+            "/usr/local/webots-project/controllers/c/built",
+        ]);
         assert_eq!(built, "print('original')");
         // It may write into its project and into `/tmp`.
         ask(&["exec", &container, "touch", "/usr/local/webots-project/new", "/tmp/new"]);
         // Health checks of the image, which would cost CPU time, are off.
-        assert_eq!(ask(&["inspect", "--format", "{{json .State.Health}}", &container]), "null");
+        assert_eq!(
+            ask(&["inspect", "--format", "{{json .State.Health}}", &container]),
+            "null"
+        );
     }
     // The next simulation need not wait for a build.
     one.leave().await;
     until("one is gone", async || containers(&server).len() == 1).await;
     let mut next = Client::start(&server, &arm()).await;
     next.patiently("webots:").await;
-    assert!(!next.heard.iter().any(|text| text.contains("COPY .")), "{:?}", next.heard);
+    assert!(
+        !next.heard.iter().any(|text| text.contains("COPY .")),
+        "{:?}",
+        next.heard
+    );
 }
 
 #[actix_rt::test]
@@ -52,7 +71,10 @@ async fn an_image_is_built_again_when_the_one_below_it_has_changed() {
         super::daemon::build_from(&format!("FROM {NAME}\nRUN echo {version} >/usr/local/version\n"), BASE);
         let mut client = Client::start(&server, &arm()).await;
         client.patiently("webots:").await;
-        assert_eq!(ask(&["exec", &of_service(&server, "webots")[0], "cat", "/usr/local/version"]), version);
+        assert_eq!(
+            ask(&["exec", &of_service(&server, "webots")[0], "cat", "/usr/local/version"]),
+            version
+        );
         client.leave().await;
         until("its container is gone", async || containers(&server).is_empty()).await;
     }
@@ -62,7 +84,12 @@ async fn an_image_is_built_again_when_the_one_below_it_has_changed() {
 async fn a_makefile_is_run_in_the_default_image() {
     let Some(_docker) = docker().await else { return };
     let (server, _client) = running(server_with(&[("Makefile", "all:\n\tcp controllers/c/c.py made\n")])).await;
-    let made = ask(&["exec", &of_service(&server, "webots")[0], "cat", "/usr/local/webots-project/made"]);
+    let made = ask(&[
+        "exec",
+        &of_service(&server, "webots")[0],
+        "cat",
+        "/usr/local/webots-project/made",
+    ]);
     assert_eq!(made, "print('original')");
 }
 
@@ -74,15 +101,27 @@ async fn what_can_not_be_built_is_told_in_words_and_leaves_nothing() {
             dockerfile("RUN echo 'gcc: not found' && exit 3"),
             "The image of this project can't be built: The command 'sh -c echo 'gcc: not found'",
         ),
-        ("FROM webots-fleet.test/nothing:1\n".to_owned(), "webots-fleet.test/nothing:1"),
-        (format!("FROM {NAME}\nADD http://127.0.0.1/secret /x\n"), "line 2, `ADD http://127.0.0.1/secret x`: ADD may"),
-        (format!("FROM {NAME}\n"), "The image of this project has no folder webots-project"),
+        (
+            "FROM webots-fleet.test/nothing:1\n".to_owned(),
+            "webots-fleet.test/nothing:1",
+        ),
+        (
+            format!("FROM {NAME}\nADD http://127.0.0.1/secret /x\n"),
+            "line 2, `ADD http://127.0.0.1/secret x`: ADD may",
+        ),
+        (
+            format!("FROM {NAME}\n"),
+            "The image of this project has no folder webots-project",
+        ),
         (dockerfile("VOLUME /data"), "line 3, `VOLUME data`: a volume"),
         (
             "FROM webots-fleet.test/volume\nCOPY . /usr/local/webots-project\n".to_owned(),
             "The image that it begins with has `VOLUME",
         ),
-        (dockerfile("RUN rm -r /usr/local/webots-project/worlds"), "has no worlds/a.wbt"),
+        (
+            dockerfile("RUN rm -r /usr/local/webots-project/worlds"),
+            "has no worlds/a.wbt",
+        ),
         ("no Dockerfile at all\n".to_owned(), "can't be built"),
     ];
     super::daemon::build_from(&format!("FROM {NAME}\nVOLUME [\"/a:b\"]\n"), "webots-fleet.test/volume");
@@ -110,38 +149,62 @@ async fn a_client_that_leaves_in_the_middle_of_a_build_ends_it() {
     let server = server_with(&[("Dockerfile", &long)]).start().await;
     let mut client = Client::start(&server, &arm()).await;
     client.patiently("loading: Step 4/6 : RUN sleep 1000").await;
-    let builds = async || ask(&["ps", "--all", "--quiet", "--filter", "label=test.long=yes"]).lines().count();
+    let builds = async || {
+        ask(&["ps", "--all", "--quiet", "--filter", "label=test.long=yes"])
+            .lines()
+            .count()
+    };
     until("it is built", async || builds().await == 1).await;
     client.leave().await;
     until("the build is gone", async || builds().await == 0).await;
     // The slot is free again.
-    server.forge().commit("lab/arm", "main", &[("Dockerfile", &dockerfile(""))]);
+    server
+        .forge()
+        .commit("lab/arm", "main", &[("Dockerfile", &dockerfile(""))]);
     Client::start(&server, &arm()).await.patiently("webots:").await;
 }
 
 #[actix_rt::test]
 async fn a_build_that_takes_too_long_is_ended_and_told() {
     let Some(_docker) = docker().await else { return };
-    is_told(&server_built("RUN sleep 1000").set("timing.build", 3).start().await, &arm(), "timing.build").await;
+    is_told(
+        &server_built("RUN sleep 1000").set("timing.build", 3).start().await,
+        &arm(),
+        "timing.build",
+    )
+    .await;
 }
 
 #[actix_rt::test]
 async fn images_of_ours_that_are_old_are_removed_and_no_others() {
     let Some(_docker) = docker().await else { return };
-    let (folder, owner, used) = images(&[("old", true), ("others", false), ("running", true)], "running", "-6 years");
+    let (folder, owner, used) = images(
+        &[("old", true), ("others", false), ("running", true)],
+        "running",
+        "-6 years",
+    );
     let (_server, client) = running(server(1).folder(folder.path())).await;
     // The end of a simulation triggers a search for unused images.
     client.leave().await;
     until("the old one is gone", async || !is_there("old")).await;
     assert!(is_there("others") && is_there("running"));
-    assert_eq!(ask(&["image", "ls", "--quiet", &format!("webots-fleet/{owner}")]).lines().count(), 1);
+    assert_eq!(
+        ask(&["image", "ls", "--quiet", &format!("webots-fleet/{owner}")])
+            .lines()
+            .count(),
+        1
+    );
     ask(&["rm", &used]);
 }
 
 #[actix_rt::test]
 async fn a_full_disk_is_freed_of_images_that_no_container_uses() {
     let Some(_docker) = docker().await else { return };
-    let (folder, owner, used) = images(&[("unused", true), ("of-others", false), ("used", true)], "used", "-2 hours");
+    let (folder, owner, used) = images(
+        &[("unused", true), ("of-others", false), ("used", true)],
+        "used",
+        "-2 hours",
+    );
     load(folder.path(), "new", &owner, "now");
     // No disk has this much room.
     let full = server(1).folder(folder.path()).set("diskReserve", 100_000_000);
@@ -158,7 +221,12 @@ fn images(tags: &[(&str, bool)], used: &str, created: &str) -> (tempfile::TempDi
     std::fs::create_dir(folder.path().join("cache")).unwrap();
     let owner = ResourceOwner::of(&folder.path().join("cache")).0;
     for (tag, is_own) in tags {
-        load(folder.path(), tag, if *is_own { &owner } else { "000000000000" }, created);
+        load(
+            folder.path(),
+            tag,
+            if *is_own { &owner } else { "000000000000" },
+            created,
+        );
         assert!(is_there(tag));
     }
     let label = "com.docker.compose.project=webots-fleet.test";
@@ -176,7 +244,10 @@ fn is_there(tag: &str) -> bool {
 
 /// Loads an image into the daemon, as if a server had built it at this time, as `date` reads it.
 fn load(folder: &std::path::Path, tag: &str, owner: &str, created: &str) {
-    let time = std::process::Command::new("date").args(["--utc", "+%FT%TZ", "--date", created]).output().unwrap();
+    let time = std::process::Command::new("date")
+        .args(["--utc", "+%FT%TZ", "--date", created])
+        .output()
+        .unwrap();
     let (name, created) = (image(tag), String::from_utf8(time.stdout).unwrap().trim().to_owned());
     let files = folder.join("image");
     std::fs::create_dir_all(&files).unwrap();
@@ -191,7 +262,13 @@ fn load(folder: &std::path::Path, tag: &str, owner: &str, created: &str) {
     let manifest = serde_json::json!([{"Config": "config.json", "RepoTags": [name], "Layers": ["layer.tar"]}]);
     std::fs::write(files.join("manifest.json"), manifest.to_string()).unwrap();
     let (tar, archive) = (folder.join("image.tar"), ["manifest.json", "config.json", "layer.tar"]);
-    let made = std::process::Command::new("tar").arg("-C").arg(&files).arg("-cf").arg(&tar).args(archive).status();
+    let made = std::process::Command::new("tar")
+        .arg("-C")
+        .arg(&files)
+        .arg("-cf")
+        .arg(&tar)
+        .args(archive)
+        .status();
     assert!(made.unwrap().success());
     ask(&["load", "--input", tar.to_str().unwrap()]);
 }

@@ -39,9 +39,14 @@ pub async fn alone() -> Option<RwLockWriteGuard<'static, ()>> {
 
 fn start() -> Option<Daemon> {
     if let Some(why) = missing() {
-        assert!(std::env::var_os("CI").is_none(), "this has to be tested where CI is set, and can't: {why}");
+        assert!(
+            std::env::var_os("CI").is_none(),
+            "this has to be tested where CI is set, and can't: {why}"
+        );
         // Not with `eprintln!`: its output is shown only if a test fails.
-        std::io::stderr().write_all(format!("SKIPPED, for {why}: the tests of containers\n").as_bytes()).unwrap();
+        std::io::stderr()
+            .write_all(format!("SKIPPED, for {why}: the tests of containers\n").as_bytes())
+            .unwrap();
         return None;
     }
     // Socket paths have a short length limit.
@@ -50,7 +55,11 @@ fn start() -> Option<Daemon> {
     let folder = below.join(std::process::id().to_string());
     std::fs::create_dir_all(&folder).unwrap();
     // A daemon that was killed leaves it.
-    Command::new("ip").args(["link", "del", INTERFACE]).stderr(Stdio::null()).status().unwrap();
+    Command::new("ip")
+        .args(["link", "del", INTERFACE])
+        .stderr(Stdio::null())
+        .status()
+        .unwrap();
     let daemon = Daemon { folder };
     daemon.launch();
     image::make(&daemon.folder);
@@ -64,9 +73,19 @@ fn missing() -> Option<String> {
     }
     let paths = std::env::var_os("PATH").unwrap();
     let is_there = |program: &str| std::env::split_paths(&paths).any(|folder| folder.join(program).is_file());
-    let programs = ["dockerd", "docker", "docker-compose", "docker-init", "unshare", "setpriv", "ip"];
-    let absent =
-        programs.into_iter().find(|program| !is_there(program)).map(|program| format!("there is no {program}"));
+    let programs = [
+        "dockerd",
+        "docker",
+        "docker-compose",
+        "docker-init",
+        "unshare",
+        "setpriv",
+        "ip",
+    ];
+    let absent = programs
+        .into_iter()
+        .find(|program| !is_there(program))
+        .map(|program| format!("there is no {program}"));
     absent.or_else(|| image::prepare().err())
 }
 
@@ -98,12 +117,25 @@ impl Daemon {
             let mut command = Command::new("setpriv");
             command.args(["--pdeathsig", "KILL", "unshare", "--pid", "--fork", "--kill-child=KILL"]);
             command.args(["--mount", "--mount-proc"]);
-            command.args(["dockerd", "--host", &socket, "--data-root", &path("data"), "--exec-root", &path("exec")]);
+            command.args([
+                "dockerd",
+                "--host",
+                &socket,
+                "--data-root",
+                &path("data"),
+                "--exec-root",
+                &path("exec"),
+            ]);
             command.args(["--pidfile", &path("pid"), "--bridge=none", "--ip-masq=false"]);
             command.args(["--iptables=false", "--ip6tables=false"]);
             // Room for two networks.
-            command.arg("--default-address-pool=base=10.213.0.0/16,size=17").process_group(0);
-            let outputs = command.stdin(Stdio::null()).stdout(log.try_clone().unwrap()).stderr(log);
+            command
+                .arg("--default-address-pool=base=10.213.0.0/16,size=17")
+                .process_group(0);
+            let outputs = command
+                .stdin(Stdio::null())
+                .stdout(log.try_clone().unwrap())
+                .stderr(log);
             let mut child = outputs.spawn().unwrap();
             std::fs::write(folder.join("keeper"), child.id().to_string()).unwrap();
             child.wait().ok();
@@ -119,7 +151,10 @@ impl Daemon {
 
     fn command(&self, arguments: &[&str]) -> Command {
         let mut command = Command::new("docker");
-        command.args(arguments).env("DOCKER_HOST", self.socket()).env("DOCKER_BUILDKIT", "0");
+        command
+            .args(arguments)
+            .env("DOCKER_HOST", self.socket())
+            .env("DOCKER_BUILDKIT", "0");
         command
     }
 }
@@ -142,7 +177,15 @@ pub fn as_ordinary(server: Builder, folder: &Path) -> Builder {
     open_socket();
     let owner = format!("{ORDINARY}:{ORDINARY}");
     for path in [server.forge().path(), folder] {
-        assert!(Command::new("chown").arg("-R").arg(&owner).arg(path).status().unwrap().success());
+        assert!(
+            Command::new("chown")
+                .arg("-R")
+                .arg(&owner)
+                .arg(path)
+                .status()
+                .unwrap()
+                .success()
+        );
     }
     let user = format!("exec setpriv --reuid {ORDINARY} --regid {ORDINARY} --clear-groups \"$0\" \"$@\"");
     server.folder(folder).before(&user)
@@ -155,7 +198,10 @@ pub fn import(folder: &Path, tar: &str, name: &str) {
 
 /// Builds an image from a folder with a Dockerfile, in the daemon with files in this folder.
 pub fn build(folder: &Path, context: &Path, name: &str) {
-    made(folder, &["build", "--network", "none", "--tag", name, context.to_str().unwrap()]);
+    made(
+        folder,
+        &["build", "--network", "none", "--tag", name, context.to_str().unwrap()],
+    );
 }
 
 /// Builds an image from a Dockerfile that copies nothing.
@@ -166,7 +212,12 @@ pub fn build_from(dockerfile: &str, name: &str) {
 }
 
 fn made(folder: &Path, arguments: &[&str]) {
-    let made = Daemon { folder: folder.to_owned() }.command(arguments).output().unwrap();
+    let made = Daemon {
+        folder: folder.to_owned(),
+    }
+    .command(arguments)
+    .output()
+    .unwrap();
     assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
 }
 
@@ -178,7 +229,11 @@ pub fn host() -> String {
 /// The output of `docker` with these arguments.
 pub fn ask(arguments: &[&str]) -> String {
     let output = daemon().command(arguments).output().unwrap();
-    assert!(output.status.success(), "docker {arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
+    assert!(
+        output.status.success(),
+        "docker {arguments:?}: {}",
+        String::from_utf8_lossy(&output.stderr)
+    );
     String::from_utf8_lossy(&output.stdout).trim().to_owned()
 }
 
@@ -222,7 +277,10 @@ pub fn server_built(lines: &str) -> Builder {
 /// The same with this script as Webots.
 pub fn server_running(webots: &str) -> Builder {
     let install = "RUN install /usr/local/webots-project/fake /usr/local/webots/webots";
-    server_with(&[("Dockerfile", &dockerfile(install)), ("fake", &format!("#!/bin/bash\n{webots}\n"))])
+    server_with(&[
+        ("Dockerfile", &dockerfile(install)),
+        ("fake", &format!("#!/bin/bash\n{webots}\n")),
+    ])
 }
 
 /// A Dockerfile that copies a project and then has these lines.
@@ -233,9 +291,16 @@ pub fn dockerfile(lines: &str) -> String {
 /// The output of `--check` for a server's configuration.
 pub fn check(server: &Server) -> String {
     let mut command = Command::new(env!("CARGO_BIN_EXE_simulation-server"));
-    command.arg("--check").arg(server.folder.join("config.json")).env("DOCKER_HOST", host());
+    command
+        .arg("--check")
+        .arg(server.folder.join("config.json"))
+        .env("DOCKER_HOST", host());
     let output = command.output().unwrap();
-    format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
+    format!(
+        "{}{}",
+        String::from_utf8_lossy(&output.stdout),
+        String::from_utf8_lossy(&output.stderr)
+    )
 }
 
 /// The containers of a server, including those that have ended.
@@ -245,8 +310,16 @@ pub fn containers(server: &Server) -> Vec<String> {
 
 /// The names and projects of containers whose name or project begins like this.
 pub fn containers_of(prefix: &str) -> Vec<String> {
-    let all = ask(&["ps", "--all", "--format", "{{.Names}} {{.Label \"com.docker.compose.project\"}}"]);
-    all.lines().filter(|line| line.split(' ').any(|name| name.starts_with(prefix))).map(str::to_owned).collect()
+    let all = ask(&[
+        "ps",
+        "--all",
+        "--format",
+        "{{.Names}} {{.Label \"com.docker.compose.project\"}}",
+    ]);
+    all.lines()
+        .filter(|line| line.split(' ').any(|name| name.starts_with(prefix)))
+        .map(str::to_owned)
+        .collect()
 }
 
 /// The prefix of the names of a server's projects.
@@ -263,7 +336,10 @@ pub fn of_service(server: &Server, service: &str) -> Vec<String> {
     let format = "{{.Label \"com.docker.compose.project\"}} {{.ID}}";
     loop {
         let all = ask(&["ps", "--filter", &filter, "--format", format]);
-        let found = all.lines().filter_map(|line| line.split_once(' ')).filter(|(name, _)| name.starts_with(&prefix));
+        let found = all
+            .lines()
+            .filter_map(|line| line.split_once(' '))
+            .filter(|(name, _)| name.starts_with(&prefix));
         let found: Vec<String> = found.map(|(_, id)| id.to_owned()).collect();
         assert!(Instant::now() < deadline, "there is no container of {service}");
         if !found.is_empty() {

@@ -13,10 +13,17 @@ fn doing(script: &str) -> Builder {
 async fn a_program_sees_its_image_and_its_project_only() {
     let Some(_docker) = docker().await else { return };
     // compose ignores the server's own environment variables.
-    let builder = doing("").env("SECRET", "xyz").env("PORT", "9").env("PROJECT", "/etc").env("BIND", "nobody");
+    let builder = doing("")
+        .env("SECRET", "xyz")
+        .env("PORT", "9")
+        .env("PROJECT", "/etc")
+        .env("BIND", "nobody");
     let (server, _client) = running(builder).await;
     let webots = &of_service(&server, "webots")[0];
-    assert_eq!(ask(&["exec", webots, "cat", "/usr/local/webots-project/controllers/c/c.py"]), "print('original')");
+    assert_eq!(
+        ask(&["exec", webots, "cat", "/usr/local/webots-project/controllers/c/c.py"]),
+        "print('original')"
+    );
     let inside = |command: &str| ask(&["exec", webots, "bash", "-c", &format!("({command}) 2>&1 || true")]);
     assert!(!inside("env").contains("SECRET"));
     // Processes, folders and devices of the machine.
@@ -29,7 +36,10 @@ async fn a_program_sees_its_image_and_its_project_only() {
         ("mkdir /data", "Read-only file system"),
         ("echo 1 >/proc/sys/vm/drop_caches", "Read-only file system"),
         ("ls /var/run/docker.sock", "No such file"),
-        ("cat /proc/self/status | while read a b; do [ \"$a\" = CapEff: ] && echo $b; done", "0000000000000000"),
+        (
+            "cat /proc/self/status | while read a b; do [ \"$a\" = CapEff: ] && echo $b; done",
+            "0000000000000000",
+        ),
     ] {
         let answer = inside(command);
         assert!(answer.contains(words), "{command}: {answer}");
@@ -76,7 +86,11 @@ async fn links_in_the_project_lead_no_other_container_astray() {
     );
     let yml = "dockerCompose: \"competition:webots-project/controllers/c\"\n";
     let controller = format!("FROM {NAME}\nCOPY . /usr/local/webots-project/controllers\nCMD [\"sleep\", \"1000\"]\n");
-    server.forge().commit("lab/arm", "main", &[("webots.yml", yml), ("controllers/Dockerfile", &controller)]);
+    server.forge().commit(
+        "lab/arm",
+        "main",
+        &[("webots.yml", yml), ("controllers/Dockerfile", &controller)],
+    );
     let (server, _client) = running(server).await;
     let controller = of_service(&server, "controller")[0].clone();
     let starts = || ask(&["inspect", "--format", "{{.State.StartedAt}}", &controller]);

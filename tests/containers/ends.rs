@@ -18,9 +18,10 @@ async fn takes_clients(server: &Server) -> bool {
 #[actix_rt::test]
 async fn everything_is_gone_soon_after_the_server_was_killed() {
     let Some(_docker) = docker().await else { return };
-    for (signal, words, code) in
-        [(Signal::SIGKILL, "webots:", None), (Signal::SIGTERM, "loading: Creating network", Some(0))]
-    {
+    for (signal, words, code) in [
+        (Signal::SIGKILL, "webots:", None),
+        (Signal::SIGTERM, "loading: Creating network", Some(0)),
+    ] {
         let (mut server, _client) = running(server(2)).await;
         let mut other = Client::start(&server, &arm()).await;
         other.patiently(words).await;
@@ -40,16 +41,38 @@ async fn only_leftovers_of_this_server_are_removed() {
     let owner = webots_fleet::simulation::container::ResourceOwner::of(&folder.path().join("cache"));
     let make = |name: &str, project: &str| {
         let label = format!("com.docker.compose.project={project}");
-        ask(&["create", "--name", name, "--label", &label, "--network", "none", super::image::NAME, "sleep", "1000"])
+        ask(&[
+            "create",
+            "--name",
+            name,
+            "--label",
+            &label,
+            "--network",
+            "none",
+            super::image::NAME,
+            "sleep",
+            "1000",
+        ])
     };
     let (mine, other) = (owner.project(2001), "webots-fleet-000000000000-2001-0".to_owned());
     // An image's label may have any text, and its containers inherit it.
-    let containers =
-        [(format!("{mine}-webots"), &mine), (format!("{other}-webots"), &other), ("forged".to_owned(), &mine)]
-            .map(|(name, project)| make(&name, project));
+    let containers = [
+        (format!("{mine}-webots"), &mine),
+        (format!("{other}-webots"), &other),
+        ("forged".to_owned(), &mine),
+    ]
+    .map(|(name, project)| make(&name, project));
     let _server = server(1).folder(folder.path()).start().await;
     let is_there = |container: &str| {
-        !ask(&["ps", "--all", "--quiet", "--no-trunc", "--filter", &format!("id={container}")]).is_empty()
+        !ask(&[
+            "ps",
+            "--all",
+            "--quiet",
+            "--no-trunc",
+            "--filter",
+            &format!("id={container}"),
+        ])
+        .is_empty()
     };
     until("what it left is gone", async || !is_there(&containers[0])).await;
     assert!(is_there(&containers[1]) && is_there(&containers[2]));
@@ -84,7 +107,10 @@ async fn a_stopped_docker_is_reported_until_it_is_back() {
     // The server has not checked Docker yet when the first client comes.
     for _ in 0..2 {
         let (told, code) = refused(&server, &arm()).await;
-        assert!(told.contains("Docker does not answer on this simulation server"), "{told}");
+        assert!(
+            told.contains("Docker does not answer on this simulation server"),
+            "{told}"
+        );
         assert_eq!(code, Some(1013));
     }
     until("it says so", async || !takes_clients(&server).await).await;
@@ -93,7 +119,10 @@ async fn a_stopped_docker_is_reported_until_it_is_back() {
     daemon::start_again();
     until("it takes clients again", async || takes_clients(&server).await).await;
     Client::start(&server, &arm()).await.patiently("webots:").await;
-    until("what the daemon has kept is gone", async || containers(&server).len() <= 1).await;
+    until("what the daemon has kept is gone", async || {
+        containers(&server).len() <= 1
+    })
+    .await;
 }
 
 #[actix_rt::test]

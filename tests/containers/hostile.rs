@@ -16,7 +16,11 @@ async fn a_link_in_an_image_leads_no_build_to_files_of_the_machine() {
     let controller = format!("FROM {NAME}\nCOPY . /stolen\nRUN cat /stolen/secret && false\n");
     let yml = "dockerCompose: \"competition:webots-project/controllers/c\"\n";
     let server = server_built(&link);
-    server.forge().commit("lab/arm", "main", &[("webots.yml", yml), ("controllers/Dockerfile", &controller)]);
+    server.forge().commit(
+        "lab/arm",
+        "main",
+        &[("webots.yml", yml), ("controllers/Dockerfile", &controller)],
+    );
     is_told(&server.start().await, &arm(), "The project has no folder controllers").await;
 }
 
@@ -38,14 +42,21 @@ async fn folders_and_devices_of_an_image_are_its_projects_fault() {
     let device = ("mknod /usr/local/webots-project/zero c 1 5".to_owned(), "not permitted");
     let all = [replaced("/tmp"), replaced("/run"), replaced("/var/tmp"), device];
     for (branch, (line, _)) in ["a", "b", "c", "d"].into_iter().zip(&all) {
-        server.forge().commit("lab/arm", branch, &[("Dockerfile", &dockerfile(&format!("RUN {line}")))]);
+        server.forge().commit(
+            "lab/arm",
+            branch,
+            &[("Dockerfile", &dockerfile(&format!("RUN {line}")))],
+        );
     }
     let server = as_ordinary(server, folder.path()).start().await;
     for (branch, (line, words)) in ["a", "b", "c", "d"].into_iter().zip(all) {
         let (told, code) = refused(&server, &arm_at(branch)).await;
         assert_eq!(code, Some(1000), "{line}: {told}");
         assert_eq!(server.status().await["failedStarts"], 0, "{line}: {told}");
-        assert!(told.contains(words) && !told.contains(server.folder.to_str().unwrap()), "{line}: {told}");
+        assert!(
+            told.contains(words) && !told.contains(server.folder.to_str().unwrap()),
+            "{line}: {told}"
+        );
     }
 }
 
@@ -60,6 +71,9 @@ async fn a_device_made_by_a_dockerfile_opens_nothing() {
     for device in ["mem", "disk"] {
         let read = format!("head -c 1 /usr/local/webots-project/{device} 2>&1 || true");
         let told = ask(&["exec", webots, "sh", "-c", &read]);
-        assert!(told.contains("not permitted") || told.contains("denied"), "{device}: {told}");
+        assert!(
+            told.contains("not permitted") || told.contains("denied"),
+            "{device}: {told}"
+        );
     }
 }

@@ -45,8 +45,15 @@ pub fn make(folder: &Path) {
     let world = crate::support::git::WORLD;
     for (name, parts, program) in [(NAME, "webots", "webots-bin"), (EDITOR, "editor", "demo-simulator")] {
         let context = folder.join(parts);
-        let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/containers/image").join(parts);
-        let copied = Command::new("cp").arg("-R").arg(&source).arg(&context).status().unwrap();
+        let source = Path::new(env!("CARGO_MANIFEST_DIR"))
+            .join("tests/containers/image")
+            .join(parts);
+        let copied = Command::new("cp")
+            .arg("-R")
+            .arg(&source)
+            .arg(&context)
+            .status()
+            .unwrap();
         assert!(copied.success());
         std::fs::copy(simulator, context.join(program)).unwrap();
         std::fs::write(context.join("editor.wbt"), world).unwrap();

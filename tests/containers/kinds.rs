@@ -11,15 +11,36 @@ async fn a_project_has_an_editor_on_the_port_of_webots_plus_500() {
     let Some(_docker) = docker().await else { return };
     let yml = "publish: true\ntype: demo\ndockerCompose:theia:webots-project/controllers/c/\n";
     let (server, client) = running(server_with(&[("webots.yml", yml)])).await;
-    let told: Vec<_> = client.heard.iter().filter(|text| !text.starts_with("loading:")).skip(1).take(3).collect();
+    let told: Vec<_> = client
+        .heard
+        .iter()
+        .filter(|text| !text.starts_with("loading:"))
+        .skip(1)
+        .take(3)
+        .collect();
     assert_eq!(told, ["ide: enable", "type:demo\n", "shutdownTimeout: 7200"]);
     let editor = ("127.0.0.1", server.port + 501);
-    until("the editor listens", async || tokio::net::TcpStream::connect(editor).await.is_ok()).await;
+    until("the editor listens", async || {
+        tokio::net::TcpStream::connect(editor).await.is_ok()
+    })
+    .await;
     let theia = &of_service(&server, "theia")[0];
-    assert_eq!(ask(&["exec", theia, "cat", "/home/project/webots-project/c.py"]), "print('original')");
-    ask(&["exec", theia, "sh", "-c", "echo edited >/home/project/webots-project/c.py"]);
+    assert_eq!(
+        ask(&["exec", theia, "cat", "/home/project/webots-project/c.py"]),
+        "print('original')"
+    );
+    ask(&[
+        "exec",
+        theia,
+        "sh",
+        "-c",
+        "echo edited >/home/project/webots-project/c.py",
+    ]);
     let webots = &of_service(&server, "webots")[0];
-    assert_eq!(ask(&["exec", webots, "cat", "/usr/local/webots-project/controllers/c/c.py"]), "edited");
+    assert_eq!(
+        ask(&["exec", webots, "cat", "/usr/local/webots-project/controllers/c/c.py"]),
+        "edited"
+    );
     client.leave().await;
     until("both are gone", async || containers(&server).is_empty()).await;
 }
@@ -33,10 +54,17 @@ async fn an_editor_shows_no_folder_outside_of_the_project() {
     let folder = work.join("controllers/x\nPROJECT=/etc");
     std::fs::create_dir_all(&folder).unwrap();
     std::fs::write(folder.join("file"), "").unwrap();
-    for (target, words) in [("/etc", "The project has no folder controllers/edit"), ("x\nPROJECT=/etc", "line break")] {
+    for (target, words) in [
+        ("/etc", "The project has no folder controllers/edit"),
+        ("x\nPROJECT=/etc", "line break"),
+    ] {
         std::fs::remove_file(work.join("controllers/edit")).ok();
         std::os::unix::fs::symlink(target, work.join("controllers/edit")).unwrap();
-        std::fs::write(work.join("webots.yml"), "dockerCompose: \"theia:webots-project/controllers/edit\"\n").unwrap();
+        std::fs::write(
+            work.join("webots.yml"),
+            "dockerCompose: \"theia:webots-project/controllers/edit\"\n",
+        )
+        .unwrap();
         server.forge().commit_work_tree("lab/arm", "main");
         is_told(&server, &arm(), words).await;
     }
@@ -44,7 +72,10 @@ async fn an_editor_shows_no_folder_outside_of_the_project() {
 
 /// Like the Dockerfiles of real competitions: a default port that their server replaces, and a shell entry point.
 const COMPETITION: [(&str, &str); 4] = [
-    ("Dockerfile", "FROM {NAME}\nRUN mkdir -p /usr/local/webots-project\nCOPY . /usr/local/webots-project\n"),
+    (
+        "Dockerfile",
+        "FROM {NAME}\nRUN mkdir -p /usr/local/webots-project\nCOPY . /usr/local/webots-project\n",
+    ),
     (
         "controllers/Dockerfile",
         "FROM {NAME}\nCOPY . /usr/local/webots-project/controllers\nENV PORT=1234\nARG WEBOTS_CONTROLLER_URL\nENV \
@@ -63,19 +94,31 @@ async fn a_participant_connects_and_runs_edited_code_after_a_reset() {
     let Some(_docker) = docker().await else { return };
     let files = COMPETITION.map(|(path, text)| (path, text.replace("{NAME}", NAME)));
     let world = format!("{WORLD}Robot {{ name \"participant\" controller \"participant\" }}\n");
-    let files = files.iter().map(|(path, text)| (*path, text.as_str())).chain([("worlds/a.wbt", world.as_str())]);
+    let files = files
+        .iter()
+        .map(|(path, text)| (*path, text.as_str()))
+        .chain([("worlds/a.wbt", world.as_str())]);
     let (server, client) = running(server_with(&files.collect::<Vec<_>>())).await;
     let port = server.port + 1;
     let webots = of_service(&server, "webots")[0].clone();
     let connected = || -> Vec<serde_json::Value> {
         let folder = format!("/tmp/webots/webots/{port}/ipc/participant");
-        let told = ask(&["exec", &webots, "sh", "-c", &format!("cat {folder}/connected 2>/dev/null || true")]);
+        let told = ask(&[
+            "exec",
+            &webots,
+            "sh",
+            "-c",
+            &format!("cat {folder}/connected 2>/dev/null || true"),
+        ]);
         told.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
     };
     until("the participant is connected", async || connected().len() == 1).await;
     let seen = connected().remove(0);
     for (key, value) in [
-        ("arguments", json!(["--robot-name=participant", format!("--port={port}"), "participant.py"])),
+        (
+            "arguments",
+            json!(["--robot-name=participant", format!("--port={port}"), "participant.py"]),
+        ),
         ("PORT", port.to_string().into()),
         ("WEBOTS_STDOUT_REDIRECT", "1".into()),
         ("WEBOTS_STDERR_REDIRECT", "1".into()),
@@ -91,7 +134,13 @@ async fn a_participant_connects_and_runs_edited_code_after_a_reset() {
     }
     // The editor changes the program, and a viewer resets the simulation.
     let theia = &of_service(&server, "theia")[0];
-    ask(&["exec", theia, "sh", "-c", "echo 'print(2)' >/home/project/webots-project/participant.py"]);
+    ask(&[
+        "exec",
+        theia,
+        "sh",
+        "-c",
+        "echo 'print(2)' >/home/project/webots-project/participant.py",
+    ]);
     let mut viewer = Client::connect(&format!("ws://127.0.0.1:{port}/")).await;
     viewer.send("x3d").await;
     viewer.until("model:").await;
@@ -112,7 +161,10 @@ async fn what_an_image_keeps_at_home_is_found_and_can_be_changed() {
     let webots = of_service(&server, "webots")[0].clone();
     let inside = |command: &str| ask(&["exec", &webots, "sh", "-c", command]);
     assert_eq!(inside("id -u"), ORDINARY.to_string());
-    assert_eq!(inside("cat ~/.cache/Cyberbotics/Webots/assets/*"), "an asset of the image");
+    assert_eq!(
+        inside("cat ~/.cache/Cyberbotics/Webots/assets/*"),
+        "an asset of the image"
+    );
     assert!(inside("cat ~/.config/Cyberbotics/Webots-R2025a.conf").contains("cacheSize=1024"));
     inside("echo x >~/.cache/Cyberbotics/Webots/assets/new && echo y >>~/.config/Cyberbotics/Webots-R2025a.conf");
     // The image itself stays unchanged.
@@ -132,5 +184,8 @@ async fn what_an_administrator_relaxes_counts_and_the_rest_stays() {
     let webots = &of_service(&server, "webots")[0];
     let format =
         "{{.HostConfig.Privileged}} {{.HostConfig.ReadonlyRootfs}} {{.HostConfig.CapAdd}} {{.HostConfig.SecurityOpt}}";
-    assert_eq!(ask(&["inspect", "--format", format, webots]), "false true [SYS_PTRACE] [no-new-privileges:false]");
+    assert_eq!(
+        ask(&["inspect", "--format", format, webots]),
+        "false true [SYS_PTRACE] [no-new-privileges:false]"
+    );
 }

@@ -14,17 +14,36 @@ const GONE: Duration = Duration::from_secs(10);
 async fn a_world_runs_in_a_container_and_leaves_nothing() {
     let Some(_docker) = docker().await else { return };
     let (server, client) = running(server(2)).await;
-    let steps = ["loading: Creating network", "shutdownTimeout: 7200", "webots:ws://localhost:"];
-    let order: Vec<_> = steps.iter().map(|step| client.heard.iter().position(|text| text.starts_with(step))).collect();
-    assert!(order.iter().all(Option::is_some) && order.is_sorted(), "{:?}", client.heard);
-    let mut viewer = Client::connect(&format!("ws://127.0.0.1:{}/", server.port + 1)).await.with_running_scene().await;
+    let steps = [
+        "loading: Creating network",
+        "shutdownTimeout: 7200",
+        "webots:ws://localhost:",
+    ];
+    let order: Vec<_> = steps
+        .iter()
+        .map(|step| client.heard.iter().position(|text| text.starts_with(step)))
+        .collect();
+    assert!(
+        order.iter().all(Option::is_some) && order.is_sorted(),
+        "{:?}",
+        client.heard
+    );
+    let mut viewer = Client::connect(&format!("ws://127.0.0.1:{}/", server.port + 1))
+        .await
+        .with_running_scene()
+        .await;
     assert_eq!(server.status().await["isolation"], "container");
     assert_eq!(containers(&server).len(), 1);
     until("the monitor shows its processor time and memory", async || {
         let page = server.monitor().await;
         let value = |label: &str| {
             let (_, cell) = page.split_once(&format!("data-label=\"{label}\""))?;
-            cell.split_once("data-value=\"")?.1.split_once('"')?.0.parse::<f64>().ok()
+            cell.split_once("data-value=\"")?
+                .1
+                .split_once('"')?
+                .0
+                .parse::<f64>()
+                .ok()
         };
         value("CPU").is_some_and(|percent| percent > 0.0) && value("Memory").is_some_and(|bytes| bytes > 1e6)
     })
@@ -37,12 +56,18 @@ async fn a_world_runs_in_a_container_and_leaves_nothing() {
     let begin = Instant::now();
     until("its container is gone", async || containers(&server).is_empty()).await;
     assert!(begin.elapsed() < GONE, "{:?}", begin.elapsed());
-    until("its folder is gone", async || instance_folders_in(&server.cache()).is_empty()).await;
+    until("its folder is gone", async || {
+        instance_folders_in(&server.cache()).is_empty()
+    })
+    .await;
     let read = || std::fs::read_to_string(server.folder.join("log/simulation/simulations.csv")).unwrap_or_default();
     until("its end is in simulations.csv", async || read().lines().count() == 2).await;
     // The port is free again, and the next simulation gets it.
     let mut next = Client::start(&server, &arm()).await;
-    assert_eq!(next.patiently("webots:").await, format!("webots:ws://localhost:{}", server.port + 1));
+    assert_eq!(
+        next.patiently("webots:").await,
+        format!("webots:ws://localhost:{}", server.port + 1)
+    );
 }
 
 #[actix_rt::test]
@@ -74,7 +99,9 @@ async fn who_comes_back_finds_its_container_as_it_runs() {
 async fn a_container_has_no_more_than_it_needs() {
     let Some(_docker) = docker().await else { return };
     let limits = json!({ "memory": 300, "cores": 1, "processes": 77, "openFiles": 2048 });
-    let server = server(1).set("limits", limits).set("timing", json!({ "heartbeat": 600, "launch": 90 }));
+    let server = server(1)
+        .set("limits", limits)
+        .set("timing", json!({ "heartbeat": 600, "launch": 90 }));
     let (server, _client) = running(server).await;
     let about: Value = serde_json::from_str(&ask(&["inspect", &of_service(&server, "webots")[0]])).unwrap();
     let (host, config) = (&about[0]["HostConfig"], &about[0]["Config"]);
@@ -94,15 +121,26 @@ async fn a_container_has_no_more_than_it_needs() {
     assert_eq!(host["RestartPolicy"]["Name"], "no");
     assert_eq!(about[0]["Mounts"].as_array().unwrap().len(), 1);
     assert_eq!(about[0]["Mounts"][0]["Destination"], "/usr/local/webots-project");
-    assert_eq!(config["User"], format!("{}:{}", nix::unistd::getuid(), nix::unistd::getgid()));
+    assert_eq!(
+        config["User"],
+        format!("{}:{}", nix::unistd::getuid(), nix::unistd::getgid())
+    );
     let environment = config["Env"].to_string();
-    assert!(environment.contains("HOME=/tmp") && !environment.contains("DOCKER_HOST"), "{environment}");
+    assert!(
+        environment.contains("HOME=/tmp") && !environment.contains("DOCKER_HOST"),
+        "{environment}"
+    );
 }
 
 #[actix_rt::test]
 async fn docker_true_runs_every_world_in_a_container() {
     let Some(_docker) = docker().await else { return };
-    let server = server(3).set("isolation", "auto").set("docker", true).set("shareIdleTime", 100).start().await;
+    let server = server(3)
+        .set("isolation", "auto")
+        .set("docker", true)
+        .set("shareIdleTime", 100)
+        .start()
+        .await;
     server.forge().commit("other/world", "main", &[("worlds/a.wbt", WORLD)]);
     for world in [arm(), world("other/world", "main", "worlds/a.wbt")] {
         let mut client = Client::start(&server, &world).await;
@@ -112,7 +150,12 @@ async fn docker_true_runs_every_world_in_a_container() {
         until("it is gone", async || containers(&server).is_empty()).await;
     }
     let server = daemon::server(2).set("shareIdleTime", 0).start().await;
-    is_told(&server, &world("other/world", "main", "worlds/a.wbt"), "not configured to share idle time").await;
+    is_told(
+        &server,
+        &world("other/world", "main", "worlds/a.wbt"),
+        "not configured to share idle time",
+    )
+    .await;
 }
 
 #[actix_rt::test]

@@ -31,7 +31,10 @@ fn a_participants_program_may_end_before_its_simulation() {
     std::fs::create_dir_all(path("controllers/participant")).unwrap();
     std::fs::write(path("library.c"), LIBRARY).unwrap();
     let library = path("home/lib/controller/libController.so");
-    let made = Command::new("cc").args(["-shared", "-fPIC", "-o"]).args([&library, &path("library.c")]).status();
+    let made = Command::new("cc")
+        .args(["-shared", "-fPIC", "-o"])
+        .args([&library, &path("library.c")])
+        .status();
     assert!(made.unwrap().success());
     let launcher = path("controllers/remote_controller_launcher.py");
     let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/simulation/docker/remote_controller_launcher.py");
@@ -42,7 +45,11 @@ fn a_participants_program_may_end_before_its_simulation() {
     for (program, told, untold) in [
         (Some(""), "", "Traceback"),
         (Some(crash), "line 4, in deep", "remote_controller_launcher"),
-        (Some("raise SystemExit('enough')"), "The controller has ended: enough", "Traceback"),
+        (
+            Some("raise SystemExit('enough')"),
+            "The controller has ended: enough",
+            "Traceback",
+        ),
         (Some("raise KeyError('x' * 100_000)"), "xxxx'", "Traceback"),
         (Some("if True print()"), "SyntaxError", "remote_controller_launcher"),
         (None, "There is no participant/participant.py", "Traceback"),
@@ -54,12 +61,25 @@ fn a_participants_program_may_end_before_its_simulation() {
             None => std::fs::remove_file(&file).unwrap(),
         }
         let mut python = Command::new("python3");
-        let output =
-            python.arg("-u").arg(&launcher).env("WEBOTS_HOME", path("home")).env("CALLS", &calls).output().unwrap();
+        let output = python
+            .arg("-u")
+            .arg(&launcher)
+            .env("WEBOTS_HOME", path("home"))
+            .env("CALLS", &calls)
+            .output()
+            .unwrap();
         let said = String::from_utf8_lossy(&output.stderr);
-        let ran = if program.is_some_and(|program| !program.starts_with("if True")) { "beside\n" } else { "" };
+        let ran = if program.is_some_and(|program| !program.starts_with("if True")) {
+            "beside\n"
+        } else {
+            ""
+        };
         let stays = "step 11\nstep 11\nstep 11\n";
-        assert_eq!(std::fs::read_to_string(calls).unwrap(), format!("init 11\n{ran}{stays}"), "{program:?}: {said}");
+        assert_eq!(
+            std::fs::read_to_string(calls).unwrap(),
+            format!("init 11\n{ran}{stays}"),
+            "{program:?}: {said}"
+        );
         assert!(said.contains(told) && !said.contains(untold), "{program:?}: {said}");
         assert!(output.status.success() && said.len() < 10_000, "{program:?}: {said}");
     }

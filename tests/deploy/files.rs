@@ -20,11 +20,18 @@ fn the_units_expose_little() {
         ("user/webots-simulation@.service", 8.0),
     ] {
         let mut command = Command::new("systemd-analyze");
-        let output =
-            command.args(["security", "--offline=true", "--no-pager"]).arg(deploy("systemd").join(unit)).output();
+        let output = command
+            .args(["security", "--offline=true", "--no-pager"])
+            .arg(deploy("systemd").join(unit))
+            .output();
         let said = String::from_utf8(output.unwrap().stdout).unwrap();
-        let level = said.split("Overall exposure level").nth(1).and_then(|rest| rest.split(": ").nth(1));
-        let level = level.and_then(|rest| rest.split(' ').next()).unwrap_or_else(|| panic!("{unit}: {said}"));
+        let level = said
+            .split("Overall exposure level")
+            .nth(1)
+            .and_then(|rest| rest.split(": ").nth(1));
+        let level = level
+            .and_then(|rest| rest.split(' ').next())
+            .unwrap_or_else(|| panic!("{unit}: {said}"));
         assert!(level.parse::<f64>().unwrap() <= most, "{unit}: {said}");
     }
 }
@@ -36,15 +43,28 @@ fn the_autostart_entries_run_the_programs_of_the_units() {
         let file = deploy(&format!("autostart/webots-{kind}.desktop"));
         let text = std::fs::read_to_string(&file).unwrap();
         let command = text.lines().find_map(|line| line.strip_prefix("Exec=")).unwrap();
-        let command = command.strip_prefix("sh -c \"").and_then(|rest| rest.strip_suffix('"')).unwrap();
-        assert!(!command.contains(['\\', '$', '`', '"', '%']), "{command} would need quotes");
+        let command = command
+            .strip_prefix("sh -c \"")
+            .and_then(|rest| rest.strip_suffix('"'))
+            .unwrap();
+        assert!(
+            !command.contains(['\\', '$', '`', '"', '%']),
+            "{command} would need quotes"
+        );
         // Runs its command with stand-ins for the servers.
         let home = tempfile::tempdir().unwrap();
         std::os::unix::fs::symlink("/bin/echo", home.path().join(format!("{kind}-server"))).unwrap();
         let search = format!("{}:/usr/bin:/bin", home.path().display());
-        let output = Command::new("sh").args(["-c", command]).env("HOME", home.path()).env("PATH", search).output();
+        let output = Command::new("sh")
+            .args(["-c", command])
+            .env("HOME", home.path())
+            .env("PATH", search)
+            .output();
         let said = String::from_utf8(output.unwrap().stdout).unwrap();
-        assert_eq!(said.trim(), format!("{}/.config/webots-fleet/{kind}/main.json", home.path().display()));
+        assert_eq!(
+            said.trim(),
+            format!("{}/.config/webots-fleet/{kind}/main.json", home.path().display())
+        );
         let validated = Command::new("desktop-file-validate").arg(&file).output().unwrap();
         assert!(validated.status.success(), "{validated:?}");
     }

@@ -27,7 +27,14 @@ const ASK: &str = r#"
 fn without_a_word_on_it_a_server_listens_on_both_families() {
     let own_network = ["unshare --net", "unshare --net --map-root-user"]
         .into_iter()
-        .find(|command| Command::new("sh").args(["-c", &format!("{command} true")]).output().unwrap().status.success());
+        .find(|command| {
+            Command::new("sh")
+                .args(["-c", &format!("{command} true")])
+                .output()
+                .unwrap()
+                .status
+                .success()
+        });
     let Some(own_network) = own_network else {
         assert!(std::env::var_os("CI").is_none(), "unshare --net is not allowed here");
         return crate::support::skip("unshare --net is not allowed here");
@@ -37,8 +44,14 @@ fn without_a_word_on_it_a_server_listens_on_both_families() {
     let config = json!({"server": "localhost", "port": 2000, "logDir": inside("log"), "simulationServers": []});
     std::fs::write(inside("config.json"), config.to_string()).unwrap();
     let mut command = Command::new("timeout");
-    command.args(["60"]).args(own_network.split(' ')).args(["bash", "-c", ASK, "ask"]);
-    let output = command.args([env!("CARGO_BIN_EXE_session-server"), &inside("config.json"), "2000"]).output().unwrap();
+    command
+        .args(["60"])
+        .args(own_network.split(' '))
+        .args(["bash", "-c", ASK, "ask"]);
+    let output = command
+        .args([env!("CARGO_BIN_EXE_session-server"), &inside("config.json"), "2000"])
+        .output()
+        .unwrap();
     let said = String::from_utf8(output.stdout).unwrap();
     let errors = String::from_utf8_lossy(&output.stderr);
     assert_eq!(said.replace('\r', ""), "HTTP/1.0 200 OK\nHTTP/1.0 200 OK\n", "{errors}");

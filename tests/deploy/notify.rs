@@ -20,7 +20,11 @@ async fn tells(server: Builder, signals: &[(Signal, &[&str])]) {
     };
     let mut server: Server = server.env("NOTIFY_SOCKET", path.to_str().unwrap()).spawn();
     expect(&format!("READY=1\nSTATUS=listens on port {}", server.port)).await;
-    assert_eq!(http::try_get(&server.url("/health")).await.unwrap().status, 200, "at once");
+    assert_eq!(
+        http::try_get(&server.url("/health")).await.unwrap().status,
+        200,
+        "at once"
+    );
     for (signal, messages) in signals {
         server.signal(*signal);
         for message in *messages {
@@ -33,7 +37,11 @@ async fn tells(server: Builder, signals: &[(Signal, &[&str])]) {
 
 #[actix_rt::test]
 async fn a_service_manager_is_notified_of_readiness_and_stop() {
-    tells(session_server(&["localhost:1".to_owned()]), &[(Signal::SIGTERM, &["STOPPING=1\n"])]).await;
+    tells(
+        session_server(&["localhost:1".to_owned()]),
+        &[(Signal::SIGTERM, &["STOPPING=1\n"])],
+    )
+    .await;
     let drained: (_, &[&str]) = (Signal::SIGUSR1, &["STOPPING=1\nSTATUS=drained"]);
     tells(demo_server(1), &[drained]).await;
     tells(demo_server(1), &[(Signal::SIGTERM, &["STOPPING=1\nSTATUS=stopping"])]).await;

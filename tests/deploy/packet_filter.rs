@@ -120,7 +120,10 @@ impl Network {
             skip("only root may make networks");
             return None;
         };
-        let forwards = ["/proc/sys/net/ipv4/ip_forward", "/proc/sys/net/ipv6/conf/all/forwarding"];
+        let forwards = [
+            "/proc/sys/net/ipv4/ip_forward",
+            "/proc/sys/net/ipv6/conf/all/forwarding",
+        ];
         if !machine.within(|| forwards.iter().all(|file| std::fs::write(file, "1").is_ok())) {
             skip("this machine does not forward");
             return None;
@@ -131,7 +134,14 @@ impl Network {
         }
         let place = || Place::new().unwrap();
         let (container, neighbour, closed) = (place(), place(), place());
-        let network = Self { machine, container, neighbour, closed, lab: place(), internet: place() };
+        let network = Self {
+            machine,
+            container,
+            neighbour,
+            closed,
+            lab: place(),
+            internet: place(),
+        };
         network.lay_cables();
         Some(network)
     }
@@ -222,7 +232,14 @@ fn arrives(mut from: &TcpStream, mut to: &TcpStream) -> bool {
 #[test]
 fn containers_reach_the_internet_and_nothing_near() {
     let Some(network) = Network::new() else { return };
-    let Network { machine, container, neighbour, closed, lab, internet } = &network;
+    let Network {
+        machine,
+        container,
+        neighbour,
+        closed,
+        lab,
+        internet,
+    } = &network;
     // They accept IPv4 and IPv6. Port 2001 of the machine stands in for Docker's proxy.
     let web = internet.listen("[::]:80");
     let _servers = [
@@ -239,10 +256,23 @@ fn containers_reach_the_internet_and_nothing_near() {
     let asked = "192.168.77.2:53";
     let mut near: Vec<String> = SPECIAL.iter().map(|address| format!("{address}:80")).collect();
     near.extend(["192.168.77.2:80", "192.168.77.2:3128", "[fd00:77::2]:80"].map(str::to_owned));
-    for address in ["172.30.0.1", "172.31.0.1", "192.168.77.1", "203.0.113.1", "[fd00:30::1]", "[2001:db8::1]"] {
+    for address in [
+        "172.30.0.1",
+        "172.31.0.1",
+        "192.168.77.1",
+        "203.0.113.1",
+        "[fd00:30::1]",
+        "[2001:db8::1]",
+    ] {
         near.extend([format!("{address}:22"), format!("{address}:2001")]);
     }
-    let beside = |from: &Place| if std::ptr::eq(from, closed) { "172.30.0.2:2001" } else { "172.31.0.2:2001" };
+    let beside = |from: &Place| {
+        if std::ptr::eq(from, closed) {
+            "172.30.0.2:2001"
+        } else {
+            "172.31.0.2:2001"
+        }
+    };
 
     // Without the filter everything is reachable, so only the filter blocks later.
     for from in [container, closed] {
@@ -256,7 +286,11 @@ fn containers_reach_the_internet_and_nothing_near() {
     let here = lasting.local_addr().unwrap();
     let is_same = |one: SocketAddr| (one.ip().to_canonical(), one.port()) == (here.ip(), here.port());
     // Skips the earlier connections.
-    let lasting_end = web.incoming().map(Result::unwrap).find(|one| is_same(one.peer_addr().unwrap())).unwrap();
+    let lasting_end = web
+        .incoming()
+        .map(Result::unwrap)
+        .find(|one| is_same(one.peer_addr().unwrap()))
+        .unwrap();
 
     let is_kept = |exceptions: &[&str]| {
         for from in [container, closed] {
@@ -267,7 +301,10 @@ fn containers_reach_the_internet_and_nothing_near() {
             assert!(!from.sends("192.168.77.2:123", &clock));
         }
         for address in far.into_iter().chain([asked]) {
-            assert!(container.reaches(address) && !closed.reaches(address), "{address} with the filter");
+            assert!(
+                container.reaches(address) && !closed.reaches(address),
+                "{address} with the filter"
+            );
         }
         assert!(container.sends(asked, &names) && !closed.sends(asked, &names));
         // Clients reach published ports, from outside and from the machine itself, and receive answers.
@@ -280,7 +317,10 @@ fn containers_reach_the_internet_and_nothing_near() {
         ] {
             assert!(from.reaches(address), "{address} for clients");
         }
-        assert!(arrives(&lasting, &lasting_end) && arrives(&lasting_end, &lasting), "a connection does not last");
+        assert!(
+            arrives(&lasting, &lasting_end) && arrives(&lasting_end, &lasting),
+            "a connection does not last"
+        );
         assert_eq!(machine.within(packet_filter::missing), None);
     };
     network.load();
@@ -304,7 +344,9 @@ fn containers_reach_the_internet_and_nothing_near() {
 #[test]
 fn a_container_does_not_reach_its_neighbour() {
     let Some(network) = Network::new() else { return };
-    let shown = network.machine.within(|| std::fs::read_to_string("/proc/sys/net/bridge/bridge-nf-call-iptables"));
+    let shown = network
+        .machine
+        .within(|| std::fs::read_to_string("/proc/sys/net/bridge/bridge-nf-call-iptables"));
     if !shown.is_ok_and(|shown| shown.trim() == "1") {
         // Without br_netfilter, which dockerd loads, no filter sees packets that cross a bridge.
         return skip("there is no br_netfilter");

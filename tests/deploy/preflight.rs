@@ -12,7 +12,10 @@ pub fn check(keys: &Value, change: impl FnOnce(&mut Command)) -> (Value, String)
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("config.json");
     let mut config = json!({"server": "localhost", "allowedRepositories": "https://github.com/lab"});
-    config.as_object_mut().unwrap().extend(keys.as_object().unwrap().clone());
+    config
+        .as_object_mut()
+        .unwrap()
+        .extend(keys.as_object().unwrap().clone());
     std::fs::write(&file, config.to_string()).unwrap();
     let mut command = Command::new(env!("CARGO_BIN_EXE_simulation-server"));
     command.arg("--check").arg(&file).env_remove("WEBOTS_HOME");
@@ -67,7 +70,11 @@ fn what_is_missing_or_does_not_fit_is_warned_about() {
              webots: This simulation server does not know where Webots is installed. Its administrator can set webotsHome",
             pose,
         ),
-        (json!({"sandbox": {"readable": "/nowhere/at/all"}}), "sandbox: /nowhere/at/all is not there", pose),
+        (
+            json!({"sandbox": {"readable": "/nowhere/at/all"}}),
+            "sandbox: /nowhere/at/all is not there",
+            pose,
+        ),
         (
             json!({"isolation": "none", "allowedRepositories": []}),
             "isolation: none\nallowedRepositories is not set: no world will run here",
@@ -90,7 +97,10 @@ fn what_is_missing_or_does_not_fit_is_warned_about() {
         let (_, told) = check(&keys, |command| {
             command.env("PATH", empty.path());
         });
-        assert!(told_of.lines().all(|words| told.contains(words)), "{told_of} is not in\n{told}");
+        assert!(
+            told_of.lines().all(|words| told.contains(words)),
+            "{told_of} is not in\n{told}"
+        );
         assert!(!told.contains(untold), "{untold} is in\n{told}");
     }
 }

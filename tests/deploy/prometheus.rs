@@ -23,7 +23,11 @@ fn read(path: &str) -> String {
 fn promtool(arguments: &[&str], file: &Path) {
     needs!("promtool");
     let output = Command::new("promtool").args(arguments).arg(file).output().unwrap();
-    assert!(output.status.success(), "promtool {arguments:?} {}: {output:?}", file.display());
+    assert!(
+        output.status.success(),
+        "promtool {arguments:?} {}: {output:?}",
+        file.display()
+    );
 }
 
 /// The queries of the dashboard.
@@ -31,7 +35,9 @@ fn queries() -> Vec<String> {
     let dashboard: Value = serde_json::from_str(&read("deploy/prometheus/dashboard.json")).unwrap();
     let panels = dashboard["panels"].as_array().unwrap();
     let targets = panels.iter().flat_map(|panel| panel["targets"].as_array().unwrap());
-    targets.map(|target| target["expr"].as_str().unwrap().to_owned()).collect()
+    targets
+        .map(|target| target["expr"].as_str().unwrap().to_owned())
+        .collect()
 }
 
 /// The servers' metrics that a text names.
@@ -43,7 +49,9 @@ fn named(text: &str) -> BTreeSet<String> {
 /// The metrics of a page `/metrics`.
 fn exported(page: &str) -> BTreeSet<String> {
     let samples = page.lines().filter(|line| !line.starts_with('#'));
-    samples.map(|line| line.split(['{', ' ']).next().unwrap().to_owned()).collect()
+    samples
+        .map(|line| line.split(['{', ' ']).next().unwrap().to_owned())
+        .collect()
 }
 
 #[test]
@@ -61,8 +69,13 @@ fn alerts_pass_promtool_and_fire_for_unhealthy_fleets() {
 #[actix_rt::test]
 async fn alerts_dashboard_and_docs_name_exported_metrics() {
     let driver = readings::gpu_driver();
-    let simulation = demo_server(1).env("LD_LIBRARY_PATH", driver.path().to_str().unwrap()).start().await;
-    let session = session_server(&[simulation.address(), "dns+fleet.test:2000".to_owned()]).start().await;
+    let simulation = demo_server(1)
+        .env("LD_LIBRARY_PATH", driver.path().to_str().unwrap())
+        .start()
+        .await;
+    let session = session_server(&[simulation.address(), "dns+fleet.test:2000".to_owned()])
+        .start()
+        .await;
     let metrics = async |url: String| exported(&http::get(&url).await.text());
     let all = async || {
         let mut all = metrics(session.url("/metrics")).await;
@@ -78,11 +91,16 @@ async fn alerts_dashboard_and_docs_name_exported_metrics() {
     for name in &all {
         assert!(name.starts_with("webots_"), "{name}");
     }
-    for (what, text) in [("the alerts", read("deploy/prometheus/alerts.yml")), ("the dashboard", queries().join("\n"))]
-    {
+    for (what, text) in [
+        ("the alerts", read("deploy/prometheus/alerts.yml")),
+        ("the dashboard", queries().join("\n")),
+    ] {
         let named = named(&text);
         let unknown: Vec<&String> = named.difference(&all).collect();
-        assert!(named.len() > 5 && unknown.is_empty(), "{what}: {unknown:?} of {named:?}");
+        assert!(
+            named.len() > 5 && unknown.is_empty(),
+            "{what}: {unknown:?} of {named:?}"
+        );
     }
     let docs = read("docs/operations.md");
     // The documentation names a histogram instead of its three metrics.

@@ -31,9 +31,17 @@ esac"#;
 fn run(folder: &Path, programs: &Path, command: &str) -> String {
     let search = format!("{}:{}", programs.display(), std::env::var("PATH").unwrap());
     let mut bash = Command::new("bash");
-    let output =
-        bash.args(["-euo", "pipefail", "-c", command]).current_dir(folder).env("PATH", search).output().unwrap();
-    assert!(output.status.success(), "{command}: {}", String::from_utf8_lossy(&output.stderr));
+    let output = bash
+        .args(["-euo", "pipefail", "-c", command])
+        .current_dir(folder)
+        .env("PATH", search)
+        .output()
+        .unwrap();
+    assert!(
+        output.status.success(),
+        "{command}: {}",
+        String::from_utf8_lossy(&output.stderr)
+    );
     String::from_utf8(output.stdout).unwrap()
 }
 
@@ -47,18 +55,36 @@ fn the_commands_of_the_page_on_kubernetes_apply_what_is_there() {
     make_program(&programs.path().join("kubectl"), KUBECTL);
     let files = own.path().join("webots-fleet");
     std::fs::create_dir(&files).unwrap();
-    assert!(Command::new("cp").arg("-R").arg(project.join("deploy")).arg(&files).status().unwrap().success());
+    assert!(
+        Command::new("cp")
+            .arg("-R")
+            .arg(project.join("deploy"))
+            .arg(&files)
+            .status()
+            .unwrap()
+            .success()
+    );
     std::fs::write(own.path().join("kustomization.yaml"), &blocks(&text, "yaml")[0]).unwrap();
-    std::fs::copy(files.join("deploy/kubernetes/base/config/simulation.json"), own.path().join("simulation.json"))
-        .unwrap();
+    std::fs::copy(
+        files.join("deploy/kubernetes/base/config/simulation.json"),
+        own.path().join("simulation.json"),
+    )
+    .unwrap();
     let (authority, commands) = (Authority::new(), commands(&text));
     let certificate = authority.issue(&["fleet.lab.example"]);
     std::fs::copy(certificate.chain, own.path().join("tls.crt")).unwrap();
     std::fs::copy(certificate.key, own.path().join("tls.key")).unwrap();
     let (demo, rest) = commands.split_at(4);
-    demo.iter().for_each(|command| drop(run(project, programs.path(), command)));
-    let applied: Vec<String> = rest.iter().map(|command| run(own.path(), programs.path(), command)).collect();
-    for words in ["registry.lab.example/simulation-server:", "wss://fleet.lab.example/{host}/{port}"] {
+    demo.iter()
+        .for_each(|command| drop(run(project, programs.path(), command)));
+    let applied: Vec<String> = rest
+        .iter()
+        .map(|command| run(own.path(), programs.path(), command))
+        .collect();
+    for words in [
+        "registry.lab.example/simulation-server:",
+        "wss://fleet.lab.example/{host}/{port}",
+    ] {
         assert!(applied.last().unwrap().contains(words), "{words} is not in {applied:?}");
     }
 }

@@ -24,15 +24,36 @@ impl Class {
         let file = folder.join("class.json");
         let mut command = Command::new(env!("CARGO_BIN_EXE_rehearse"));
         command.args([url, "--world", &arm(), "--over", "1s", "--stay", "3s"]);
-        command.args(["--patience", "20s", "--misbehave", "reload=10,drop=10,sleep=5,vanish=5,hasty=15"]);
-        command.args(["--clients", &CLIENTS.to_string(), "--soak", &format!("{}s", time.as_secs())]);
-        command.arg("--json").arg(&file).stdout(Stdio::null()).stderr(Stdio::null()).kill_on_drop(true);
-        Self { child: command.spawn().unwrap(), file }
+        command.args([
+            "--patience",
+            "20s",
+            "--misbehave",
+            "reload=10,drop=10,sleep=5,vanish=5,hasty=15",
+        ]);
+        command.args([
+            "--clients",
+            &CLIENTS.to_string(),
+            "--soak",
+            &format!("{}s", time.as_secs()),
+        ]);
+        command
+            .arg("--json")
+            .arg(&file)
+            .stdout(Stdio::null())
+            .stderr(Stdio::null())
+            .kill_on_drop(true);
+        Self {
+            child: command.spawn().unwrap(),
+            file,
+        }
     }
 
     /// Waits until all clients have left. Returns the results.
     pub async fn end(mut self) -> Value {
-        actix_rt::time::timeout(Duration::from_secs(90), self.child.wait()).await.expect("the class ends").unwrap();
+        actix_rt::time::timeout(Duration::from_secs(90), self.child.wait())
+            .await
+            .expect("the class ends")
+            .unwrap();
         serde_json::from_str(&std::fs::read_to_string(&self.file).unwrap()).unwrap()
     }
 }

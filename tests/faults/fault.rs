@@ -88,14 +88,21 @@ async fn bury(fleet: &mut Fleet, index: usize) {
     let stopwatch = Stopwatch::start();
     let ended = stopwatch.lap();
     while let rest @ [_, ..] = instances_below(&fleet.site.folder(index)).as_slice() {
-        assert!(ended.elapsed() < AT_ONCE, "{AT_ONCE:?} after the server's end there is still {rest:?}");
+        assert!(
+            ended.elapsed() < AT_ONCE,
+            "{AT_ONCE:?} after the server's end there is still {rest:?}"
+        );
         actix_rt::time::sleep(Duration::from_millis(10)).await;
     }
 }
 
 async fn stand_still(fleet: &Fleet, random: &mut SmallRng, is_session: bool) -> bool {
     let index = random.random_range(0..SERVERS);
-    let server = if is_session { &fleet.session } else { &fleet.servers[index] };
+    let server = if is_session {
+        &fleet.session
+    } else {
+        &fleet.servers[index]
+    };
     server.signal(Signal::SIGSTOP);
     actix_rt::time::sleep(WHILE).await;
     server.signal(Signal::SIGCONT);
@@ -108,7 +115,10 @@ async fn signal(fleet: &Fleet, random: &mut SmallRng, words: &str, signal: Signa
     let deadline = Instant::now() + WHILE;
     while Instant::now() < deadline {
         let all = instances_below(fleet.site.root()).into_iter();
-        let all: Vec<i32> = all.filter(|(_, command)| command.contains(words)).map(|(pid, _)| pid).collect();
+        let all: Vec<i32> = all
+            .filter(|(_, command)| command.contains(words))
+            .map(|(pid, _)| pid)
+            .collect();
         if !all.is_empty() {
             return kill(Pid::from_raw(all[random.random_range(0..all.len())]), signal).is_ok();
         }

@@ -97,7 +97,10 @@ impl Site {
         std::fs::create_dir_all(self.folder(index)).unwrap();
         // The small disk has less room than the default reserve.
         let builder = builder.set("hangLimit", 1).set("diskReserve", 8);
-        self.clock.of(builder).folder(&self.folder(index)).port(self.ports[index])
+        self.clock
+            .of(builder)
+            .folder(&self.folder(index))
+            .port(self.ports[index])
     }
 
     /// The session server.
@@ -116,7 +119,8 @@ impl Site {
             None => builder,
         };
         // Other load on this machine must not close the fleet.
-        self.clock.of(builder.set("timing", json!({"answer": 1})).set("loadThreshold", 1000))
+        self.clock
+            .of(builder.set("timing", json!({"answer": 1})).set("loadThreshold", 1000))
     }
 }
 
@@ -140,7 +144,13 @@ impl Fleet {
         }
         let session = site.session().start().await;
         let memory = servers.iter().map(|server| memory(server.pid())).collect();
-        Self { session, servers, site, network, memory }
+        Self {
+            session,
+            servers,
+            site,
+            network,
+            memory,
+        }
     }
 
     /// Restarts a simulation server that has ended, as a service manager does.
@@ -179,8 +189,12 @@ impl Fleet {
     /// Checks all invariants once, while clients come and go.
     async fn look(&self) -> Result<(), String> {
         let status = http::try_get(&self.session.url("/status")).await?.json();
-        let states: Vec<&str> =
-            status["servers"].as_array().unwrap().iter().map(|s| s["state"].as_str().unwrap()).collect();
+        let states: Vec<&str> = status["servers"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .map(|s| s["state"].as_str().unwrap())
+            .collect();
         if states.len() != SERVERS || states.iter().any(|state| !matches!(*state, "up" | "full")) {
             return Err(format!("the servers are {states:?}: {status}"));
         }
@@ -216,18 +230,27 @@ impl Fleet {
         let all = Process::myself().and_then(|this| this.tcp()).unwrap();
         let places = self.site.places(index);
         let is_held = |one: &&TcpNetEntry| one.state == TcpState::Listen && places.contains(&one.local_address.port());
-        (instance_folders_in(&self.site.folder(index).join("cache")).len(), all.iter().filter(is_held).count())
+        (
+            instance_folders_in(&self.site.folder(index).join("cache")).len(),
+            all.iter().filter(is_held).count(),
+        )
     }
 
     fn look_for_rests(&self) -> Result<(), String> {
         for (index, server) in self.servers.iter().enumerate() {
             let (processes, held) = (instances_below(&self.site.folder(index)), self.held(index));
             if !processes.is_empty() || held != (0, 0) {
-                return Err(format!("server {index} has left {processes:?}, and folders and ports: {held:?}"));
+                return Err(format!(
+                    "server {index} has left {processes:?}, and folders and ports: {held:?}"
+                ));
             }
             let (before, now) = (self.memory[index], memory(server.pid()));
             if now > before + (24 << 20) {
-                return Err(format!("server {index} takes {} MiB, and took {}", now >> 20, before >> 20));
+                return Err(format!(
+                    "server {index} takes {} MiB, and took {}",
+                    now >> 20,
+                    before >> 20
+                ));
             }
         }
         Ok(())
@@ -243,7 +266,9 @@ fn memory(pid: i32) -> u64 {
 pub async fn try_start(server: &str) -> Result<Client, String> {
     let client = Client::try_connect(&format!("{server}/client")).await;
     let mut client = client.map_err(|why| format!("{server}: {why}"))?;
-    client.try_send(&json!({"start": {"url": support::arm()}}).to_string()).await?;
+    client
+        .try_send(&json!({"start": {"url": support::arm()}}).to_string())
+        .await?;
     loop {
         match client.next_within(SOON).await {
             Some(Heard::Text(text)) if text.starts_with("webots:") => return Ok(client),

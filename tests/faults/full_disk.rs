@@ -44,15 +44,24 @@ async fn a_server_with_a_full_disk_takes_nobody() {
     }
     let healthy = server(&folder.path().join("healthy")).start().await;
     let full = server(&small).start().await;
-    let session = session_server(&[healthy.address(), full.address()]).set("loadThreshold", 1000).start().await;
+    let session = session_server(&[healthy.address(), full.address()])
+        .set("loadThreshold", 1000)
+        .start()
+        .await;
     until("both work", async || second(&session).await.0 == "up").await;
 
     // The disk fills up while the server has a simulation.
     let mut running = try_start(&format!("ws://{}", full.address())).await.unwrap();
     let filler = Full::at(&small);
-    until("the full one is not offered", async || second(&session).await.0 == "down").await;
+    until("the full one is not offered", async || {
+        second(&session).await.0 == "down"
+    })
+    .await;
     let (_, why) = second(&session).await;
-    assert!(why.contains("disk is full: less than 8 MiB are left (diskReserve)"), "{why}");
+    assert!(
+        why.contains("disk is full: less than 8 MiB are left (diskReserve)"),
+        "{why}"
+    );
     let (status, text) = full.health().await;
     assert!(status == 503 && text.contains("disk is full"), "{text}");
     let page = full.monitor().await;

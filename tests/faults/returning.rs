@@ -18,7 +18,11 @@ async fn on_a_quiet_machine_five_thousand_clients_reconnect_at_once() {
     let (reserved, simulation_port) = dead_port();
     let servers = [format!("127.0.0.1:{simulation_port}")];
     // Load on this machine must not make its simulation server full.
-    let configure = || session_server(&servers).set("maxClientsPerAddress", 2 * CLIENTS).set("loadThreshold", 1_000);
+    let configure = || {
+        session_server(&servers)
+            .set("maxClientsPerAddress", 2 * CLIENTS)
+            .set("loadThreshold", 1_000)
+    };
     let mut session = configure().folder(folder.path()).start().await;
     let port = session.port;
     let url = session.websocket("/");

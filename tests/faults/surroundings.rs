@@ -29,7 +29,11 @@ pub async fn fill_disk(fleet: &mut Fleet, _: &mut SmallRng) -> bool {
 /// Makes a folder read-only, either as it is or replaced by an empty one.
 pub async fn close_folder(fleet: &mut Fleet, name: &str, is_empty: bool) -> bool {
     let folder = fleet.site.folder(SMALL_DISK).join(name);
-    let closed = if is_empty { ReadOnly::empty(&folder) } else { ReadOnly::at(&folder) };
+    let closed = if is_empty {
+        ReadOnly::empty(&folder)
+    } else {
+        ReadOnly::at(&folder)
+    };
     if closed.is_none() {
         return false;
     }
@@ -72,7 +76,9 @@ impl Clock {
     /// Makes a server use this clock.
     pub fn of(&self, server: Builder) -> Builder {
         let file = |name: &str| self.folder.path().join(name).to_str().unwrap().to_owned();
-        server.env("LD_PRELOAD", &file("clock.so")).env("CLOCK_STEP", &file("step"))
+        server
+            .env("LD_PRELOAD", &file("clock.so"))
+            .env("CLOCK_STEP", &file("step"))
     }
 
     /// Sets the offset from the machine's clock.

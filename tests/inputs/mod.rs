@@ -32,7 +32,11 @@ const BOUND: Duration = Duration::from_secs(2);
 fn try_many(seeds: &'static str, check: impl Fn(&[u8])) {
     let cases = std::env::var("INPUTS").map_or(CASES, |text| text.parse().unwrap());
     let failure_persistence = Some(Box::new(FileFailurePersistence::Direct("tests/inputs/regressions.txt")) as _);
-    let mut runner = TestRunner::new(Config { cases, failure_persistence, ..Config::default() });
+    let mut runner = TestRunner::new(Config {
+        cases,
+        failure_persistence,
+        ..Config::default()
+    });
     let checked = runner.run(&mutations::of(seeds), |input| {
         let began = processor_time();
         check(&input);
@@ -60,7 +64,11 @@ fn any_message_is_answered_in_the_form_of_the_protocol() {
         let text = String::from_utf8_lossy(input);
         match ClientRequest::parse(&text) {
             Ok(request) => {
-                let texts = [request.reset_controller, request.resume, request.start.map(|start| start.url)];
+                let texts = [
+                    request.reset_controller,
+                    request.resume,
+                    request.start.map(|start| start.url),
+                ];
                 assert!(texts.into_iter().flatten().all(|one| one.len() <= text.len()));
                 assert!(serde_json::from_str::<serde_json::Value>(&text).is_ok());
             }
@@ -78,7 +86,9 @@ fn any_message_is_answered_in_the_form_of_the_protocol() {
 /// Configuration files of both servers.
 #[test]
 fn any_configuration_is_read_or_refused_in_one_line() {
-    let folder = tempfile::tempdir_in("/dev/shm").or_else(|_| tempfile::tempdir()).unwrap();
+    let folder = tempfile::tempdir_in("/dev/shm")
+        .or_else(|_| tempfile::tempdir())
+        .unwrap();
     let file = folder.path().join("configuration.json");
     try_many(include_str!("seeds/configuration.txt"), |input| {
         std::fs::write(&file, input).unwrap();
@@ -90,7 +100,11 @@ fn any_configuration_is_read_or_refused_in_one_line() {
 fn is_read_or_refused<C: Configuration>(file: &Path) {
     match load::<C>(file) {
         Ok(loaded) => {
-            assert!(loaded.warnings.iter().all(|warning| is_one_line(warning)), "{:?}", loaded.warnings)
+            assert!(
+                loaded.warnings.iter().all(|warning| is_one_line(warning)),
+                "{:?}",
+                loaded.warnings
+            )
         }
         Err(told) => {
             assert!(told.contains("configuration.json") && is_one_line(&told), "{told}");
@@ -110,7 +124,11 @@ fn only_a_trusted_proxy_is_believed_and_only_addresses_are() {
         };
         let from = |address: IpAddr| {
             let request = TestRequest::default().peer_addr((address, 4000).into());
-            trusted.peer(&request.insert_header(("x-forwarded-for", value.clone())).to_http_request())
+            trusted.peer(
+                &request
+                    .insert_header(("x-forwarded-for", value.clone()))
+                    .to_http_request(),
+            )
         };
         assert_eq!(from(stranger), Peer::Client(stranger));
         match from(proxy) {
@@ -125,8 +143,13 @@ fn only_a_trusted_proxy_is_believed_and_only_addresses_are() {
 fn is_named(header: &[u8], address: IpAddr) -> bool {
     let text = String::from_utf8_lossy(header);
     let pieces = || text.split([',', ';', '=', ' ', '\t', '"', '[', ']', '%']);
-    let ports = pieces().filter_map(|piece| piece.rsplit_once(':')).map(|(host, _)| host);
-    pieces().chain(ports).filter_map(|piece| piece.parse::<IpAddr>().ok()).any(|one| one.to_canonical() == address)
+    let ports = pieces()
+        .filter_map(|piece| piece.rsplit_once(':'))
+        .map(|(host, _)| host);
+    pieces()
+        .chain(ports)
+        .filter_map(|piece| piece.parse::<IpAddr>().ok())
+        .any(|one| one.to_canonical() == address)
 }
 
 /// Answers of a simulation server, or of any host that is listed as one.
@@ -137,7 +160,10 @@ fn a_report_is_a_load_and_short_lines_whatever_a_server_answers() {
         let Ok(report) = ServerReport::parse(input) else {
             return;
         };
-        assert!(report.load.percent().is_finite() && report.load.percent() >= 0.0, "{report:?}");
+        assert!(
+            report.load.percent().is_finite() && report.load.percent() >= 0.0,
+            "{report:?}"
+        );
         assert!(is_one_line(&report.version), "{report:?}");
         assert!(report.problem.as_deref().is_none_or(is_one_line), "{report:?}");
         if let Some(instances) = report.instances {
@@ -166,17 +192,30 @@ fn any_webots_yml_requests_nothing_outside_of_its_project() {
         // Each example is one line of `seeds`, with escaped line ends.
         let text = String::from_utf8_lossy(input).replace("\\n", "\n").replace("\\r", "\r");
         let found = WebotsYml::parse(&text);
-        assert!(found.warnings.iter().all(|warning| is_one_line(warning)), "{:?}", found.warnings);
+        assert!(
+            found.warnings.iter().all(|warning| is_one_line(warning)),
+            "{:?}",
+            found.warnings
+        );
         if let Some(message) = &found.project_type {
             let line = message.strip_suffix('\n').unwrap();
-            assert!(is_one_line(line) && line.starts_with("type:") && line.len() <= 200, "{message:?}");
+            assert!(
+                is_one_line(line) && line.starts_with("type:") && line.len() <= 200,
+                "{message:?}"
+            );
         }
         if found.kind != ProjectKind::Default {
             let folder = &found.folder;
-            assert!(folder.starts_with("webots-project") && is_one_line(folder), "{folder:?}");
+            assert!(
+                folder.starts_with("webots-project") && is_one_line(folder),
+                "{folder:?}"
+            );
             assert!(!folder.contains([':', '$', '\\', '"', '\'', '`', '#']), "{folder:?}");
             let inside = found.folder_in_project();
-            assert!(inside.components().all(|part| matches!(part, Component::Normal(_))), "{inside:?}");
+            assert!(
+                inside.components().all(|part| matches!(part, Component::Normal(_))),
+                "{inside:?}"
+            );
         }
     });
 }
@@ -201,12 +240,18 @@ fn is_safe(world: &ProjectUrl) {
         assert!(!segment.is_empty() && segment != "." && segment != "..", "{world:?}");
         assert!(!segment.contains(['/', '\\']) && is_one_line(segment), "{world:?}");
     }
-    assert!(!world.host().starts_with('-') && !world.host().contains(['/', '@', ' ', '\\']), "{world:?}");
+    assert!(
+        !world.host().starts_with('-') && !world.host().contains(['/', '@', ' ', '\\']),
+        "{world:?}"
+    );
     assert!(world.repository().starts_with("https://"), "{world:?}");
     assert!(world.world().to_ascii_lowercase().ends_with(".wbt"), "{world:?}");
     let inside = world.candidates();
     assert!(!inside.is_empty(), "{world:?}");
     for reading in inside {
-        assert!(!reading.folder.starts_with('/') && !reading.folder.split('/').any(|name| name == ".git"), "{world:?}");
+        assert!(
+            !reading.folder.starts_with('/') && !reading.folder.split('/').any(|name| name == ".git"),
+            "{world:?}"
+        );
     }
 }

@@ -38,7 +38,9 @@ pub fn of(seeds: &'static str) -> impl Strategy<Value = Vec<u8>> {
         1 => (any::<Index>(), any::<Index>(), any::<Index>()).prop_map(|(at, seed, from)| Mutation::Join(at, seed, from)),
     ];
     (select(seeds.clone()), prop::collection::vec(mutation, 0..6)).prop_map(move |(seed, mutations)| {
-        mutations.into_iter().fold(seed.to_vec(), |text, mutation| changed(text, mutation, &seeds))
+        mutations
+            .into_iter()
+            .fold(seed.to_vec(), |text, mutation| changed(text, mutation, &seeds))
     })
 }
 

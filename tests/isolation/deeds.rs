@@ -49,8 +49,13 @@ impl Stage {
 
     pub fn builder(&self, webots: &Webots, level: &str) -> Builder {
         let builder = simulation_server(&webots.path(), self.forge.path(), 2).folder(self.folder.path());
-        let builder = builder.set("isolation", level).set("adminPassword", "a secret").set("timing.grace", 0.5);
-        builder.env("HOME", self.home.path().to_str().unwrap()).env("SECRET_OF_THE_SERVER", "a secret")
+        let builder = builder
+            .set("isolation", level)
+            .set("adminPassword", "a secret")
+            .set("timing.grace", 0.5);
+        builder
+            .env("HOME", self.home.path().to_str().unwrap())
+            .env("SECRET_OF_THE_SERVER", "a secret")
     }
 
     /// Which of these deeds a world's program can do; each is a name and a shell command.
@@ -62,18 +67,26 @@ impl Stage {
     ) -> Vec<String> {
         let one =
             |(name, line): &(&str, String)| format!("if ( {line} ) >/dev/null 2>&1; then echo 'DONE {name}'; fi\n");
-        let webots = Webots::script(&format!("{}\necho THE END\nexit 1", deeds.iter().map(one).collect::<String>()));
+        let webots = Webots::script(&format!(
+            "{}\necho THE END\nexit 1",
+            deeds.iter().map(one).collect::<String>()
+        ));
         let server = change(self.builder(&webots, level)).start().await;
         let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
         assert!(told.contains("THE END"), "{told}");
         nothing_left(&server, 2).await;
-        told.split(" | ").filter_map(|line| line.split("DONE ").nth(1)).map(str::to_owned).collect()
+        told.split(" | ")
+            .filter_map(|line| line.split("DONE ").nth(1))
+            .map(str::to_owned)
+            .collect()
     }
 }
 
 /// A writable folder outside of homes and temporary folders. The project may be in one, so there are several candidates.
 fn apart() -> Option<&'static str> {
-    let user = nix::unistd::User::from_uid(nix::unistd::getuid()).unwrap().map(|user| user.dir);
+    let user = nix::unistd::User::from_uid(nix::unistd::getuid())
+        .unwrap()
+        .map(|user| user.dir);
     let hidden: Vec<PathBuf> = ["/tmp", "/var/tmp"]
         .map(PathBuf::from)
         .into_iter()
@@ -83,13 +96,17 @@ fn apart() -> Option<&'static str> {
         .filter_map(|folder| folder.canonicalize().ok())
         .filter(|folder| folder.parent().is_some())
         .collect();
-    [env!("CARGO_TARGET_TMPDIR"), "/srv", "/var/lib", "/opt"].into_iter().find(|folder| {
-        let Ok(real) = Path::new(folder).canonicalize() else { return false };
-        // The path becomes part of shell commands.
-        !folder.contains(' ')
-            && !hidden.iter().any(|place| real.starts_with(place))
-            && tempfile::tempdir_in(real).is_ok()
-    })
+    [env!("CARGO_TARGET_TMPDIR"), "/srv", "/var/lib", "/opt"]
+        .into_iter()
+        .find(|folder| {
+            let Ok(real) = Path::new(folder).canonicalize() else {
+                return false;
+            };
+            // The path becomes part of shell commands.
+            !folder.contains(' ')
+                && !hidden.iter().any(|place| real.starts_with(place))
+                && tempfile::tempdir_in(real).is_ok()
+        })
 }
 
 /// Lets all users read and write a folder.
@@ -108,15 +125,27 @@ fn files(stage: &Stage) -> Vec<(&'static str, String, [bool; 2])> {
     let keyring = format!("python3 -c 'import ctypes; assert ctypes.CDLL(None).syscall({number}, 0, -3, 1) > 0'");
     let has_keyrings = Command::new("sh").args(["-c", &keyring]).status().unwrap().success();
     vec![
-        ("read and write the project", "test -f worlds/a.wbt && touch worlds/new".to_owned(), [true, true]),
+        (
+            "read and write the project",
+            "test -f worlds/a.wbt && touch worlds/new".to_owned(),
+            [true, true],
+        ),
         ("write a home", "touch ~/.config-of-webots".to_owned(), [true, true]),
         (
             "write the runtime folder",
             "touch ${XDG_RUNTIME_DIR:-/tmp}/x.$$; rm ${XDG_RUNTIME_DIR:-/tmp}/x.$$".to_owned(),
             [true, true],
         ),
-        ("use temporary files", "f=$(mktemp) && echo x > $f && rm $f".to_owned(), [true, true]),
-        ("use shared memory", "touch /dev/shm/fleet.$$ && rm /dev/shm/fleet.$$".to_owned(), [true, true]),
+        (
+            "use temporary files",
+            "f=$(mktemp) && echo x > $f && rm $f".to_owned(),
+            [true, true],
+        ),
+        (
+            "use shared memory",
+            "touch /dev/shm/fleet.$$ && rm /dev/shm/fleet.$$".to_owned(),
+            [true, true],
+        ),
         (
             "read the system",
             "test -r /etc/passwd -a -x /usr/bin/env -a -r /proc/cpuinfo -a -d /sys/class".to_owned(),
@@ -124,20 +153,48 @@ fn files(stage: &Stage) -> Vec<(&'static str, String, [bool; 2])> {
         ),
         ("read elsewhere", format!("grep data {elsewhere}/data"), [true, true]),
         ("write elsewhere", format!("touch {elsewhere}/new"), [true, false]),
-        ("read the configuration", format!("grep secret {folder}/config.json"), [true, false]),
-        ("change the configuration", format!("echo >> {folder}/config.json"), [true, false]),
-        ("read the log", format!("ls {folder}/log/simulation/instances/*.log"), [true, false]),
+        (
+            "read the configuration",
+            format!("grep secret {folder}/config.json"),
+            [true, false],
+        ),
+        (
+            "change the configuration",
+            format!("echo >> {folder}/config.json"),
+            [true, false],
+        ),
+        (
+            "read the log",
+            format!("ls {folder}/log/simulation/instances/*.log"),
+            [true, false],
+        ),
         ("read the cache", format!("ls {folder}/cache/git/*/HEAD"), [true, false]),
-        ("change the cache", format!("for one in {folder}/cache/git/*/HEAD; do echo >> $one; done"), [true, false]),
-        ("see all of its folder", format!("ls {folder}/cache/runs/*/*/index"), [true, false]),
+        (
+            "change the cache",
+            format!("for one in {folder}/cache/git/*/HEAD; do echo >> $one; done"),
+            [true, false],
+        ),
+        (
+            "see all of its folder",
+            format!("ls {folder}/cache/runs/*/*/index"),
+            [true, false],
+        ),
         ("read the home", format!("grep secret {home}/secret"), [true, false]),
-        ("write what git obeys", format!("touch {home}/.gitconfig && test -f {home}/secret"), [true, false]),
+        (
+            "write what git obeys",
+            format!("touch {home}/.gitconfig && test -f {home}/secret"),
+            [true, false],
+        ),
         (
             "read the environment of the server",
             "grep -ls SECRET_OF_THE_SERVER /proc/[0-9]*/environ | grep .".to_owned(),
             [true, false],
         ),
-        ("see other processes", "grep -ls simulation-serv /proc/[0-9]*/comm | grep .".to_owned(), [true, false]),
+        (
+            "see other processes",
+            "grep -ls simulation-serv /proc/[0-9]*/comm | grep .".to_owned(),
+            [true, false],
+        ),
         ("use a keyring", keyring, [has_keyrings, false]),
     ]
 }
@@ -146,8 +203,17 @@ async fn compare(stage: &Stage, change: impl Fn(Builder) -> Builder, levels: &[u
     let table = files(stage);
     let deeds: Vec<(&str, String)> = table.iter().map(|(name, line, _)| (*name, line.clone())).collect();
     for level in levels {
-        let expected: Vec<&str> = table.iter().filter(|(_, _, done)| done[*level]).map(|(name, ..)| *name).collect();
-        assert_eq!(stage.tried(&deeds, LEVELS[*level], &change).await, expected, "{}", LEVELS[*level]);
+        let expected: Vec<&str> = table
+            .iter()
+            .filter(|(_, _, done)| done[*level])
+            .map(|(name, ..)| *name)
+            .collect();
+        assert_eq!(
+            stage.tried(&deeds, LEVELS[*level], &change).await,
+            expected,
+            "{}",
+            LEVELS[*level]
+        );
     }
 }
 
@@ -176,7 +242,11 @@ async fn a_sandbox_holds_for_an_ordinary_user_too() {
     compare(&stage, |builder| builder.before(nobody), &[1]).await;
     // bubblewrap is one more process.
     let processes = [("be bounded by the kernel", "test $(ulimit -u) = 71".to_owned())];
-    let done = stage.tried(&processes, "sandbox", |builder| builder.before(nobody).set("limits.processes", 70)).await;
+    let done = stage
+        .tried(&processes, "sandbox", |builder| {
+            builder.before(nobody).set("limits.processes", 70)
+        })
+        .await;
     assert_eq!(done, ["be bounded by the kernel"]);
 }
 
@@ -188,10 +258,15 @@ async fn temporary_folders_are_the_simulations_own_wherever_they_are() {
     let there = shown(&folder);
     let deeds = [
         ("use it", format!("touch '{there}'/new.$$ && rm '{there}'/new.$$")),
-        ("use the usual ones", "touch /tmp/new.$$ /var/tmp/new.$$ && rm /tmp/new.$$".to_owned()),
+        (
+            "use the usual ones",
+            "touch /tmp/new.$$ /var/tmp/new.$$ && rm /tmp/new.$$".to_owned(),
+        ),
         ("read what others have there", format!("grep secret '{there}'/secret")),
     ];
-    let done = Stage::new().tried(&deeds, "sandbox", |builder| builder.env("TMPDIR", &there)).await;
+    let done = Stage::new()
+        .tried(&deeds, "sandbox", |builder| builder.env("TMPDIR", &there))
+        .await;
     assert_eq!(done, ["use it", "use the usual ones"]);
 }
 
@@ -203,7 +278,10 @@ async fn folders_are_shown_and_opened_by_keys() {
         ("read home", format!("grep secret {home}/secret")),
         ("write home", format!("touch {home}/new")),
         ("write elsewhere", format!("touch {elsewhere}/new")),
-        ("read the configuration", format!("grep secret {}/config.json", shown(&stage.folder))),
+        (
+            "read the configuration",
+            format!("grep secret {}/config.json", shown(&stage.folder)),
+        ),
     ];
     let done = stage.tried(&deeds, "sandbox", |builder| {
         // A path that contains the server's own directories does not make those visible.
@@ -220,14 +298,34 @@ async fn the_environment_is_what_webots_needs_and_what_a_key_adds() {
     needs!("bwrap");
     let stage = Stage::new();
     let has = |name: &str| format!("test -n \"${{{name}}}\"");
-    let deeds = ["PATH", "HOME", "DISPLAY", "LC_ALL", "SECRET_OF_THE_SERVER", "ROS_DOMAIN_ID", "ONE", "ONE_MORE"]
-        .map(|name| (name, has(name)));
+    let deeds = [
+        "PATH",
+        "HOME",
+        "DISPLAY",
+        "LC_ALL",
+        "SECRET_OF_THE_SERVER",
+        "ROS_DOMAIN_ID",
+        "ONE",
+        "ONE_MORE",
+    ]
+    .map(|name| (name, has(name)));
     for level in LEVELS {
         let done = stage.tried(&deeds, level, |builder| {
-            let builder = builder.env("ROS_DOMAIN_ID", "7").env("ONE", "1").env("ONE_MORE", "2").env("LC_ALL", "C");
-            builder.set("environment", serde_json::json!(["ROS_*", "ONE", "DEMO_SIMULATOR_BIND"]))
+            let builder = builder
+                .env("ROS_DOMAIN_ID", "7")
+                .env("ONE", "1")
+                .env("ONE_MORE", "2")
+                .env("LC_ALL", "C");
+            builder.set(
+                "environment",
+                serde_json::json!(["ROS_*", "ONE", "DEMO_SIMULATOR_BIND"]),
+            )
         });
-        assert_eq!(done.await, ["PATH", "HOME", "DISPLAY", "LC_ALL", "ROS_DOMAIN_ID", "ONE"], "{level}");
+        assert_eq!(
+            done.await,
+            ["PATH", "HOME", "DISPLAY", "LC_ALL", "ROS_DOMAIN_ID", "ONE"],
+            "{level}"
+        );
     }
 }
 
@@ -248,9 +346,15 @@ async fn empty_folders_of_a_sandbox_stay_empty() {
         ("fill the cache", hidden("cache")),
         ("use devices", "head -c 1 /dev/urandom > /dev/null".to_owned()),
         ("use the runtime folder", "touch $XDG_RUNTIME_DIR/new".to_owned()),
-        ("use shared memory", "head -c 4000000 /dev/zero > /dev/shm/one".to_owned()),
+        (
+            "use shared memory",
+            "head -c 4000000 /dev/zero > /dev/shm/one".to_owned(),
+        ),
         ("fill it", "head -c 4000000 /dev/zero > /dev/shm/other".to_owned()),
-        ("read the settings of the kernel", "test -n \"$(cat /proc/sys/vm/swappiness)\"".to_owned()),
+        (
+            "read the settings of the kernel",
+            "test -n \"$(cat /proc/sys/vm/swappiness)\"".to_owned(),
+        ),
         ("make a user namespace", "unshare --user true".to_owned()),
         ("make another sandbox", "bwrap --bind / / true".to_owned()),
         ("set swappiness", set("/proc/sys/vm/swappiness")),
@@ -265,8 +369,17 @@ async fn empty_folders_of_a_sandbox_stay_empty() {
             std::fs::create_dir(&folder).unwrap();
             open(&folder);
         }
-        let done = stage.tried(&deeds, "sandbox", |builder| builder.before(before).set("limits.disk", 5)).await;
-        let allowed = ["use devices", "use the runtime folder", "use shared memory", "read the settings of the kernel"];
+        let done = stage
+            .tried(&deeds, "sandbox", |builder| {
+                builder.before(before).set("limits.disk", 5)
+            })
+            .await;
+        let allowed = [
+            "use devices",
+            "use the runtime folder",
+            "use shared memory",
+            "read the settings of the kernel",
+        ];
         assert_eq!(done, allowed, "{before}");
     }
 }

@@ -11,7 +11,11 @@ use crate::support::wrapper::Wrapper;
 use crate::support::{Client, DEMO, Server, Webots, demo_server, display, instances_below, server_of, until};
 
 fn xvfb(server: &Server) -> i32 {
-    instances_below(&server.folder).into_iter().find(|(_, words)| words.contains("Xvfb -screen")).unwrap().0
+    instances_below(&server.folder)
+        .into_iter()
+        .find(|(_, words)| words.contains("Xvfb -screen"))
+        .unwrap()
+        .0
 }
 
 fn namespace(pid: &str, name: &str) -> PathBuf {
@@ -53,11 +57,19 @@ async fn a_virtual_display_is_inside_of_the_sandbox() {
         assert_eq!(done, ["socket", "use it", "refuse others at :99"], "{user}: {printed}");
         let pid = xvfb(&server);
         for name in ["pid", "mnt", "ipc"] {
-            assert_ne!(namespace(&pid.to_string(), name), namespace("self", name), "{user}: {name}");
+            assert_ne!(
+                namespace(&pid.to_string(), name),
+                namespace("self", name),
+                "{user}: {name}"
+            );
         }
         client.leave().await;
         nothing_left(&server, 1).await;
-        let has_ended = || Process::new(pid).and_then(|one| one.stat()).map_or(true, |stat| stat.state == 'Z');
+        let has_ended = || {
+            Process::new(pid)
+                .and_then(|one| one.stat())
+                .map_or(true, |stat| stat.state == 'Z')
+        };
         until("its display has ended", async || has_ended()).await;
     }
 }
@@ -69,7 +81,9 @@ const MEMORY: u64 = 256 << 20;
 async fn told_memory(server: &Server) -> u64 {
     let page = server.monitor().await;
     let cell = page.split_once("data-label=\"Memory\"").map_or("", |(_, cell)| cell);
-    let value = cell.split_once("data-value=\"").and_then(|(_, value)| value.split_once('"'));
+    let value = cell
+        .split_once("data-value=\"")
+        .and_then(|(_, value)| value.split_once('"'));
     value.map_or(0, |(value, _)| value.parse().unwrap())
 }
 
@@ -80,13 +94,20 @@ async fn what_a_virtual_display_takes_counts_for_its_simulation() {
     let large = Wrapper::of("Xvfb", "set -- \"${@/1280x1024x24/8192x8192x24}\"");
     for level in ["sandbox", "none"] {
         let group = Delegated::new();
-        let builder = demo_server(1).set("xvfb", true).set("isolation", level).env("PATH", &large.path());
+        let builder = demo_server(1)
+            .set("xvfb", true)
+            .set("isolation", level)
+            .env("PATH", &large.path());
         let join = group.as_ref().map_or("true".to_owned(), Delegated::join);
         let server = builder.before(&join).start().await;
         let client = Client::ready(&server).await;
         until("its memory counts", async || told_memory(&server).await >= MEMORY).await;
         if let Some(group) = &group {
-            let own = group.groups().into_iter().find(|name| name.starts_with("simulation-")).unwrap();
+            let own = group
+                .groups()
+                .into_iter()
+                .find(|name| name.starts_with("simulation-"))
+                .unwrap();
             let folder = group.0.join(own);
             let inside = std::fs::read_to_string(folder.join("cgroup.procs")).unwrap();
             assert!(inside.lines().any(|pid| pid == xvfb(&server).to_string()), "{inside}");

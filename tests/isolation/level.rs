@@ -15,7 +15,9 @@ fn programs(bubblewrap: Option<&str>) -> tempfile::TempDir {
 }
 
 fn with(builder: Builder, programs: &tempfile::TempDir, isolation: &str) -> Builder {
-    builder.env("PATH", programs.path().to_str().unwrap()).set("isolation", isolation)
+    builder
+        .env("PATH", programs.path().to_str().unwrap())
+        .set("isolation", isolation)
 }
 
 #[actix_rt::test]
@@ -27,11 +29,23 @@ async fn a_required_level_that_is_missing_refuses_the_start() {
     let closed = |programs| with(demo_server(1).set("sandbox.network", "closed"), programs, "auto");
     let begin = "error: isolation is \"sandbox\", but bubblewrap";
     let mut table = vec![
-        (sandbox(&none), begin, "the package bubblewrap has it; \"none\" runs worlds without it"),
+        (
+            sandbox(&none),
+            begin,
+            "the package bubblewrap has it; \"none\" runs worlds without it",
+        ),
         (sandbox(&denied), begin, "uid map: Permission denied): user namespaces"),
         (sandbox(&hangs), begin, "did not end within 5 seconds"),
-        (closed(&none), "error: ", "closed\", but bubblewrap (bwrap) is not there"),
-        (closed(&ends), "error: ", "closed\", but bubblewrap makes no sandbox here"),
+        (
+            closed(&none),
+            "error: ",
+            "closed\", but bubblewrap (bwrap) is not there",
+        ),
+        (
+            closed(&ends),
+            "error: ",
+            "closed\", but bubblewrap makes no sandbox here",
+        ),
         (
             with(demo_server(1), &none, "container"),
             "error: isolation is \"container\", but docker is not there; ",
@@ -55,11 +69,15 @@ async fn auto_warns_where_no_sandbox_works() {
     let words = "bubblewrap makes no sandbox here (bwrap: No permissions)";
     let log = server.log();
     assert!(
-        log.lines().any(|line| line.contains("WARN") && line.contains("(isolation: none)") && line.contains(words)),
+        log.lines()
+            .any(|line| line.contains("WARN") && line.contains("(isolation: none)") && line.contains(words)),
         "{log}"
     );
     let page = server.monitor().await;
-    assert!(page.contains(words) && page.contains("may do whatever this server may"), "{page}");
+    assert!(
+        page.contains(words) && page.contains("may do whatever this server may"),
+        "{page}"
+    );
     assert_eq!(server.status().await["isolation"], "none");
     Client::ready(&server).await;
 }
@@ -73,9 +91,17 @@ async fn a_sandbox_is_what_a_machine_has_by_itself() {
     assert!(page.contains("<dt>Isolation</dt><dd>sandbox</dd>"), "{page}");
     let log = server.log();
     // Warnings about what the machine of the tests may lack.
-    let known = ["only bubblewrap from 0.8 on", "network of simulations: shared with this machine: "];
+    let known = [
+        "only bubblewrap from 0.8 on",
+        "network of simulations: shared with this machine: ",
+    ];
     let is_known = |line: &&str| known.iter().any(|words| line.contains(words));
-    assert_eq!(log.lines().filter(|line| line.contains("WARN")).find(|line| !is_known(line)), None);
+    assert_eq!(
+        log.lines()
+            .filter(|line| line.contains("WARN"))
+            .find(|line| !is_known(line)),
+        None
+    );
 }
 
 #[actix_rt::test]
@@ -86,14 +112,23 @@ async fn limits_that_a_machine_can_not_enforce_are_reported() {
     ];
     let told = |text: &str, mark: &str| -> Vec<String> {
         let marked = text.lines().filter(|line| line.contains(mark)).map(str::to_owned);
-        marked.filter(|line| lines.iter().any(|words| line.contains(words))).collect()
+        marked
+            .filter(|line| lines.iter().any(|words| line.contains(words)))
+            .collect()
     };
-    let limited = demo_server(1).set("isolation", "none").set("limits.memory", 1000).set("limits.cores", 1);
+    let limited = demo_server(1)
+        .set("isolation", "none")
+        .set("limits.memory", 1000)
+        .set("limits.cores", 1);
     let server = limited.start().await;
     assert_eq!(told(&server.log(), "WARN").len(), 2, "{}", server.log());
     let check = || {
         let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_simulation-server"));
-        let output = command.arg("--check").arg(server.folder.join("config.json")).output().unwrap();
+        let output = command
+            .arg("--check")
+            .arg(server.folder.join("config.json"))
+            .output()
+            .unwrap();
         String::from_utf8([output.stdout, output.stderr].concat()).unwrap()
     };
     let text = check();
@@ -111,6 +146,10 @@ async fn a_webots_that_is_never_ready_names_level_and_keys() {
         let server = server_of(webots, 1).set("isolation", isolation).start().await;
         let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
         assert!(told.contains("no module named arm"), "{told}");
-        assert_eq!(told.contains("It ran in a sandbox") && told.contains("sandbox.readable"), is_told, "{told}");
+        assert_eq!(
+            told.contains("It ran in a sandbox") && told.contains("sandbox.readable"),
+            is_told,
+            "{told}"
+        );
     }
 }

@@ -11,7 +11,9 @@ const LEVELS: [&str; 2] = ["none", "sandbox"];
 
 /// The error for the client of a simulation that does this once it is ready, and must be ended for it.
 async fn told_for(deed: &str, level: &str, key: &str, value: u64) -> String {
-    let webots = Webots::script(&format!("{DEMO} \"$@\" &\nuntil [ -e go ]; do sleep 0.05; done\n{deed}\nwait"));
+    let webots = Webots::script(&format!(
+        "{DEMO} \"$@\" &\nuntil [ -e go ]; do sleep 0.05; done\n{deed}\nwait"
+    ));
     let builder = server_of(webots, 4).set("isolation", level);
     let server = builder.set(&format!("limits.{key}"), value).start().await;
     let mut client = Client::ready(&server).await;
@@ -58,8 +60,14 @@ async fn files_are_bounded_in_size_and_those_that_are_open_in_number() {
             (1500, 1200, "files 1024 1200 core 0"),
             (70, 1200, "files 70 70 core 0"),
         ] {
-            let builder = server_of(Webots::script(script), 1).set("isolation", level).set("limits.disk", 5);
-            let server = builder.set("limits.openFiles", limit).files(of_the_server).start().await;
+            let builder = server_of(Webots::script(script), 1)
+                .set("isolation", level)
+                .set("limits.disk", 5);
+            let server = builder
+                .set("limits.openFiles", limit)
+                .files(of_the_server)
+                .start()
+                .await;
             let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
             assert!(told.contains(words) && told.contains("5242880"), "{told}");
         }
@@ -116,7 +124,9 @@ pub struct Delegated(pub std::path::PathBuf);
 impl Delegated {
     pub fn new() -> Option<Self> {
         let mounts = procfs::process::Process::myself().unwrap().mountinfo().unwrap();
-        let mount = mounts.into_iter().find(|mount| mount.fs_type == "cgroup2" && mount.root == "/")?;
+        let mount = mounts
+            .into_iter()
+            .find(|mount| mount.fs_type == "cgroup2" && mount.root == "/")?;
         let folder = mount.mount_point.join(format!("fleet-test-{}", rand::random::<u64>()));
         std::fs::create_dir(&folder).ok().map(|()| Self(folder))
     }
@@ -127,7 +137,10 @@ impl Delegated {
     }
 
     pub fn groups(&self) -> Vec<String> {
-        let inside = std::fs::read_dir(&self.0).unwrap().flatten().filter(|entry| entry.path().is_dir());
+        let inside = std::fs::read_dir(&self.0)
+            .unwrap()
+            .flatten()
+            .filter(|entry| entry.path().is_dir());
         inside.map(|entry| entry.file_name().into_string().unwrap()).collect()
     }
 }
@@ -159,7 +172,10 @@ async fn a_simulation_has_its_own_control_group() {
         let mut groups = delegated.groups();
         groups.sort();
         assert_eq!(groups.len(), 2, "{groups:?}");
-        assert!(groups[0] == "server" && groups[1].starts_with("simulation-"), "{groups:?}");
+        assert!(
+            groups[0] == "server" && groups[1].starts_with("simulation-"),
+            "{groups:?}"
+        );
         let members = std::fs::read_to_string(delegated.0.join(&groups[1]).join("cgroup.procs")).unwrap();
         assert!(members.lines().count() >= 3, "{members}");
         let id = client.id().to_owned();

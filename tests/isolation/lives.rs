@@ -38,11 +38,18 @@ async fn what_hides_on_purpose_ends_with_its_sandbox() {
         let webots = Webots::script(&format!(
             "(env -i sleep {stayed} &)\n(setsid sleep {left} &)\n(env -i setsid sleep {hidden} &)\n{DEMO} \"$@\" & wait"
         ));
-        let mut server = server_of(webots, 1).set("isolation", level).set("timing.grace", 0.5).start().await;
+        let mut server = server_of(webots, 1)
+            .set("isolation", level)
+            .set("timing.grace", 0.5)
+            .start()
+            .await;
         let client = Client::ready(&server).await;
         let all = [("stayed", &stayed), ("left", &left), ("hidden", &hidden)];
         let alive = || -> Vec<&str> {
-            all.into_iter().filter(|(_, word)| !named(word).is_empty()).map(|(name, _)| name).collect()
+            all.into_iter()
+                .filter(|(_, word)| !named(word).is_empty())
+                .map(|(name, _)| name)
+                .collect()
         };
         until("they hide", async || alive().len() == 3).await;
         match reason {
@@ -53,8 +60,14 @@ async fn what_hides_on_purpose_ends_with_its_sandbox() {
                 server.ended().await;
             }
         }
-        until(&format!("{level}, {reason}: there is only {survivors:?}"), async || alive() == survivors).await;
-        until("its folder is gone", async || instance_folders(&server.folder).is_empty()).await;
+        until(&format!("{level}, {reason}: there is only {survivors:?}"), async || {
+            alive() == survivors
+        })
+        .await;
+        until("its folder is gone", async || {
+            instance_folders(&server.folder).is_empty()
+        })
+        .await;
         assert_eq!(alive(), survivors, "{level}, {reason}");
         for pid in all.into_iter().flat_map(|(_, word)| named(word)) {
             kill(Pid::from_raw(pid), Signal::SIGKILL).unwrap();
@@ -67,16 +80,30 @@ async fn a_simulation_has_its_grace_time_at_each_level() {
     needs!("bwrap");
     for (level, user, network) in levels() {
         let stage = Stage::new();
-        let (open, written) = (stage.elsewhere.path().to_str().unwrap(), stage.elsewhere.path().join("written"));
+        let (open, written) = (
+            stage.elsewhere.path().to_str().unwrap(),
+            stage.elsewhere.path().join("written"),
+        );
         // Like Webots' launcher: it forwards SIGTERM, and waits.
         let work = format!("sleep 0.3; echo saved > '{}'", written.display());
         let webots = Webots::script(&format!("trap \"{work}; exit 0\" TERM\n{DEMO} \"$@\" & wait"));
-        let builder = stage.builder(&webots, level).before(user).set("sandbox.network", network);
-        let server = builder.set("sandbox.writable", open).set("timing.grace", 10).start().await;
+        let builder = stage
+            .builder(&webots, level)
+            .before(user)
+            .set("sandbox.network", network);
+        let server = builder
+            .set("sandbox.writable", open)
+            .set("timing.grace", 10)
+            .start()
+            .await;
         let client = Client::ready(&server).await;
         client.leave().await;
         nothing_left(&server, 2).await;
-        assert_eq!(std::fs::read_to_string(&written).unwrap_or_default(), "saved\n", "{level}, {network}");
+        assert_eq!(
+            std::fs::read_to_string(&written).unwrap_or_default(),
+            "saved\n",
+            "{level}, {network}"
+        );
     }
 }
 
@@ -85,13 +112,21 @@ async fn a_simulation_that_ignores_sigterm_is_killed() {
     needs!("bwrap");
     for (level, user, network) in levels() {
         let stage = Stage::new();
-        let webots = Webots::script(&format!("trap '' TERM\n{DEMO} \"$@\" &\nwhile true; do wait; sleep 0.1; done"));
-        let builder = stage.builder(&webots, level).before(user).set("sandbox.network", network);
+        let webots = Webots::script(&format!(
+            "trap '' TERM\n{DEMO} \"$@\" &\nwhile true; do wait; sleep 0.1; done"
+        ));
+        let builder = stage
+            .builder(&webots, level)
+            .before(user)
+            .set("sandbox.network", network);
         let server = builder.set("maxConnections", 1).start().await;
         let client = Client::ready(&server).await;
         let left = Instant::now();
         client.leave().await;
         let took = gone_within(0.5, left, &server).await;
-        assert!(took >= Duration::from_millis(500), "{level}, {network}: it was killed after {took:?}");
+        assert!(
+            took >= Duration::from_millis(500),
+            "{level}, {network}: it was killed after {took:?}"
+        );
     }
 }

@@ -27,7 +27,11 @@ fn ordinary() -> Option<&'static str> {
         skip("an ordinary user can't open /dev/net/tun here");
         return None;
     }
-    if nix::unistd::getuid().is_root() { as_nobody() } else { Some("true") }
+    if nix::unistd::getuid().is_root() {
+        as_nobody()
+    } else {
+        Some("true")
+    }
 }
 
 /// The isolations of a simulation: level, command that runs the server, and network.
@@ -39,7 +43,10 @@ pub fn levels() -> Vec<(&'static str, &'static str, &'static str)> {
 
 /// A server of an ordinary user, with this network for its sandboxes.
 fn server(stage: &Stage, webots: &Webots, user: &str, network: &str) -> Builder {
-    stage.builder(webots, "sandbox").before(user).set("sandbox.network", network)
+    stage
+        .builder(webots, "sandbox")
+        .before(user)
+        .set("sandbox.network", network)
 }
 
 /// Sets `port` in a shell to the value of the option `--port`.
@@ -60,8 +67,14 @@ async fn a_world_in_its_own_network_reaches_nothing_of_the_machine() {
     let six = std::net::TcpListener::bind("[::1]:0");
     let port = four.local_addr().unwrap().port();
     let mut deeds = vec![
-        ("reach a port of the machine", python(&format!("s.create_connection(('127.0.0.1', {port}), 5)"))),
-        ("reach an abstract socket", python(&format!("s.socket(s.AF_UNIX).connect('\\\\0{name}')"))),
+        (
+            "reach a port of the machine",
+            python(&format!("s.create_connection(('127.0.0.1', {port}), 5)")),
+        ),
+        (
+            "reach an abstract socket",
+            python(&format!("s.socket(s.AF_UNIX).connect('\\\\0{name}')")),
+        ),
         ("pass for a trusted proxy", {
             // The server's own port is one below the first slot's.
             let request = "GET /load HTTP/1.1\\r\\nHost: x\\r\\nX-Forwarded-For: 192.0.2.7\\r\\n\\r\\n";
@@ -89,12 +102,18 @@ async fn a_world_in_its_own_network_reaches_nothing_of_the_machine() {
     ];
     if let Ok(six) = &six {
         let port = six.local_addr().unwrap().port();
-        deeds
-            .push(("reach a port of the machine by IPv6", python(&format!("s.create_connection(('::1', {port}), 5)"))));
+        deeds.push((
+            "reach a port of the machine by IPv6",
+            python(&format!("s.create_connection(('::1', {port}), 5)")),
+        ));
     }
     let tried = async |network: &str| -> Vec<String> {
         let change = |builder: Builder| builder.before(user).set("sandbox.network", network);
-        stage.tried(&deeds, "sandbox", |builder| change(builder).set("limits.output", 10_000)).await
+        stage
+            .tried(&deeds, "sandbox", |builder| {
+                change(builder).set("limits.output", 10_000)
+            })
+            .await
     };
     let own = tried("own").await;
     let free = |name: &String| name != "be kept from the internet";
@@ -102,10 +121,18 @@ async fn a_world_in_its_own_network_reaches_nothing_of_the_machine() {
         own.into_iter().filter(free).collect::<Vec<_>>(),
         ["use its own loopback", "be kept from private addresses"]
     );
-    let all = ["use its own loopback", "be kept from private addresses", "be kept from the internet"];
+    let all = [
+        "use its own loopback",
+        "be kept from private addresses",
+        "be kept from the internet",
+    ];
     assert_eq!(tried("closed").await, all);
     let shared = tried("shared").await;
-    let mut reached = vec!["reach a port of the machine", "reach an abstract socket", "pass for a trusted proxy"];
+    let mut reached = vec![
+        "reach a port of the machine",
+        "reach an abstract socket",
+        "pass for a trusted proxy",
+    ];
     reached.extend(six.is_ok().then_some("reach a port of the machine by IPv6"));
     for deed in reached {
         assert!(shared.iter().any(|one| one == deed), "{deed}: {shared:?}");
@@ -121,11 +148,19 @@ async fn who_takes_all_ports_in_its_own_network_keeps_nobody_out() {
     let Some(user) = ordinary() else { return };
     for network in ["own", "shared"] {
         let stage = Stage::new();
-        let webots = Webots::script(&format!("export PYTHONUNBUFFERED=1\n{PORT}\n{TAKES_ALL}\n{DEMO} \"$@\" & wait"));
-        let server = server(&stage, &webots, user, network).set("maxConnections", 3).start().await;
+        let webots = Webots::script(&format!(
+            "export PYTHONUNBUFFERED=1\n{PORT}\n{TAKES_ALL}\n{DEMO} \"$@\" & wait"
+        ));
+        let server = server(&stage, &webots, user, network)
+            .set("maxConnections", 3)
+            .start()
+            .await;
         let first = Client::ready(&server).await;
         let log = server.output_file(&first);
-        until("all are taken", async || std::fs::read_to_string(&log).is_ok_and(|text| text.contains("TAKEN"))).await;
+        until("all are taken", async || {
+            std::fs::read_to_string(&log).is_ok_and(|text| text.contains("TAKEN"))
+        })
+        .await;
         let mut second = Client::start(&server, &arm()).await;
         let outcome = loop {
             match second.next().await {
@@ -153,13 +188,20 @@ async fn a_display_can_be_reached_at_each_level() {
     ];
     for (level, user, network) in levels() {
         let change = |builder: Builder| builder.before(user).set("sandbox.network", network).set("xvfb", true);
-        assert_eq!(Stage::new().tried(&deeds, level, change).await, ["use the display"], "{level}, {network}");
+        assert_eq!(
+            Stage::new().tried(&deeds, level, change).await,
+            ["use the display"],
+            "{level}, {network}"
+        );
     }
 }
 
 /// The processes of a server's simulations, without the server itself.
 fn all_of(server: &Server) -> Vec<(i32, String)> {
-    instances_below(&server.folder).into_iter().filter(|(pid, _)| *pid != server.pid()).collect()
+    instances_below(&server.folder)
+        .into_iter()
+        .filter(|(pid, _)| *pid != server.pid())
+        .collect()
 }
 
 #[actix_rt::test]
@@ -168,15 +210,24 @@ async fn pasta_ends_with_its_simulation_and_with_the_server() {
     for end in ["client", "pasta", "server"] {
         let stage = Stage::new();
         let webots = Webots::script(&format!("(env -i setsid sleep 1000 &)\n{DEMO} \"$@\" & wait"));
-        let mut server = server(&stage, &webots, user, "own").set("maxConnections", 1).start().await;
+        let mut server = server(&stage, &webots, user, "own")
+            .set("maxConnections", 1)
+            .start()
+            .await;
         let mut client = Client::ready(&server).await;
         let parent = server.pid();
         let is_pasta = |one: &procfs::process::Process| {
-            one.stat().is_ok_and(|stat| stat.ppid == parent && stat.comm.starts_with("pas"))
+            one.stat()
+                .is_ok_and(|stat| stat.ppid == parent && stat.comm.starts_with("pas"))
         };
         let all = || procfs::process::all_processes().unwrap().flatten();
         let pasta = all().find(is_pasta).unwrap().pid();
-        let inside = procfs::process::Process::new(pasta).unwrap().task_main_thread().unwrap().children().unwrap();
+        let inside = procfs::process::Process::new(pasta)
+            .unwrap()
+            .task_main_thread()
+            .unwrap()
+            .children()
+            .unwrap();
         match end {
             "pasta" => {
                 kill(Pid::from_raw(pasta), Signal::SIGKILL).unwrap();
@@ -196,7 +247,10 @@ async fn pasta_ends_with_its_simulation_and_with_the_server() {
                 gone_within(0.5, left, &server).await;
             }
         }
-        until("nothing runs", async || all_of(&server).is_empty() && !all().any(|one| is_pasta(&one))).await;
+        until("nothing runs", async || {
+            all_of(&server).is_empty() && !all().any(|one| is_pasta(&one))
+        })
+        .await;
         let lives =
             |pid: &u32| procfs::process::Process::new(i32::try_from(*pid).unwrap()).is_ok_and(|one| one.is_alive());
         until("bubblewrap has ended", async || !inside.iter().any(lives)).await;
@@ -208,7 +262,10 @@ async fn how_a_program_has_ended_is_told_from_its_own_network() {
     let Some(user) = ordinary() else { return };
     let stage = Stage::new();
     for (script, words) in [
-        ("echo LAST; exit 7", "Webots ended with exit code 7. Its last output: LAST"),
+        (
+            "echo LAST; exit 7",
+            "Webots ended with exit code 7. Its last output: LAST",
+        ),
         ("kill -SEGV $$", "Webots was ended by the signal SIGSEGV"),
     ] {
         let webots = Webots::script(script);
@@ -220,34 +277,59 @@ async fn how_a_program_has_ended_is_told_from_its_own_network() {
 #[actix_rt::test]
 async fn which_network_simulations_have_is_told() {
     let Some(user) = ordinary() else { return };
-    let names = ["git", "bash", "env", "sh", "setpriv", "bwrap", "prlimit", "unshare", "pasta"];
+    let names = [
+        "git", "bash", "env", "sh", "setpriv", "bwrap", "prlimit", "unshare", "pasta",
+    ];
     let (all, none) = (programs(&names), programs(&names[..8]));
     let path = |folder: &tempfile::TempDir| folder.path().to_str().unwrap().to_owned();
     for (network, path, shown, words) in [
-        ("auto", path(&all), "own", "own, with the internet, without this machine and private addresses"),
+        (
+            "auto",
+            path(&all),
+            "own",
+            "own, with the internet, without this machine and private addresses",
+        ),
         ("closed", path(&all), "closed", "closed, nothing can be reached"),
         ("shared", path(&all), "shared", "shared with this machine"),
-        ("auto", path(&none), "shared", "shared with this machine: pasta is not there; on Debian"),
+        (
+            "auto",
+            path(&none),
+            "shared",
+            "shared with this machine: pasta is not there; on Debian",
+        ),
     ] {
         let stage = Stage::new();
         let webots = Webots::script("exit 1");
         let setpriv = user.replace("setpriv", "/usr/bin/setpriv");
-        let server = server(&stage, &webots, &setpriv, network).env("PATH", &path).start().await;
+        let server = server(&stage, &webots, &setpriv, network)
+            .env("PATH", &path)
+            .start()
+            .await;
         assert_eq!(server.status().await["network"], shown);
         let page = server.monitor().await;
         assert!(page.contains(&format!("<dd>{words}")), "{page}");
-        assert!(server.log().contains(&format!("network of simulations: {words}")), "{}", server.log());
+        assert!(
+            server.log().contains(&format!("network of simulations: {words}")),
+            "{}",
+            server.log()
+        );
     }
     let (stage, webots) = (Stage::new(), Webots::script("exit 1"));
     let setpriv = user.replace("setpriv", "/usr/bin/setpriv");
-    let told = server(&stage, &webots, &setpriv, "own").env("PATH", &path(&none)).refused(1).await;
+    let told = server(&stage, &webots, &setpriv, "own")
+        .env("PATH", &path(&none))
+        .refused(1)
+        .await;
     assert!(told.contains("but pasta is not there"), "{told}");
 }
 
 #[actix_rt::test]
 async fn a_machine_with_one_version_of_ip_has_own_networks() {
     let Some(user) = ordinary() else { return };
-    for (ip, address, route) in [("ip -6", "2001:db8::2/64", "2001:db8::1"), ("ip -4", "192.0.2.2/24", "192.0.2.1")] {
+    for (ip, address, route) in [
+        ("ip -6", "2001:db8::2/64", "2001:db8::1"),
+        ("ip -4", "192.0.2.2/24", "192.0.2.1"),
+    ] {
         // From here on, this thread starts programs in a network namespace with only this address and route.
         if unshare(CloneFlags::CLONE_NEWNET).is_err() {
             return skip("only root can make a network namespace");
@@ -256,14 +338,19 @@ async fn a_machine_with_one_version_of_ip_has_own_networks() {
             "ip link set lo up && ip link add out type veth peer name far && ip link set far up && sysctl -qw net.ipv6.conf.out.accept_dad=0 && \
              {ip} address add {address} dev out && ip link set out up && {ip} route add default via {route}"
         );
-        let made = std::process::Command::new("sh").args(["-ec", &script]).output().unwrap();
+        let made = std::process::Command::new("sh")
+            .args(["-ec", &script])
+            .output()
+            .unwrap();
         if !made.status.success() {
             return skip(&format!("no network: {}", String::from_utf8_lossy(&made.stderr)));
         }
         for streaming in ["direct", "relay"] {
             let (stage, webots) = (Stage::new(), Webots::script(&format!("{DEMO} \"$@\" & wait")));
             // `::` stands for the addresses of this namespace.
-            let server = server(&stage, &webots, user, "own").set("streaming", streaming).set("bind", "::");
+            let server = server(&stage, &webots, user, "own")
+                .set("streaming", streaming)
+                .set("bind", "::");
             let server = server.env("DEMO_SIMULATOR_BIND", "::").start().await;
             let client = Client::ready(&server).await;
             client.leave().await;

@@ -68,7 +68,9 @@ impl Least {
 async fn server(webots: Webots, folder: &Path, change: impl FnOnce(Builder) -> Builder) -> Server {
     open(folder);
     let builder = server_of(webots, 2).folder(folder).set("timing.heartbeat", 0.5);
-    change(builder.set("isolation", "sandbox").set("limits.disk", 1_000_000)).start().await
+    change(builder.set("isolation", "sandbox").set("limits.disk", 1_000_000))
+        .start()
+        .await
 }
 
 fn webots() -> Webots {
@@ -81,7 +83,10 @@ fn webots() -> Webots {
 async fn doing(server: &Server, deed: &str) -> (Client, PathBuf) {
     let before = instance_folders(&server.folder);
     let client = Client::ready(server).await;
-    let new = instance_folders(&server.folder).into_iter().find(|folder| !before.contains(folder)).unwrap();
+    let new = instance_folders(&server.folder)
+        .into_iter()
+        .find(|folder| !before.contains(folder))
+        .unwrap();
     std::fs::write(new.join("project/deed"), deed).unwrap();
     (client, new)
 }
@@ -109,14 +114,21 @@ async fn on_a_quiet_machine_the_reserve_of_the_disk_is_kept() {
         let (mut innocent, folder) = doing(&server, "").await;
         go(&folder, "true");
         // A server of root sees hidden descriptors, too.
-        for (name, deed, argument) in [("many", MANY, ""), ("nameless", NAMELESS, ""), ("hidden", NAMELESS, "hidden")] {
+        for (name, deed, argument) in [
+            ("many", MANY, ""),
+            ("nameless", NAMELESS, ""),
+            ("hidden", NAMELESS, "hidden"),
+        ] {
             let what = format!("{user}, {name}");
             let (mut client, folder) = doing(&server, deed).await;
             let least = Least::of(&small);
             go(&folder, &format!("python3 deed {argument}"));
             let told = actix_rt::time::timeout(SOON, client.until("loading: Error:")).await;
             let told = told.unwrap_or_else(|_| panic!("{what}: it was not ended, {} MiB were left", least.mib()));
-            assert!(told.contains("is almost full (diskReserve), and the simulation "), "{what}: {told}");
+            assert!(
+                told.contains("is almost full (diskReserve), and the simulation "),
+                "{what}: {told}"
+            );
             let hides = user == "nobody" && name == "hidden";
             assert_eq!(told.contains("hides which files"), hides, "{what}: {told}");
             assert_eq!(client.closed().await, Some(1000), "{what}");
@@ -138,7 +150,10 @@ async fn no_simulation_ends_where_another_program_fills_the_disk() {
     if !disk::small_disk(folder.path(), 64) {
         return skip("only root may mount a small disk");
     }
-    let server = server(Webots::launcher(), folder.path(), |builder| builder.set("diskReserve", 8)).await;
+    let server = server(Webots::launcher(), folder.path(), |builder| {
+        builder.set("diskReserve", 8)
+    })
+    .await;
     let mut client = Client::ready(&server).await;
     let _filler = Full::at(folder.path());
     until("it is full", async || server.health().await.0 == 503).await;

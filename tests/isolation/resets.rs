@@ -18,7 +18,10 @@ async fn a_reset_replaces_a_link_and_follows_none() {
         ("rm -r controllers; touch controllers", false),
         ("rm -r controllers", false),
         ("rm controllers/c/c.py; mkfifo controllers/c/c.py", true),
-        ("rm controllers/c/c.py; mkdir controllers/c/c.py; touch controllers/c/c.py/mine", false),
+        (
+            "rm controllers/c/c.py; mkdir controllers/c/c.py; touch controllers/c/c.py/mine",
+            false,
+        ),
     ];
     for level in ["none", "sandbox"] {
         let server = demo_server(1).set("isolation", level).start().await;
@@ -34,7 +37,10 @@ async fn a_reset_replaces_a_link_and_follows_none() {
             // The server's git must ignore settings in the project's folder.
             let git = "echo '*.py working-tree-encoding=UTF-16' > .gitattributes; echo 'gitdir: /tmp' > .git";
             let mut shell = std::process::Command::new("sh");
-            let done = shell.args(["-ec", &format!("{deed}; {git}")]).current_dir(folder.join("project")).status();
+            let done = shell
+                .args(["-ec", &format!("{deed}; {git}")])
+                .current_dir(folder.join("project"))
+                .status();
             assert!(done.unwrap().success());
             let what = format!("{level}, {deed}");
             let answer = client.reset("c/c.py").await;
@@ -47,9 +53,20 @@ async fn a_reset_replaces_a_link_and_follows_none() {
             }
             assert_eq!(std::fs::read_to_string(&victim).unwrap(), "untouched", "{what}");
             let inside = |folder: &Path| std::fs::read_dir(folder).unwrap().count();
-            assert_eq!((inside(outside.path()), inside(&outside.path().join("c"))), (2, 0), "{what}");
-            let left: Vec<_> = std::fs::read_dir(&folder).unwrap().flatten().map(|entry| entry.file_name()).collect();
-            assert!(!left.iter().any(|name| name.to_string_lossy().starts_with("restored")), "{left:?}");
+            assert_eq!(
+                (inside(outside.path()), inside(&outside.path().join("c"))),
+                (2, 0),
+                "{what}"
+            );
+            let left: Vec<_> = std::fs::read_dir(&folder)
+                .unwrap()
+                .flatten()
+                .map(|entry| entry.file_name())
+                .collect();
+            assert!(
+                !left.iter().any(|name| name.to_string_lossy().starts_with("restored")),
+                "{left:?}"
+            );
             client.leave().await;
             nothing_left(&server, 1).await;
         }
@@ -69,7 +86,9 @@ async fn a_reset_never_writes_outside_of_the_project() {
     needs!("bwrap");
     let outside = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap();
     let outside_shown = outside.path().display();
-    let webots = Webots::script(&format!("python3 -c \"{EXCHANGE}\" '{outside_shown}' &\n{DEMO} \"$@\" & wait"));
+    let webots = Webots::script(&format!(
+        "python3 -c \"{EXCHANGE}\" '{outside_shown}' &\n{DEMO} \"$@\" & wait"
+    ));
     let server = server_of(webots, 1).set("isolation", "sandbox");
     // Resets between two pings are limited.
     let server = server.set("timing.ping", 0.2).start().await;

@@ -13,7 +13,11 @@ cp --remove-destination "$PROGRAMS"/session-server "$PROGRAMS"/simulation-server
 /// Starts and stops the servers; returns the output of the start, and the recorded calls of cargo.
 fn start(project: &Project, name: &str) -> (String, String) {
     let server_sh = |arguments: &[&str]| {
-        let path = format!("{}:{}", project.path("bin-of-cargo").display(), std::env::var("PATH").unwrap());
+        let path = format!(
+            "{}:{}",
+            project.path("bin-of-cargo").display(),
+            std::env::var("PATH").unwrap()
+        );
         let mut command = Command::new(project.path("server.sh"));
         let output = command
             .args(arguments)
@@ -23,7 +27,11 @@ fn start(project: &Project, name: &str) -> (String, String) {
             .output()
             .unwrap();
         let said = String::from_utf8_lossy(&output.stdout).into_owned();
-        assert!(output.status.success(), "{said}{}", String::from_utf8_lossy(&output.stderr));
+        assert!(
+            output.status.success(),
+            "{said}{}",
+            String::from_utf8_lossy(&output.stderr)
+        );
         said
     };
     let said = server_sh(&["start", name]);
@@ -46,12 +54,18 @@ fn a_start_builds_changed_programs() {
     let servers = "build --release --locked --bin simulation-server --bin session-server";
 
     let (said, asked) = start(&project, "demo");
-    assert!(said.starts_with("builds the programs first, which takes about three minutes on two cores"), "{said}");
+    assert!(
+        said.starts_with("builds the programs first, which takes about three minutes on two cores"),
+        "{said}"
+    );
     assert_eq!(asked, format!("{servers} --bin demo-simulator --target-dir target\n"));
     assert_eq!(start(&project, "demo").1, "", "nothing has changed");
     std::fs::write(project.path("src/lib.rs"), "// changed").unwrap();
     let (said, asked) = start(&project, "local");
     assert!(!said.contains("three minutes"), "{said}");
     assert_eq!(asked, format!("{servers} --target-dir target\n"));
-    assert_eq!(start(&project, "demo").1, format!("{servers} --bin demo-simulator --target-dir target\n"));
+    assert_eq!(
+        start(&project, "demo").1,
+        format!("{servers} --bin demo-simulator --target-dir target\n")
+    );
 }

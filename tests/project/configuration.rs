@@ -48,7 +48,9 @@ impl Kind {
     /// Every key with its default; nested keys as `part.key`.
     fn defaults(&self) -> BTreeMap<String, Value> {
         let output = self.check(&self.smallest.to_string());
-        let Value::Object(all) = serde_json::from_slice(&output.stdout).unwrap() else { panic!("{output:?}") };
+        let Value::Object(all) = serde_json::from_slice(&output.stdout).unwrap() else {
+            panic!("{output:?}")
+        };
         let mut keys = BTreeMap::new();
         for (key, value) in all {
             match value {
@@ -82,11 +84,19 @@ impl Kind {
 
 /// Runs `--check`; of its messages, keeps only those about the file.
 fn check(program: &str, file: &Path) -> Output {
-    let output = Command::new(program).arg("--check").arg(file).env_remove("WEBOTS_HOME").output().unwrap();
+    let output = Command::new(program)
+        .arg("--check")
+        .arg(file)
+        .env_remove("WEBOTS_HOME")
+        .output()
+        .unwrap();
     let name = file.display().to_string();
     let remarks = String::from_utf8(output.stderr).unwrap();
     let about: Vec<&str> = remarks.lines().filter(|line| line.contains(&name)).collect();
-    Output { stderr: about.join("\n").into_bytes(), ..output }
+    Output {
+        stderr: about.join("\n").into_bytes(),
+        ..output
+    }
 }
 
 #[test]
@@ -98,9 +108,16 @@ fn every_shipped_configuration_is_taken_without_a_warning() {
         let packaged = root().join("deploy/config").join(name).join("main.json");
         for file in files.iter().chain([&packaged]) {
             let output = check(kind.program, file);
-            assert!(output.status.success() && output.stderr.is_empty(), "{}: {output:?}", file.display());
+            assert!(
+                output.status.success() && output.stderr.is_empty(),
+                "{}: {output:?}",
+                file.display()
+            );
             let config: Value = serde_json::from_slice(&output.stdout).unwrap();
-            assert!(*file != packaged || config["bind"] == "127.0.0.1", "the package's is reached from outside");
+            assert!(
+                *file != packaged || config["bind"] == "127.0.0.1",
+                "the package's is reached from outside"
+            );
         }
     }
 }
@@ -121,7 +138,10 @@ fn the_page_names_every_key_once_with_its_default_and_no_other() {
             if told == "required" {
                 let output = kind.check("{}");
                 let told = String::from_utf8_lossy(&output.stderr);
-                assert!(output.status.code() == Some(2) && told.ends_with(&format!(" {key}: it is missing")), "{told}");
+                assert!(
+                    output.status.code() == Some(2) && told.ends_with(&format!(" {key}: it is missing")),
+                    "{told}"
+                );
             } else if told == "none" {
                 let empty = [json!(null), json!([]), json!({})];
                 assert!(empty.contains(default), "{key}: the page says none, it is {default}");
@@ -142,12 +162,18 @@ fn the_page_names_every_key_once_with_its_default_and_no_other() {
 fn the_examples_of_the_page_are_taken_without_a_warning() {
     for kind in kinds() {
         let page = kind.page();
-        let examples: Vec<&str> =
-            page.split("```json\n").skip(1).map(|text| text.split("```").next().unwrap()).collect();
+        let examples: Vec<&str> = page
+            .split("```json\n")
+            .skip(1)
+            .map(|text| text.split("```").next().unwrap())
+            .collect();
         assert!(!examples.is_empty(), "{}", kind.heading);
         for example in examples {
             let output = kind.check(example);
-            assert!(output.status.success() && output.stderr.is_empty(), "{example}{output:?}");
+            assert!(
+                output.status.success() && output.stderr.is_empty(),
+                "{example}{output:?}"
+            );
         }
     }
 }
@@ -178,6 +204,9 @@ fn values_come_from_files_and_the_environment() {
         }
         let output = kind.check(r#"{"simulationServers": [], "publicUrl": "$NOWHERE"}"#);
         let told = String::from_utf8_lossy(&output.stderr);
-        assert!(output.status.code() == Some(2) && told.contains("publicUrl") && told.contains("NOWHERE"), "{told}");
+        assert!(
+            output.status.code() == Some(2) && told.contains("publicUrl") && told.contains("NOWHERE"),
+            "{told}"
+        );
     }
 }

@@ -38,7 +38,11 @@ impl Project {
     pub fn copy() -> Self {
         // Webots may take one of the ten ports after its own.
         let session = ports::block(24);
-        let project = Self { temporary: tempfile::tempdir().unwrap(), session, simulation: session + 1 };
+        let project = Self {
+            temporary: tempfile::tempdir().unwrap(),
+            session,
+            simulation: session + 1,
+        };
         copy(&root().join("server.sh"), &project.path("server.sh"));
         copy(&root().join("config"), &project.path("config"));
         copy(&root().join("tests/websocket.sh"), &project.path("tests/websocket.sh"));
@@ -56,7 +60,9 @@ impl Project {
                 config["bind"] = "127.0.0.1".into();
             });
         }
-        project.configure("simulation/demo", |config| config["webots"] = env!("CARGO_BIN_EXE_demo-simulator").into());
+        project.configure("simulation/demo", |config| {
+            config["webots"] = env!("CARGO_BIN_EXE_demo-simulator").into()
+        });
         project
     }
 
@@ -87,9 +93,15 @@ impl Project {
             .kill_on_drop(true)
             .output();
         let output = actix_rt::time::timeout(LIMIT, command).await;
-        let output = output.unwrap_or_else(|_| panic!("server.sh {arguments:?} does not end")).unwrap();
+        let output = output
+            .unwrap_or_else(|_| panic!("server.sh {arguments:?} does not end"))
+            .unwrap();
         let text = |bytes| String::from_utf8(bytes).unwrap();
-        Outcome { code: output.status.code(), output: text(output.stdout), errors: text(output.stderr) }
+        Outcome {
+            code: output.status.code(),
+            output: text(output.stdout),
+            errors: text(output.stderr),
+        }
     }
 
     /// Like `server_sh`, but asserts success; returns the output.
@@ -97,9 +109,15 @@ impl Project {
         let outcome = self.server_sh(arguments).await;
         assert_eq!(outcome.code, Some(0), "{arguments:?}: {outcome:#?}");
         // Warnings that the machine lacks something optional are no errors.
-        let faults =
-            outcome.errors.lines().filter(|line| !line.starts_with("warning: ") || !line.contains(" is not there"));
-        assert_eq!(faults.collect::<Vec<_>>(), Vec::<&str>::new(), "{arguments:?}: {outcome:#?}");
+        let faults = outcome
+            .errors
+            .lines()
+            .filter(|line| !line.starts_with("warning: ") || !line.contains(" is not there"));
+        assert_eq!(
+            faults.collect::<Vec<_>>(),
+            Vec::<&str>::new(),
+            "{arguments:?}: {outcome:#?}"
+        );
         outcome.output
     }
 
@@ -111,9 +129,13 @@ impl Project {
     /// What earlier servers have left: processes, PID files, folders of runs, ports that accept connections.
     pub fn leftovers(&self) -> Vec<String> {
         let mut left = processes_in(&self.folder());
-        let pid_files =
-            walk(&self.path("log")).into_iter().filter(|path| path.extension().is_some_and(|kind| kind == "pid"));
-        let runs = std::fs::read_dir(self.path("cache/runs")).into_iter().flatten().map(|entry| entry.unwrap().path());
+        let pid_files = walk(&self.path("log"))
+            .into_iter()
+            .filter(|path| path.extension().is_some_and(|kind| kind == "pid"));
+        let runs = std::fs::read_dir(self.path("cache/runs"))
+            .into_iter()
+            .flatten()
+            .map(|entry| entry.unwrap().path());
         left.extend(pid_files.chain(runs).map(|path| path.display().to_string()));
         for port in self.session..self.session + 12 {
             if std::net::TcpStream::connect(("127.0.0.1", port)).is_ok() {
@@ -132,7 +154,10 @@ impl Project {
 
 impl Drop for Project {
     fn drop(&mut self) {
-        let stop = ["90", "bash"].into_iter().map(PathBuf::from).chain([self.path("server.sh"), "stop".into()]);
+        let stop = ["90", "bash"]
+            .into_iter()
+            .map(PathBuf::from)
+            .chain([self.path("server.sh"), "stop".into()]);
         std::process::Command::new("timeout")
             .args(stop)
             .env("FLEET_BIN", programs())
@@ -142,7 +167,11 @@ impl Drop for Project {
             .ok();
         if std::thread::panicking() {
             for log in walk(&self.path("log")) {
-                eprintln!("--- {} ---\n{}", log.display(), std::fs::read_to_string(&log).unwrap_or_default());
+                eprintln!(
+                    "--- {} ---\n{}",
+                    log.display(),
+                    std::fs::read_to_string(&log).unwrap_or_default()
+                );
             }
         }
     }
@@ -159,7 +188,13 @@ pub fn processes_in(folder: &Path) -> Vec<String> {
     let processes = procfs::process::all_processes().unwrap().flatten();
     processes
         .filter(|process| process.cwd().is_ok_and(|cwd| cwd.starts_with(&folder)))
-        .map(|process| format!("process {} {}", process.pid(), process.cmdline().unwrap_or_default().join(" ")))
+        .map(|process| {
+            format!(
+                "process {} {}",
+                process.pid(),
+                process.cmdline().unwrap_or_default().join(" ")
+            )
+        })
         .collect()
 }
 
@@ -185,9 +220,17 @@ pub fn walk(folder: &Path) -> Vec<PathBuf> {
 }
 
 fn copy(from: &Path, to: &Path) {
-    let files = if from.is_dir() { walk(from) } else { vec![from.to_owned()] };
+    let files = if from.is_dir() {
+        walk(from)
+    } else {
+        vec![from.to_owned()]
+    };
     for file in files {
-        let to = if file == from { to.to_owned() } else { to.join(file.strip_prefix(from).unwrap()) };
+        let to = if file == from {
+            to.to_owned()
+        } else {
+            to.join(file.strip_prefix(from).unwrap())
+        };
         std::fs::create_dir_all(to.parent().unwrap()).unwrap();
         std::fs::copy(&file, &to).unwrap();
     }

@@ -16,7 +16,9 @@ const WORLD: &str = "https://github.com/webots-fleet/demo/blob/main/worlds/playg
 /// A client whose simulation of the demo's world is ready, and the URL of its stream.
 async fn simulate(project: &Project) -> (Client, String) {
     let mut client = Client::connect(&format!("ws://localhost:{}/client", project.simulation)).await;
-    client.send(&serde_json::json!({"start": {"url": WORLD}}).to_string()).await;
+    client
+        .send(&serde_json::json!({"start": {"url": WORLD}}).to_string())
+        .await;
     let url = client.until("webots:").await.trim_start_matches("webots:").to_owned();
     (client, url)
 }
@@ -38,7 +40,9 @@ async fn talk(project: &Project, url: &str, message: &str, last: &str) -> Vec<St
     let mut heard: Vec<String> = Vec::new();
     while !heard.last().is_some_and(|line| line.starts_with(last)) {
         let line = actix_rt::time::timeout(SOON, reader.next_line()).await;
-        let Ok(Ok(Some(line))) = line else { panic!("only {heard:?} came") };
+        let Ok(Ok(Some(line))) = line else {
+            panic!("only {heard:?} came")
+        };
         heard.push(line);
     }
     // As Ctrl-C does.
@@ -62,21 +66,35 @@ async fn the_demo_runs_from_its_start_to_its_stop() {
         assert!(told.contains(&part), "{part} is missing: {told}");
     }
 
-    until("a client can be placed", async || http::get(&project.session_url("/request")).await.text() == "1").await;
+    until("a client can be placed", async || {
+        http::get(&project.session_url("/request")).await.text() == "1"
+    })
+    .await;
     let answer = talk(&project, &format!("ws://localhost:{session}/session"), WORLD, "ws:").await;
     assert_eq!(answer, ["1".to_owned(), format!("ws://localhost:{simulation}")]);
     for path in ["/monitor", "/status", "/load", "/metrics", "/health", "/request"] {
         assert_eq!(http::get(&project.session_url(path)).await.status, 200, "{path}");
     }
     let start = serde_json::json!({"start": {"url": WORLD}}).to_string();
-    let answer = talk(&project, &format!("ws://localhost:{simulation}/client"), &start, "webots:").await;
+    let answer = talk(
+        &project,
+        &format!("ws://localhost:{simulation}/client"),
+        &start,
+        "webots:",
+    )
+    .await;
     let stream = format!("webots:ws://localhost:{simulation}/stream/");
     assert!(answer.last().unwrap().starts_with(&stream), "{answer:?}");
     until("neither a process nor a folder of the simulation is left", async || {
         instance_folders_in(&project.path("cache")).is_empty() && processes_in(&project.path("cache")).is_empty()
     })
     .await;
-    assert!(project.done(&["status"]).await.contains("demo: the session server runs"));
+    assert!(
+        project
+            .done(&["status"])
+            .await
+            .contains("demo: the session server runs")
+    );
     let before = project.pid("session", "demo");
     project.done(&["restart"]).await;
     assert_ne!(before, project.pid("session", "demo"));
@@ -92,14 +110,19 @@ async fn the_demo_runs_from_its_start_to_its_stop() {
 async fn a_server_that_does_not_end_is_killed_with_what_it_started() {
     needs!("bwrap");
     let project = Project::copy();
-    project.configure("simulation/demo", |config| config["timing"] = serde_json::json!({"stop": 1}));
+    project.configure("simulation/demo", |config| {
+        config["timing"] = serde_json::json!({"stop": 1})
+    });
     project.done(&["start", "demo"]).await;
     let (_client, _) = simulate(&project).await;
     kill(Pid::from_raw(project.pid("simulation", "demo")), Signal::SIGSTOP).unwrap();
     let stopped = project.done(&["stop"]).await;
     assert!(stopped.contains("killed the simulation server of demo"), "{stopped}");
     // The killed server could not remove the folder of its run; the next start does.
-    until("no process is left", async || processes_in(&project.folder()).is_empty()).await;
+    until("no process is left", async || {
+        processes_in(&project.folder()).is_empty()
+    })
+    .await;
     project.done(&["start", "demo"]).await;
     project.done(&["stop"]).await;
     nothing_is_left(&project).await;
@@ -109,18 +132,32 @@ async fn a_server_that_does_not_end_is_killed_with_what_it_started() {
 async fn without_webots_a_client_is_told_what_to_do() {
     let project = Project::copy();
     let home = project.path("no webots here");
-    project.configure("simulation/local", |config| config["webotsHome"] = home.to_str().unwrap().into());
+    project.configure("simulation/local", |config| {
+        config["webotsHome"] = home.to_str().unwrap().into()
+    });
     // Without a name, `server.sh` takes the configuration `local`.
     let started = project.server_sh(&["start"]).await;
     assert_eq!(started.code, Some(0), "{started:#?}");
-    assert!(started.errors.contains("warning: webots: This simulation server has no Webots"), "{started:#?}");
+    assert!(
+        started
+            .errors
+            .contains("warning: webots: This simulation server has no Webots"),
+        "{started:#?}"
+    );
     let mut client = Client::connect(&format!("ws://localhost:{}/client", project.simulation)).await;
     let world = "https://github.com/cyberbotics/webots/blob/released/projects/languages/python/worlds/example.wbt";
-    client.send(&serde_json::json!({"start": {"url": world}}).to_string()).await;
+    client
+        .send(&serde_json::json!({"start": {"url": world}}).to_string())
+        .await;
     client.closed().await;
-    let [told] = client.heard.as_slice() else { panic!("{:?}", client.heard) };
+    let [told] = client.heard.as_slice() else {
+        panic!("{:?}", client.heard)
+    };
     assert!(told.starts_with("loading: Error: "), "{told}");
-    assert!(told.contains("has no Webots that it can run at \"webots\"") && told.contains("webotsHome"), "{told}");
+    assert!(
+        told.contains("has no Webots that it can run at \"webots\"") && told.contains("webotsHome"),
+        "{told}"
+    );
     project.done(&["stop"]).await;
     nothing_is_left(&project).await;
 }

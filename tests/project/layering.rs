@@ -21,7 +21,9 @@ const ROOMS: [(&str, &str); 3] = [
 /// All files below `src`: the path, the text, and the text without comments and inline tests.
 fn sources() -> Vec<(String, String, String)> {
     let tests = Regex::new(r"(?s)#\[cfg\(test\)\]\nmod tests \{.*?\n\}\n|(?m-s:^ *//.*\n)").unwrap();
-    let files = walk(&root().join("src")).into_iter().filter(|path| path.extension().is_some_and(|end| end == "rs"));
+    let files = walk(&root().join("src"))
+        .into_iter()
+        .filter(|path| path.extension().is_some_and(|end| end == "rs"));
     files
         .map(|file| {
             let text = std::fs::read_to_string(&file).unwrap();
@@ -39,28 +41,48 @@ fn imports() -> BTreeMap<String, BTreeSet<String>> {
         let inside = inside.strip_suffix("/mod").unwrap_or(inside);
         (!inside.starts_with("bin/") && inside != "lib").then(|| inside.replace('/', "::"))
     };
-    let all: BTreeMap<String, String> =
-        sources().into_iter().filter_map(|(path, _, shipped)| Some((module(&path)?, shipped))).collect();
+    let all: BTreeMap<String, String> = sources()
+        .into_iter()
+        .filter_map(|(path, _, shipped)| Some((module(&path)?, shipped)))
+        .collect();
     // A path, and the names in braces at its end.
     let paths = Regex::new(r"\b(crate|super)((?:::\w+)*)(?:::\{([^{}]*)\})?").unwrap();
     let named = |(name, shipped): (&String, &String)| {
-        assert!(!shipped.contains("super::super"), "{name}: longer ways begin with crate");
+        assert!(
+            !shipped.contains("super::super"),
+            "{name}: longer ways begin with crate"
+        );
         let parent = name.rsplit_once("::").map_or("", |(parent, _)| parent);
         let named = paths.captures_iter(shipped).flat_map(|found| {
             let text = |group| found.get(group).map_or("", |text| text.as_str());
             let begin = if text(1) == "super" { parent } else { "" };
             let path = format!("{begin}{}", text(2)).trim_start_matches("::").to_owned();
-            text(3).split(',').map(|last| format!("{path}::{}", last.trim())).collect::<Vec<_>>()
+            text(3)
+                .split(',')
+                .map(|last| format!("{path}::{}", last.trim()))
+                .collect::<Vec<_>>()
         });
         let longest = |path: String| {
             let ends = path.match_indices("::").map(|(end, _)| end).chain([path.len()]);
-            ends.map(|end| &path[..end]).filter(|module| all.contains_key(*module)).last().map(str::to_owned)
+            ends.map(|end| &path[..end])
+                .filter(|module| all.contains_key(*module))
+                .last()
+                .map(str::to_owned)
         };
-        (name.clone(), named.filter_map(longest).filter(|module| module != name).collect())
+        (
+            name.clone(),
+            named.filter_map(longest).filter(|module| module != name).collect(),
+        )
     };
     let imports: BTreeMap<_, BTreeSet<String>> = all.iter().map(named).collect();
-    assert!(imports["simulation::ends::ends"].contains("simulation::ends::csv"), "imports are found");
-    assert!(imports["session::web::routes"].contains("session::fleet"), "imports are found");
+    assert!(
+        imports["simulation::ends::ends"].contains("simulation::ends::csv"),
+        "imports are found"
+    );
+    assert!(
+        imports["session::web::routes"].contains("session::fleet"),
+        "imports are found"
+    );
     imports
 }
 
@@ -68,35 +90,59 @@ fn imports() -> BTreeMap<String, BTreeSet<String>> {
 fn room(module: &str) -> Option<(&'static str, usize)> {
     let (part, inside) = module.split_once("::")?;
     let (part, rooms) = ROOMS.iter().find(|(name, _)| *name == part)?;
-    let floor = rooms.split(' ').position(|room| Some(room) == inside.split("::").next())?;
+    let floor = rooms
+        .split(' ')
+        .position(|room| Some(room) == inside.split("::").next())?;
     Some((part, floor))
 }
 
 fn may_name(from: (&str, usize), to: (&str, usize)) -> bool {
-    if from.0 == to.0 { from.1 >= to.1 } else { to.0 == "shared" }
+    if from.0 == to.0 {
+        from.1 >= to.1
+    } else {
+        to.0 == "shared"
+    }
 }
 
 #[test]
 fn imports_point_down_only() {
     let imports = imports();
-    let homeless: Vec<_> = imports.keys().filter(|name| name.contains("::") && room(name).is_none()).collect();
+    let homeless: Vec<_> = imports
+        .keys()
+        .filter(|name| name.contains("::") && room(name).is_none())
+        .collect();
     assert!(homeless.is_empty(), "in no room: {homeless:#?}");
-    let edges = imports.iter().flat_map(|(from, all)| all.iter().map(move |to| (from, to)));
+    let edges = imports
+        .iter()
+        .flat_map(|(from, all)| all.iter().map(move |to| (from, to)));
     let is_bad =
         |(from, to): &(&String, &String)| room(from).zip(room(to)).is_some_and(|(from, to)| !may_name(from, to));
     let bad: Vec<_> = edges.filter(is_bad).collect();
-    assert!(bad.is_empty(), "these name what is above them, or another server: {bad:#?}");
+    assert!(
+        bad.is_empty(),
+        "these name what is above them, or another server: {bad:#?}"
+    );
 }
 
 #[test]
 fn no_modules_name_each_other() {
     let mut imports = imports();
     // Modules that import none of the remaining ones can't be part of a cycle.
-    while let Some(free) = imports.iter().find(|(_, names)| names.is_empty()).map(|(name, _)| name.clone()) {
+    while let Some(free) = imports
+        .iter()
+        .find(|(_, names)| names.is_empty())
+        .map(|(name, _)| name.clone())
+    {
         imports.remove(&free);
-        imports.values_mut().for_each(|names| names.retain(|name| *name != free));
+        imports
+            .values_mut()
+            .for_each(|names| names.retain(|name| *name != free));
     }
-    assert!(imports.is_empty(), "these are in a circle, or name one: {:#?}", imports.keys());
+    assert!(
+        imports.is_empty(),
+        "these are in a circle, or name one: {:#?}",
+        imports.keys()
+    );
 }
 
 #[test]

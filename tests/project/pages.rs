@@ -6,8 +6,11 @@ use std::path::PathBuf;
 use super::copy::{root, walk};
 
 fn pages() -> Vec<PathBuf> {
-    let docs = walk(&root().join("docs")).into_iter().filter(|path| path.extension().is_some_and(|end| end == "md"));
-    docs.chain(["README.md", "CHANGELOG.md", "CONTRIBUTING.md"].map(|name| root().join(name))).collect()
+    let docs = walk(&root().join("docs"))
+        .into_iter()
+        .filter(|path| path.extension().is_some_and(|end| end == "md"));
+    docs.chain(["README.md", "CHANGELOG.md", "CONTRIBUTING.md"].map(|name| root().join(name)))
+        .collect()
 }
 
 #[test]
@@ -15,12 +18,19 @@ fn every_link_leads_to_a_file_and_the_readme_to_every_page() {
     let readme = std::fs::read_to_string(root().join("README.md")).unwrap();
     for page in pages() {
         let name = page.strip_prefix(root()).unwrap().to_str().unwrap();
-        assert!(name == "README.md" || readme.contains(&format!("]({name})")), "README.md does not lead to {name}");
+        assert!(
+            name == "README.md" || readme.contains(&format!("]({name})")),
+            "README.md does not lead to {name}"
+        );
         let text = std::fs::read_to_string(&page).unwrap();
         for link in text.split("](").skip(1).map(|rest| rest.split(')').next().unwrap()) {
             let file = link.split('#').next().unwrap();
             let is_file = !link.contains("://") && !file.is_empty();
-            assert!(!is_file || page.parent().unwrap().join(file).exists(), "{}: {link}", page.display());
+            assert!(
+                !is_file || page.parent().unwrap().join(file).exists(),
+                "{}: {link}",
+                page.display()
+            );
         }
     }
 }
@@ -29,20 +39,34 @@ fn every_link_leads_to_a_file_and_the_readme_to_every_page() {
 fn every_guarantee_names_tests_that_exist() {
     let test = regex_lite::Regex::new(r"#\[(?:\w+::)?test\]\s+(?:#\[.*\]\s+)*(?:async )?fn (\w+)\(").unwrap();
     let is_rust = |path: &PathBuf| path.extension().is_some_and(|end| end == "rs");
-    let files = ["tests", "src"].into_iter().flat_map(|folder| walk(&root().join(folder))).filter(is_rust);
+    let files = ["tests", "src"]
+        .into_iter()
+        .flat_map(|folder| walk(&root().join(folder)))
+        .filter(is_rust);
     let texts: Vec<String> = files.map(|file| std::fs::read_to_string(file).unwrap()).collect();
-    let tests: HashSet<&str> =
-        texts.iter().flat_map(|text| test.captures_iter(text).map(|found| found.get(1).unwrap().as_str())).collect();
+    let tests: HashSet<&str> = texts
+        .iter()
+        .flat_map(|text| test.captures_iter(text).map(|found| found.get(1).unwrap().as_str()))
+        .collect();
     // This test program has no harness, so its tests have no `#[test]`.
     let without_harness = std::fs::read_to_string(root().join("tests/simulation_limits/main.rs")).unwrap();
     let page = std::fs::read_to_string(root().join("docs/guarantees.md")).unwrap();
     let mut promises = 0;
-    for row in page.lines().filter(|line| line.starts_with("| ") && !line.ends_with("| shown by |")) {
+    for row in page
+        .lines()
+        .filter(|line| line.starts_with("| ") && !line.ends_with("| shown by |"))
+    {
         let shown_by = row.trim_end_matches(" |").rsplit(" | ").next().unwrap();
         let names: Vec<&str> = shown_by.split('`').skip(1).step_by(2).collect();
         assert!(!names.is_empty(), "nothing shows: {row}");
-        for name in names.iter().filter(|name| !name.starts_with("cargo bench ") && !root().join(name).is_file()) {
-            assert!(tests.contains(name) || without_harness.contains(name), "there is no test {name}");
+        for name in names
+            .iter()
+            .filter(|name| !name.starts_with("cargo bench ") && !root().join(name).is_file())
+        {
+            assert!(
+                tests.contains(name) || without_harness.contains(name),
+                "there is no test {name}"
+            );
         }
         promises += 1;
     }
@@ -52,11 +76,18 @@ fn every_guarantee_names_tests_that_exist() {
 #[test]
 fn every_file_that_contributors_are_sent_to_is_there() {
     let page = std::fs::read_to_string(root().join("CONTRIBUTING.md")).unwrap();
-    let table = page.lines().filter(|line| line.starts_with("| ") && line.contains("`s"));
-    let files: Vec<&str> =
-        table.flat_map(|row| row.split('`').skip(1).step_by(2)).filter(|name| name.contains('/')).collect();
+    let table = page
+        .lines()
+        .filter(|line| line.starts_with("| ") && line.contains("`s"));
+    let files: Vec<&str> = table
+        .flat_map(|row| row.split('`').skip(1).step_by(2))
+        .filter(|name| name.contains('/'))
+        .collect();
     assert!(files.len() > 8, "{files:?}");
     for file in files {
-        assert!(root().join("src").join(file).exists() || root().join(file).exists(), "{file} is not there");
+        assert!(
+            root().join("src").join(file).exists() || root().join(file).exists(),
+            "{file} is not there"
+        );
     }
 }

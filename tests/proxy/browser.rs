@@ -29,7 +29,10 @@ pub struct Browser {
 impl Browser {
     /// The same browser at another address.
     pub fn at(&self, address: &'static str) -> Self {
-        Self { address, ..self.clone() }
+        Self {
+            address,
+            ..self.clone()
+        }
     }
 
     /// Gets a page of `https://HOST`.
@@ -39,9 +42,14 @@ impl Browser {
 
     /// Requests a page, whose body may be endless.
     pub async fn begin(&self, url: &str, headers: &[(&str, &str)]) -> Page {
-        let connector =
-            awc::Connector::new().rustls_0_23(self.trust.clone()).local_address(self.address.parse().unwrap());
-        let client = awc::Client::builder().connector(connector).timeout(SOON).disable_redirects().finish();
+        let connector = awc::Connector::new()
+            .rustls_0_23(self.trust.clone())
+            .local_address(self.address.parse().unwrap());
+        let client = awc::Client::builder()
+            .connector(connector)
+            .timeout(SOON)
+            .disable_redirects()
+            .finish();
         let mut request = client.get(url);
         for &header in headers {
             request = request.insert_header(header);
@@ -53,15 +61,26 @@ impl Browser {
     pub async fn ask(&self, url: &str, headers: &[(&str, &str)]) -> Answer {
         let mut answer = self.begin(url, headers).await;
         let body = answer.body().await.unwrap_or_else(|error| panic!("{url}: {error}"));
-        Answer { status: answer.status(), headers: answer.headers().clone(), body }
+        Answer {
+            status: answer.status(),
+            headers: answer.headers().clone(),
+            body,
+        }
     }
 
     /// Asserts that a path serves neither a page nor a WebSocket.
     pub async fn finds_nothing(&self, path: &str) {
         let answer = self.get(path).await;
-        assert!([400, 403, 404].contains(&answer.status.as_u16()), "{path}: {}", answer.status);
+        assert!(
+            [400, 403, 404].contains(&answer.status.as_u16()),
+            "{path}: {}",
+            answer.status
+        );
         assert!(!answer.text().contains("secret"), "{path}");
-        assert!(self.try_open(&format!("wss://{}{path}", self.host), &[]).await.is_err(), "{path}");
+        assert!(
+            self.try_open(&format!("wss://{}{path}", self.host), &[]).await.is_err(),
+            "{path}"
+        );
     }
 
     /// Opens a WebSocket of `wss://HOST`.
@@ -71,7 +90,9 @@ impl Browser {
 
     /// Opens a WebSocket at a URL that a server sent.
     pub async fn open(&self, url: &str) -> Client {
-        self.try_open(url, &[]).await.unwrap_or_else(|error| panic!("{url}: {error}"))
+        self.try_open(url, &[])
+            .await
+            .unwrap_or_else(|error| panic!("{url}: {error}"))
     }
 
     /// Opens a WebSocket with headers; it may be refused.

@@ -20,7 +20,9 @@ async fn is_told_what_happens(browser: &Browser, path: &str) {
     assert_eq!(events.status(), 200, "{path}");
     let begun = Instant::now();
     while begun.elapsed() < QUIET {
-        let event = actix_rt::time::timeout(SOON, events.next()).await.expect("nothing is told");
+        let event = actix_rt::time::timeout(SOON, events.next())
+            .await
+            .expect("nothing is told");
         event.unwrap_or_else(|| panic!("{path}: the end")).unwrap();
     }
 }
@@ -82,5 +84,9 @@ async fn restarts(fleet: &mut Fleet) {
     let (mut again, _) = fleet.simulate(&fleet.browser, &fleet.here).await;
     again.until(".").await;
     fleet.both_up().await;
-    assert!(!passing_by.is_finished(), "a connection past the web server was closed: {:?}", passing_by.await);
+    assert!(
+        !passing_by.is_finished(),
+        "a connection past the web server was closed: {:?}",
+        passing_by.await
+    );
 }

@@ -25,7 +25,11 @@ pub fn private_service() -> u16 {
 
 /// Checks on one fleet where requests arrive, and which client they are attributed to.
 async fn requests_lead_to_the_fleet_and_nowhere_else(rules: Rules) {
-    let keys = |server: Builder| server.set("trustedProxies", json!(["127.0.0.1"])).set("maxClientsPerAddress", 2);
+    let keys = |server: Builder| {
+        server
+            .set("trustedProxies", json!(["127.0.0.1"]))
+            .set("maxClientsPerAddress", 2)
+    };
     let fleet = Fleet::start_with(rules, keys).await;
     only_the_fleet_is_reachable(&fleet).await;
     an_editor_is_at_the_port_of_its_webots_and_500_more(&fleet).await;
@@ -71,7 +75,11 @@ async fn only_the_fleet_is_reachable(fleet: &Fleet) {
 async fn an_editor_is_at_the_port_of_its_webots_and_500_more(fleet: &Fleet) {
     let editor = fleet.here.port + 1 + 500;
     listen(TcpListener::bind(("127.0.0.1", editor)).unwrap(), |request| {
-        Some(if request.path() == "/a%20b?c" { (200, "editor") } else { (404, "") })
+        Some(if request.path() == "/a%20b?c" {
+            (200, "editor")
+        } else {
+            (404, "")
+        })
     });
     let answer = fleet.browser.get(&format!("/{editor}/a%20b?c")).await;
     assert_eq!((answer.status.as_u16(), answer.text().as_str()), (200, "editor"));
@@ -83,8 +91,16 @@ async fn an_editor_is_at_the_port_of_its_webots_and_500_more(fleet: &Fleet) {
 
 /// The path requested, and the path that arrives through Apache and through nginx; `None` if they refuse it.
 const PATHS: [(&str, Option<&str>, Option<&str>); 11] = [
-    ("/textures/my%20file.png", Some("/textures/my%20file.png"), Some("/textures/my%20file.png")),
-    ("/%C3%BC+%2B.png?x=a%20b&y=%2F", Some("/%C3%BC++.png?x=a%20b&y=%2F"), Some("/%C3%BC++.png?x=a%20b&y=%2F")),
+    (
+        "/textures/my%20file.png",
+        Some("/textures/my%20file.png"),
+        Some("/textures/my%20file.png"),
+    ),
+    (
+        "/%C3%BC+%2B.png?x=a%20b&y=%2F",
+        Some("/%C3%BC++.png?x=a%20b&y=%2F"),
+        Some("/%C3%BC++.png?x=a%20b&y=%2F"),
+    ),
     ("/a%252fb.png", Some("/a%252fb.png"), Some("/a%252fb.png")),
     // Apache rejects an encoded question mark as an attack.
     ("/a%3Fb.png", None, Some("/a%3Fb.png")),
@@ -94,7 +110,11 @@ const PATHS: [(&str, Option<&str>, Option<&str>); 11] = [
     ("/%2e%2e/b.png", None, None),
     ("/a/..%2F..%2Fb.png", None, None),
     // Encoded line ends stay part of the name.
-    ("/a%0D%0AX:%20y.png", Some("/a%0D%0AX:%20y.png"), Some("/a%0D%0AX:%20y.png")),
+    (
+        "/a%0D%0AX:%20y.png",
+        Some("/a%0D%0AX:%20y.png"),
+        Some("/a%0D%0AX:%20y.png"),
+    ),
     ("/a%00.png", None, None),
     ("//a.png", Some("/a.png"), Some("/a.png")),
 ];
@@ -111,9 +131,17 @@ async fn paths_arrive(fleet: &Fleet, rules: Rules) {
         let wanted = if rules.kind() == Kind::Apache { apache } else { nginx };
         let answer = fleet.browser.get(&format!("/{port}{path}")).await;
         if wanted.is_some() {
-            assert_eq!((answer.status.as_u16(), answer.text().as_str()), (200, "file"), "{path}");
+            assert_eq!(
+                (answer.status.as_u16(), answer.text().as_str()),
+                (200, "file"),
+                "{path}"
+            );
         } else {
-            assert!([400, 403, 404].contains(&answer.status.as_u16()), "{path}: {}", answer.status);
+            assert!(
+                [400, 403, 404].contains(&answer.status.as_u16()),
+                "{path}: {}",
+                answer.status
+            );
         }
         assert_eq!(asked.try_recv().ok().as_deref(), wanted, "{path}");
     }
@@ -131,7 +159,11 @@ async fn limits_are_for_each_client(fleet: &Fleet) {
         other => panic!("{url}: {:?}", other.err()),
     };
     let door = format!("wss://{}/session", fleet.browser.host);
-    for url in [door, format!("{}/client", fleet.wss(&fleet.here)), format!("{}/client", fleet.wss(&fleet.there))] {
+    for url in [
+        door,
+        format!("{}/client", fleet.wss(&fleet.here)),
+        format!("{}/client", fleet.wss(&fleet.there)),
+    ] {
         let many = fleet.browser.at("127.0.0.5");
         let first = many.open(&url).await;
         let _second = many.open(&url).await;
@@ -156,9 +188,19 @@ async fn no_simulation_gets_a_secret(rules: Rules) {
     listen(TcpListener::bind(("127.0.0.1", webots)).unwrap(), |request| {
         let head = request.head.to_lowercase();
         let secrets = ["authorization", "cookie", "x-forwarded-user", "anna", "203.0.113.9"];
-        Some((200, if secrets.iter().any(|secret| head.contains(secret)) { "told" } else { "nothing" }))
+        Some((
+            200,
+            if secrets.iter().any(|secret| head.contains(secret)) {
+                "told"
+            } else {
+                "nothing"
+            },
+        ))
     });
-    let secrets = [("authorization", "Basic YWRtaW46b3BlbiBzZXNhbWU="), ("cookie", "_oauth2_proxy=anna")];
+    let secrets = [
+        ("authorization", "Basic YWRtaW46b3BlbiBzZXNhbWU="),
+        ("cookie", "_oauth2_proxy=anna"),
+    ];
     let forged = [("x-forwarded-for", "203.0.113.9"), ("forwarded", "for=203.0.113.9")];
     let secrets = [secrets, forged].concat();
     let url = |port: u16| format!("https://{}/{port}/", fleet.browser.host);
@@ -203,8 +245,15 @@ async fn pages_are_sent_on_to_https_and_the_bare_name(browser: &Browser) {
         }
         // No path redirects to another host.
         let answer = browser.ask(&format!("{server}//other.example/"), &[host]).await;
-        assert!(answer.header("location").unwrap().starts_with("https://localhost/"), "{server} {host:?}");
+        assert!(
+            answer.header("location").unwrap().starts_with("https://localhost/"),
+            "{server} {host:?}"
+        );
     }
     let question = format!("{plain}/.well-known/acme-challenge/token");
-    assert_eq!(browser.ask(&question, &[]).await.status, 404, "certbot's questions are answered here");
+    assert_eq!(
+        browser.ask(&question, &[]).await.status,
+        404,
+        "certbot's questions are answered here"
+    );
 }

@@ -52,7 +52,10 @@ impl Fleet {
             let server = if rules.is_door() {
                 server.set("publicUrl", format!("wss://{host}/{{host}}/{{port}}"))
             } else {
-                server.set("server", host.as_str()).set("ssl", true).set("portRewrite", true)
+                server
+                    .set("server", host.as_str())
+                    .set("ssl", true)
+                    .set("portRewrite", true)
             };
             // While a test waits for one connection, it answers no pings on the others.
             keys(server.set("timing.ping", 0.5).set("timing.silence", 60))
@@ -63,7 +66,13 @@ impl Fleet {
             let server = server.set("bind", machine).set("timing.heartbeat", 0.2);
             if rules.is_door() {
                 // As a container learns its host name.
-                behind(server.port(port).set("server", "$FLEET_TEST_HOST").env("FLEET_TEST_HOST", machine)).spawn()
+                behind(
+                    server
+                        .port(port)
+                        .set("server", "$FLEET_TEST_HOST")
+                        .env("FLEET_TEST_HOST", machine),
+                )
+                .spawn()
             } else {
                 behind(server).spawn()
             }
@@ -93,9 +102,24 @@ impl Fleet {
             key: certificate.key.to_str().unwrap(),
         };
         let web = WebServer::start(rules.kind(), (http, https), &rules.text(&place), IDLE).await;
-        let browser = Browser { address: "127.0.0.1", trust: trusting(&authority.file()), host, plain: http };
+        let browser = Browser {
+            address: "127.0.0.1",
+            trust: trusting(&authority.file()),
+            host,
+            plain: http,
+        };
         let (_authority, _webots, _forge) = (authority, webots, forge);
-        let fleet = Self { rules, browser, web, session, here, there, _authority, _webots, _forge };
+        let fleet = Self {
+            rules,
+            browser,
+            web,
+            session,
+            here,
+            there,
+            _authority,
+            _webots,
+            _forge,
+        };
         fleet.both_up().await;
         fleet
     }
@@ -104,8 +128,13 @@ impl Fleet {
     pub async fn both_up(&self) {
         until("both simulation servers answer", async || {
             let status = http::try_get(&self.session.url("/status")).await;
-            status
-                .is_ok_and(|page| page.json()["servers"].as_array().unwrap().iter().all(|one| one["load"].is_number()))
+            status.is_ok_and(|page| {
+                page.json()["servers"]
+                    .as_array()
+                    .unwrap()
+                    .iter()
+                    .all(|one| one["load"].is_number())
+            })
         })
         .await;
     }
@@ -113,7 +142,9 @@ impl Fleet {
     /// Starts a simulation; returns its client and the URL of its stream.
     pub async fn simulate(&self, browser: &Browser, server: &Server) -> (Client, String) {
         let mut client = browser.open(&format!("{}/client", self.wss(server))).await;
-        client.send(&serde_json::json!({"start": {"url": arm()}}).to_string()).await;
+        client
+            .send(&serde_json::json!({"start": {"url": arm()}}).to_string())
+            .await;
         let webots = client.until("webots:").await;
         (client, webots.strip_prefix("webots:").unwrap().to_owned())
     }
@@ -125,7 +156,11 @@ impl Fleet {
 
     /// The web server's path of a port of a simulation server's machine.
     pub fn path(&self, server: &Server, port: u16) -> String {
-        if self.rules.is_door() { format!("/{}/{port}", self.machine(server)) } else { format!("/{port}") }
+        if self.rules.is_door() {
+            format!("/{}/{port}", self.machine(server))
+        } else {
+            format!("/{port}")
+        }
     }
 
     /// The URL at which clients connect to a simulation server.

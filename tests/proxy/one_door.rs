@@ -18,7 +18,8 @@ async fn who_is_lost_comes_back_through_the_door() {
     let mut tokens = Vec::new();
     for server in [&fleet.here, &fleet.there] {
         let mut lost = fleet.browser.open(&format!("{}/client", fleet.wss(server))).await;
-        lost.send(&serde_json::json!({"start": {"url": arm(), "resumable": true}}).to_string()).await;
+        lost.send(&serde_json::json!({"start": {"url": arm(), "resumable": true}}).to_string())
+            .await;
         let stream = lost.until("webots:").await["webots:".len()..].to_owned();
         tokens.push((lost.token().await, stream));
         drop(lost);
@@ -38,7 +39,10 @@ async fn who_is_lost_comes_back_through_the_door() {
         viewer.until("scene load completed").await;
         // It counts once, at its own server and at the session server.
         until("both servers say so", async || {
-            let own = browser.get(&format!("{}/status", fleet.path(server, server.port))).await.json();
+            let own = browser
+                .get(&format!("{}/status", fleet.path(server, server.port)))
+                .await
+                .json();
             let known = browser.get("/status").await.json()["servers"][number]["instances"].clone();
             own["instances"]["arrivals"] == 1 && own["simulations"].as_array().unwrap().len() == 1 && known["idle"] == 1
         })

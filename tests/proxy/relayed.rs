@@ -14,7 +14,10 @@ async fn streams_come_through_the_simulation_server(rules: Rules) {
     for server in [&fleet.here, &fleet.there] {
         let (client, stream) = fleet.simulate(browser, server).await;
         let beginning = format!("{}/stream/", fleet.wss(server));
-        let token = stream.strip_prefix(&beginning).unwrap_or_else(|| panic!("{stream}")).to_owned();
+        let token = stream
+            .strip_prefix(&beginning)
+            .unwrap_or_else(|| panic!("{stream}"))
+            .to_owned();
         let mut viewer = browser.open(&format!("{stream}/")).await.with_scene().await;
         viewer.send("real-time:-1").await;
         viewer.until("application/json:").await;
@@ -24,12 +27,17 @@ async fn streams_come_through_the_simulation_server(rules: Rules) {
         assert_eq!(file.header("content-security-policy"), Some("sandbox allow-scripts"));
         client.leave().await;
         viewer.closed().await;
-        until("the token is gone", async || browser.get(&of("/worlds/textures/old%20wood.png")).await.status == 404)
-            .await;
+        until("the token is gone", async || {
+            browser.get(&of("/worlds/textures/old%20wood.png")).await.status == 404
+        })
+        .await;
         // No log contains the token; other requests are logged.
         let known = format!("GET /{}/status", server.port);
         browser.get(&format!("/{}/status", server.port)).await;
-        until("the request is logged", async || fleet.web.access_log().contains(&known)).await;
+        until("the request is logged", async || {
+            fleet.web.access_log().contains(&known)
+        })
+        .await;
         assert!(!fleet.web.access_log().contains(&token), "{}", fleet.web.access_log());
     }
 }

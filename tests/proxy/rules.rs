@@ -35,7 +35,11 @@ pub struct Place<'a> {
 
 impl Rules {
     pub fn kind(self) -> Kind {
-        if matches!(self, Self::Apache | Self::ApacheWithUsers | Self::Documents) { Kind::Apache } else { Kind::Nginx }
+        if matches!(self, Self::Apache | Self::ApacheWithUsers | Self::Documents) {
+            Kind::Apache
+        } else {
+            Kind::Nginx
+        }
     }
 
     /// Whether all machines are behind one nginx on another machine.
@@ -45,7 +49,11 @@ impl Rules {
 
     /// The addresses of the machines. Without a door, the first is also the web server's.
     pub fn machines(self) -> [&'static str; 2] {
-        if self.is_door() { ["127.0.0.2", "127.0.0.3"] } else { ["127.0.0.1", "127.0.0.2"] }
+        if self.is_door() {
+            ["127.0.0.2", "127.0.0.3"]
+        } else {
+            ["127.0.0.1", "127.0.0.2"]
+        }
     }
 
     /// The path at which clients reach the session server.
@@ -57,7 +65,15 @@ impl Rules {
     }
 
     pub fn text(self, place: &Place) -> String {
-        let Place { http, https, session, here, there, chain, key } = place;
+        let Place {
+            http,
+            https,
+            session,
+            here,
+            there,
+            chain,
+            key,
+        } = place;
         let pattern = |ports: &[u16]| ports.iter().map(u16::to_string).collect::<Vec<_>>().join("|");
         let editors = |ports: &[u16]| pattern(&ports[1..].iter().map(|port| port + 500).collect::<Vec<_>>());
         // Webots and editors of both machines, and the address of the other machine.
@@ -106,7 +122,10 @@ impl Rules {
                 adapt(&Self::Apache.text(place), &[(last, &format!("{last}{user}"))])
             }
             Self::NginxWithUsers(port) => {
-                let changes = [("4180", port.to_string()), ("2000|3000", format!("{}|{}", here[0], there[0]))];
+                let changes = [
+                    ("4180", port.to_string()),
+                    ("2000|3000", format!("{}|{}", here[0], there[0])),
+                ];
                 let changes = changes.each_ref().map(|(from, to)| (*from, to.as_str()));
                 let users = adapt(include_str!("../../deploy/nginx-users.conf"), &changes);
                 let last = "\n  proxy_set_header Forwarded \"\";\n";

@@ -33,10 +33,17 @@ async fn who_signs_in_at_the_web_server_is_known_to_the_administrator() {
     let client = format!("{}/client", fleet.wss(&fleet.here));
     let page = visitor.get("/viewer").await;
     assert_eq!(page.status.as_u16(), 302);
-    assert!(page.header("location").unwrap().ends_with("/oauth2/sign_in?rd=/viewer"), "{page:?}");
+    assert!(
+        page.header("location").unwrap().ends_with("/oauth2/sign_in?rd=/viewer"),
+        "{page:?}"
+    );
     assert!(visitor.try_open(&client, &[]).await.is_err());
     assert_eq!(visitor.get("/oauth2/sign_in").await.status.as_u16(), 200);
-    assert_eq!(visitor.get("/oauth2/auth").await.status.as_u16(), 404, "nobody asks for others");
+    assert_eq!(
+        visitor.get("/oauth2/auth").await.status.as_u16(),
+        404,
+        "nobody asks for others"
+    );
 
     // Frames without an origin need assets and streams, so these are public; no path leads from there to other pages.
     let port = fleet.here.port;
@@ -59,12 +66,24 @@ async fn who_signs_in_at_the_web_server_is_known_to_the_administrator() {
     }
 
     let anna = [("cookie", "_oauth2_proxy=anna")];
-    assert_eq!(visitor.ask(&format!("https://{}/viewer", visitor.host), &anna).await.status.as_u16(), 200);
+    assert_eq!(
+        visitor
+            .ask(&format!("https://{}/viewer", visitor.host), &anna)
+            .await
+            .status
+            .as_u16(),
+        200
+    );
     let mut running: Vec<Client> = Vec::new();
     // A `userHeader` sent by the visitor is ignored.
-    for headers in [vec![anna[0]], vec![("cookie", "_oauth2_proxy=ben"), ("x-forwarded-user", "intruder")]] {
+    for headers in [
+        vec![anna[0]],
+        vec![("cookie", "_oauth2_proxy=ben"), ("x-forwarded-user", "intruder")],
+    ] {
         let mut client = visitor.try_open(&client, &headers).await.unwrap();
-        client.send(&serde_json::json!({"start": {"url": arm(), "name": "somebody"}}).to_string()).await;
+        client
+            .send(&serde_json::json!({"start": {"url": arm(), "name": "somebody"}}).to_string())
+            .await;
         client.until("webots:").await;
         running.push(client);
     }
@@ -80,6 +99,9 @@ async fn who_signs_in_at_the_web_server_is_known_to_the_administrator() {
     // The simulation server itself asks for the administrator's password.
     let sign_in = format!("https://{}/{}/sign-in", visitor.host, fleet.here.port);
     let answer = visitor.ask(&sign_in, &anna).await;
-    assert_eq!((answer.status.as_u16(), answer.header("www-authenticate").is_some()), (401, true));
+    assert_eq!(
+        (answer.status.as_u16(), answer.header("www-authenticate").is_some()),
+        (401, true)
+    );
     assert_eq!(visitor.ask(&sign_in, &[anna[0], password]).await.status.as_u16(), 303);
 }

@@ -50,7 +50,12 @@ impl WebServer {
             Kind::Nginx => nginx_conf(folder.path(), idle),
         };
         std::fs::write(folder.path().join("main.conf"), main).unwrap();
-        let mut server = Self { kind, child: None, folder, port: ports.1 };
+        let mut server = Self {
+            kind,
+            child: None,
+            folder,
+            port: ports.1,
+        };
         server.go().await;
         server
     }
@@ -70,7 +75,11 @@ impl WebServer {
             "this test needs Debian's web servers, and {program} is missing: apt install apache2-bin nginx"
         );
         let conf = self.folder.path().join("main.conf");
-        let output = std::fs::File::options().create(true).append(true).open(self.error_log()).unwrap();
+        let output = std::fs::File::options()
+            .create(true)
+            .append(true)
+            .open(self.error_log())
+            .unwrap();
         let mut command = Command::new("setpriv");
         // It ends even if this process is killed.
         command.args(["--pdeathsig", "TERM", program]);
@@ -78,8 +87,12 @@ impl WebServer {
             Kind::Apache => command.arg("-f").arg(&conf).arg("-DFOREGROUND"),
             Kind::Nginx => command.arg("-c").arg(&conf).arg("-e").arg(self.error_log()),
         };
-        let child =
-            command.process_group(0).stdin(Stdio::null()).stdout(output.try_clone().unwrap()).stderr(output).spawn();
+        let child = command
+            .process_group(0)
+            .stdin(Stdio::null())
+            .stdout(output.try_clone().unwrap())
+            .stderr(output)
+            .spawn();
         let child = child.expect("this test needs setpriv: apt install util-linux");
         self.child = Some(child);
         let listens = holds_soon(async || {
@@ -92,7 +105,11 @@ impl WebServer {
 
     /// Makes it reload its configuration, as after the renewal of a certificate.
     pub fn reload(&self) {
-        let signal = if self.kind == Kind::Apache { Signal::SIGUSR1 } else { Signal::SIGHUP };
+        let signal = if self.kind == Kind::Apache {
+            Signal::SIGUSR1
+        } else {
+            Signal::SIGHUP
+        };
         kill(self.pid(), signal).unwrap();
     }
 
@@ -143,7 +160,11 @@ fn apache_conf(folder: &Path, (http, https): (u16, u16), idle: Duration) -> Stri
         .collect();
     let folder = folder.display();
     let idle = idle.as_secs();
-    let user = if Uid::effective().is_root() { "User www-data\nGroup www-data\n" } else { "" };
+    let user = if Uid::effective().is_root() {
+        "User www-data\nGroup www-data\n"
+    } else {
+        ""
+    };
     format!(
         "{modules}ServerRoot {folder}\nDefaultRuntimeDir {folder}\nPidFile {folder}/pid\nErrorLog {folder}/error.log\n\
          LogLevel warn\nLogFormat \"%r\" combined\nServerName localhost\n{user}\
@@ -159,7 +180,9 @@ fn nginx_conf(folder: &Path, idle: Duration) -> String {
     let user = if Uid::effective().is_root() { "user root;\n" } else { "" };
     let temporary: String = ["client_body", "proxy", "fastcgi", "uwsgi", "scgi"]
         .iter()
-        .fold(String::new(), |text, name| text + &format!("  {name}_temp_path {folder}/{name};\n"));
+        .fold(String::new(), |text, name| {
+            text + &format!("  {name}_temp_path {folder}/{name};\n")
+        });
     format!(
         "{user}daemon off;\nworker_processes 1;\npid {folder}/pid;\nerror_log {folder}/error.log warn;\n\
          events {{ worker_connections 512; }}\n\

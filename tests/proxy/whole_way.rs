@@ -15,7 +15,11 @@ pub async fn the_whole_way(rules: Rules) -> Fleet {
 
     // Pages with their assets. The servers log the URLs of their pages.
     let port = format!("/{}", fleet.session.port);
-    let door = format!("https://{}{}/monitor", browser.host, if rules.is_door() { "" } else { &port });
+    let door = format!(
+        "https://{}{}/monitor",
+        browser.host,
+        if rules.is_door() { "" } else { &port }
+    );
     assert!(fleet.session.log().contains(&door), "{}", fleet.session.log());
     let page = browser.ask(&door, &[]).await.text();
     let status = browser.get(&at_the_door("/status")).await.json();
@@ -24,7 +28,14 @@ pub async fn the_whole_way(rules: Rules) -> Fleet {
         let monitor = format!("https://{}{path}/monitor", browser.host);
         assert!(page.contains(&monitor), "{page}");
         assert!(server.log().contains(&monitor), "{}", server.log());
-        assert!(status["servers"].as_array().unwrap().iter().any(|one| one["monitor"] == *monitor), "{status}");
+        assert!(
+            status["servers"]
+                .as_array()
+                .unwrap()
+                .iter()
+                .any(|one| one["monitor"] == *monitor),
+            "{status}"
+        );
         let answer = browser.ask(&monitor, &[]).await;
         let policy = answer.header("content-security-policy").unwrap();
         assert!(
@@ -38,7 +49,10 @@ pub async fn the_whole_way(rules: Rules) -> Fleet {
     assert_eq!(browser.get(&at_the_door("/monitor")).await.status, 200);
     assert_eq!(browser.get(&at_the_door("/assets/style.css")).await.status, 200);
     assert_eq!(browser.get(&at_the_door("/viewer")).await.status, 200);
-    until("the door is open", async || browser.get(&at_the_door("/request")).await.text() == "1").await;
+    until("the door is open", async || {
+        browser.get(&at_the_door("/request")).await.text() == "1"
+    })
+    .await;
 
     // The session server.
     let mut door = browser.connect(&at_the_door("/")).await;
@@ -47,7 +61,10 @@ pub async fn the_whole_way(rules: Rules) -> Fleet {
     session.until("1").await;
     let both = [fleet.wss(&fleet.here), fleet.wss(&fleet.there)];
     let question = at_the_door(&format!("/session?url={}", arm()));
-    until("a page is given a simulation server", async || both.contains(&browser.get(&question).await.text())).await;
+    until("a page is given a simulation server", async || {
+        both.contains(&browser.get(&question).await.text())
+    })
+    .await;
     session.send(&arm()).await;
     let given = session.until("wss").await;
     assert!(both.contains(&given), "{given}");

@@ -25,13 +25,19 @@ async fn an_announcement_reaches_who_asks_for_it_in_time() {
     let (text, asked) = ("<b>Maintenance</b> & more\nat noon", Instant::now());
     assert_eq!(announce(&session, &json!({"text": text})).await, 200);
     let told = viewer.until("announcement:").await;
-    assert_eq!(told, "announcement: \u{2039}b\u{203a}Maintenance\u{2039}/b\u{203a} \u{ff06} more at noon");
+    assert_eq!(
+        told,
+        "announcement: \u{2039}b\u{203a}Maintenance\u{2039}/b\u{203a} \u{ff06} more at noon"
+    );
     let shown = "Maintenance&#60;/b&#62; &#38; more at noon";
     let page = session.monitor().await;
     assert!(page.contains(shown) && !page.contains("<b>Maint"), "{page}");
     assert!(asked.elapsed() < Duration::from_secs(2), "{:?}", asked.elapsed());
     // Clients that connect later receive it too.
-    Client::connect(&session.websocket(ASKS)).await.until("announcement: ").await;
+    Client::connect(&session.websocket(ASKS))
+        .await
+        .until("announcement: ")
+        .await;
     // Another announcement, and its end.
     assert_eq!(announce(&session, &json!({"text": "R&D"})).await, 200);
     assert_eq!(viewer.until("announcement:").await, "announcement: R\u{ff06}D");
@@ -55,9 +61,17 @@ async fn only_the_password_announces_something() {
     assert_eq!(post(&url, None, order).await, 401);
     assert_eq!(post(&url, Some("guess"), order).await, 401);
     let foreign = awc::Client::default().post(&url).basic_auth("admin", PASSWORD);
-    let answer = foreign.insert_header(("Origin", "https://evil.example")).send_body(order).await.unwrap();
+    let answer = foreign
+        .insert_header(("Origin", "https://evil.example"))
+        .send_body(order)
+        .await
+        .unwrap();
     assert_eq!(answer.status(), 403);
-    for wrong in [json!({"text": 5}), json!({"text": "x", "more": 1}), json!({"text": "x".repeat(301)})] {
+    for wrong in [
+        json!({"text": 5}),
+        json!({"text": "x", "more": 1}),
+        json!({"text": "x".repeat(301)}),
+    ] {
         assert_eq!(announce(&session, &wrong).await, 400, "{wrong}");
     }
     assert!(!session.monitor().await.contains("class=\"announcement\""));

@@ -23,7 +23,10 @@ fn loopback(last: impl IntoIterator<Item = u8>) -> Vec<IpAddr> {
 }
 
 fn stand_ins(addresses: &[IpAddr], port: u16) -> Vec<StandIn> {
-    addresses.iter().map(|address| StandIn::start_on((*address, port).into(), good())).collect()
+    addresses
+        .iter()
+        .map(|address| StandIn::start_on((*address, port).into(), good()))
+        .collect()
 }
 
 /// A session server that looks these entries up.
@@ -36,7 +39,10 @@ async fn servers(session: &Server) -> Vec<(String, String)> {
     let status = session.status().await;
     let text = |value: &Value| value.as_str().unwrap().to_owned();
     let servers = status["servers"].as_array().unwrap();
-    servers.iter().map(|server| (text(&server["address"]), text(&server["state"]))).collect()
+    servers
+        .iter()
+        .map(|server| (text(&server["address"]), text(&server["state"])))
+        .collect()
 }
 
 #[actix_rt::test]
@@ -49,7 +55,11 @@ async fn servers_behind_a_name_come_and_go() {
     let session = looking_up(&[fixed.address()], &names).start().await;
     session.reload(json!({"simulationServers": [fixed.address(), format!("dns+Fleet.test:{port}")]}));
     until_states(&session, &["up"; 3]).await;
-    assert_eq!(servers(&session).await[0].0, fixed.address(), "in the order of the configuration");
+    assert_eq!(
+        servers(&session).await[0].0,
+        fixed.address(),
+        "in the order of the configuration"
+    );
 
     // More servers are listed, one of them with an IPv6 address.
     let (third, fourth): (IpAddr, IpAddr) = ([127, 0, 0, 4].into(), "::1".parse().unwrap());
@@ -57,14 +67,28 @@ async fn servers_behind_a_name_come_and_go() {
     let begin = Instant::now();
     names.set("fleet.test", &[loopback([2, 3]), vec![third, fourth]].concat());
     until_states(&session, &["up"; 5]).await;
-    assert!(begin.elapsed() < Duration::from_secs(5), "used after {:?}", begin.elapsed());
-    assert!(servers(&session).await.iter().any(|(address, _)| *address == format!("[::1]:{port}")));
+    assert!(
+        begin.elapsed() < Duration::from_secs(5),
+        "used after {:?}",
+        begin.elapsed()
+    );
+    assert!(
+        servers(&session)
+            .await
+            .iter()
+            .any(|(address, _)| *address == format!("[::1]:{port}"))
+    );
 
     // One is no longer listed but still answers: no client is sent there.
     let leaving = first.remove(0);
     names.set("fleet.test", &[loopback([3]), vec![third, fourth]].concat());
     until_states(&session, &["up"; 4]).await;
-    assert!(servers(&session).await.iter().all(|(address, _)| *address != leaving.address()));
+    assert!(
+        servers(&session)
+            .await
+            .iter()
+            .all(|(address, _)| *address != leaving.address())
+    );
     for _ in 0..20 {
         assert_ne!(http::get(&session.url("/session")).await.text(), leaving.url());
     }
@@ -76,7 +100,11 @@ async fn servers_behind_a_name_come_and_go() {
     let address = leaving.address();
     drop(leaving);
     assert_eq!(times_logged(&session, &format!("{address}: no longer watched")), 2);
-    assert_eq!(times_logged(&session, &format!("{address}: down")), 0, "to leave is no failure");
+    assert_eq!(
+        times_logged(&session, &format!("{address}: down")),
+        0,
+        "to leave is no failure"
+    );
     // One that fails, and is then no longer listed, is forgotten.
     drop(first.pop());
     until_states(&session, &["up", "down", "up", "up"]).await;
@@ -120,7 +148,11 @@ async fn a_failed_lookup_keeps_the_servers_and_is_logged_once() {
             let begin = stopwatch.lap();
             let given = http::get(&session.url("/session")).await.text();
             assert!(given.starts_with("ws://127.0.0."), "{given}");
-            assert!(begin.elapsed() < Duration::from_secs(1), "an answer took {:?}", begin.elapsed());
+            assert!(
+                begin.elapsed() < Duration::from_secs(1),
+                "an answer took {:?}",
+                begin.elapsed()
+            );
             actix_rt::time::sleep(Duration::from_millis(20)).await;
         }
         until_states(&session, &["up"; 2]).await;
@@ -143,17 +175,33 @@ async fn a_failed_lookup_keeps_the_servers_and_is_logged_once() {
 async fn a_thousand_servers_are_found_behind_one_name() {
     let Some(names) = NameServer::start() else { return };
     let port = ports::block(1);
-    let addresses: Vec<IpAddr> =
-        (0..1000).map(|number| [127, 1, (number / 250) as u8, (number % 250) as u8 + 1].into()).collect();
+    let addresses: Vec<IpAddr> = (0..1000)
+        .map(|number| [127, 1, (number / 250) as u8, (number % 250) as u8 + 1].into())
+        .collect();
     let _servers = stand_ins(&addresses, port);
     names.set("fleet.test", &addresses);
     let builder = looking_up(&[format!("dns+fleet.test:{port}")], &names);
-    let session = builder.set("loadRefresh", 600).set("timing", json!({"answer": 15})).start().await;
+    let session = builder
+        .set("loadRefresh", 600)
+        .set("timing", json!({"answer": 15}))
+        .start()
+        .await;
     let metrics = async |line: String| session.metrics().await.lines().any(|one| one == line);
-    until("all are found", async || metrics("webots_session_servers{state=\"up\"} 1000".to_owned()).await).await;
-    assert!(metrics(format!("webots_session_lookup_servers{{name=\"dns+fleet.test:{port}\"}} 1000")).await);
+    until("all are found", async || {
+        metrics("webots_session_servers{state=\"up\"} 1000".to_owned()).await
+    })
+    .await;
+    assert!(
+        metrics(format!(
+            "webots_session_lookup_servers{{name=\"dns+fleet.test:{port}\"}} 1000"
+        ))
+        .await
+    );
     names.set("fleet.test", &addresses[..500]);
-    until("half of them are gone", async || metrics("webots_session_servers{state=\"up\"} 500".to_owned()).await).await;
+    until("half of them are gone", async || {
+        metrics("webots_session_servers{state=\"up\"} 500".to_owned()).await
+    })
+    .await;
 }
 
 #[actix_rt::test]
@@ -164,20 +212,35 @@ async fn a_name_whose_lookup_hangs_holds_up_only_its_own_server() {
     let well = StandIn::start(good());
     let mut servers: Vec<String> = (0..HANGING).map(|number| format!("{number}.test:2000")).collect();
     servers.push(well.address());
-    let builder = looking_up(&servers, &names).set("timing", json!({"answer": 0.5})).set("loadRefresh", 0.05);
+    let builder = looking_up(&servers, &names)
+        .set("timing", json!({"answer": 0.5}))
+        .set("loadRefresh", 0.05);
     let mut session = builder.start().await;
     until_states(&session, &[vec!["down"; HANGING], vec!["up"]].concat()).await;
     assert!(session.log().contains("0.test:2000: down: no answer within 0.5 s"));
     // After some polls, no threads have piled up, and the other server is polled as before.
-    let threads = || procfs::process::Process::new(session.pid()).unwrap().stat().unwrap().num_threads;
+    let threads = || {
+        procfs::process::Process::new(session.pid())
+            .unwrap()
+            .stat()
+            .unwrap()
+            .num_threads
+    };
     let before = threads();
     let (asked, begin) = (well.requests(), Instant::now());
     until("it is asked twenty times more", async || well.requests() >= asked + 20).await;
     let took = begin.elapsed();
-    assert!(took < Duration::from_secs(5), "twenty looks, one each 0.05 s, took {took:?}");
+    assert!(
+        took < Duration::from_secs(5),
+        "twenty looks, one each 0.05 s, took {took:?}"
+    );
     assert!(threads() <= before, "{} threads, {before} before", threads());
     // The pending lookups don't delay the stop either.
     let begin = Instant::now();
     session.stops().await;
-    assert!(begin.elapsed() < Duration::from_secs(5), "the end took {:?}", begin.elapsed());
+    assert!(
+        begin.elapsed() < Duration::from_secs(5),
+        "the end took {:?}",
+        begin.elapsed()
+    );
 }

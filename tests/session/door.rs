@@ -15,22 +15,35 @@ use crate::support::{SOON, http, until};
 async fn a_client_is_led_to_the_simulation_server_that_is_there() {
     let simulation = demo_server(9).start().await;
     // Other load on this machine must not make the server full.
-    let session = session_server(&[simulation.address()]).set("loadThreshold", 1000).start().await;
+    let session = session_server(&[simulation.address()])
+        .set("loadThreshold", 1000)
+        .start()
+        .await;
     let mut client = Client::connect(&session.websocket("/session")).await;
     client.until("1").await;
     let address = format!("ws://{}", simulation.address());
     assert_eq!(http::get(&session.url("/request")).await.text(), "1");
     assert_eq!(http::get(&session.url("/session")).await.text(), address);
     let url = world("lab/arm", "main", "worlds/a.wbt");
-    assert_eq!(http::get(&session.url(&format!("/session?url={url}"))).await.text(), address);
+    assert_eq!(
+        http::get(&session.url(&format!("/session?url={url}"))).await.text(),
+        address
+    );
     client.send(&url).await;
     assert_eq!(client.until("ws").await, address);
     drop(simulation);
     client.until("0").await;
-    until("the door is closed", async || http::get(&session.url("/request")).await.text() == "0").await;
+    until("the door is closed", async || {
+        http::get(&session.url("/request")).await.text() == "0"
+    })
+    .await;
     let answer = http::get(&session.url("/session")).await;
     assert_eq!(answer.text(), "Error: no simulation server available at the moment.");
-    assert_eq!((answer.status.as_u16(), answer.header("retry-after")), (200, None), "as the Python server answers");
+    assert_eq!(
+        (answer.status.as_u16(), answer.header("retry-after")),
+        (200, None),
+        "as the Python server answers"
+    );
     // `Retry-After` varies, so that the clients of a class retry at different times.
     let mut seconds = BTreeSet::new();
     for _ in 0..20 {
@@ -40,7 +53,10 @@ async fn a_client_is_led_to_the_simulation_server_that_is_there() {
         assert_eq!(answer.header("access-control-expose-headers"), Some("Retry-After"));
         seconds.insert(answer.header("retry-after").unwrap().parse::<u32>().unwrap());
     }
-    assert!(seconds.len() > 1 && seconds.iter().all(|time| (2..=6).contains(time)), "{seconds:?}");
+    assert!(
+        seconds.len() > 1 && seconds.iter().all(|time| (2..=6).contains(time)),
+        "{seconds:?}"
+    );
 }
 
 #[actix_rt::test]
@@ -51,8 +67,13 @@ async fn a_message_may_come_in_pieces_and_must_not_be_large() {
     let connect = async || Client::connect(&session.websocket("/")).await;
     let mut client = connect().await;
     client.until("1").await;
-    client.send_pieces(&[b"https://github.com/lab/arm", b"", b"/blob/main/worlds/a.wbt"]).await;
-    assert_eq!(client.until("Error").await, "Error: no simulation server accepts https://github.com/lab/arm.");
+    client
+        .send_pieces(&[b"https://github.com/lab/arm", b"", b"/blob/main/worlds/a.wbt"])
+        .await;
+    assert_eq!(
+        client.until("Error").await,
+        "Error: no simulation server accepts https://github.com/lab/arm."
+    );
     let piece = [b'x'; 5000];
     client.send_pieces(&[&piece, &piece]).await;
     assert_eq!(client.closed().await, Some(1009));
@@ -103,7 +124,11 @@ async fn a_draining_server_is_offered_for_less_than_a_second_more() {
     let config: serde_json::Value = serde_json::from_slice(&config).unwrap();
     let session = session_server(&[server.address()]).set("loadRefresh", config["loadRefresh"].clone());
     // Neither other tests on this machine nor the requests below make the server full.
-    let session = session.set("loadThreshold", 1000).set("clientCost", 0.001).start().await;
+    let session = session
+        .set("loadThreshold", 1000)
+        .set("clientCost", 0.001)
+        .start()
+        .await;
     let offered = async || http::get(&session.url("/session")).await.text().starts_with("ws://");
     until("it is offered", offered).await;
     let _client = Client::ready(&server).await;
@@ -116,7 +141,11 @@ async fn a_draining_server_is_offered_for_less_than_a_second_more() {
     while offered().await {
         let last = asked;
         assert!(last.elapsed() < SOON, "it is offered for ever");
-        assert!(last - drains < Duration::from_secs(1) + held_up, "offered to one who asked {:?} later", last - drains);
+        assert!(
+            last - drains < Duration::from_secs(1) + held_up,
+            "offered to one who asked {:?} later",
+            last - drains
+        );
         actix_rt::time::sleep(Duration::from_millis(50)).await;
         asked = Instant::now();
         held_up = held_up.max(asked - last - Duration::from_millis(50));

@@ -29,7 +29,10 @@ async fn until_states(session: &Server, expected: &[&str]) {
     until(&format!("the servers are {expected:?}"), async || {
         let status = session.status().await;
         let servers = status["servers"].as_array().unwrap();
-        servers.iter().map(|server| server["state"].as_str().unwrap()).eq(expected.iter().copied())
+        servers
+            .iter()
+            .map(|server| server["state"].as_str().unwrap())
+            .eq(expected.iter().copied())
     })
     .await;
 }

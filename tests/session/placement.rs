@@ -15,7 +15,9 @@ const NOBODY: &str = "Error: no simulation server available at the moment.";
 
 /// A session server whose simulation servers report only once, so that the test runs between two reports.
 fn between_reports(servers: &[StandIn], client_cost: f64) -> Builder {
-    session_server(&addresses(servers)).set("loadRefresh", 600).set("clientCost", client_cost)
+    session_server(&addresses(servers))
+        .set("loadRefresh", 600)
+        .set("clientCost", client_cost)
 }
 
 /// Sends `count` requests; returns how many clients each server got.
@@ -46,7 +48,11 @@ async fn a_burst_between_two_reports_is_spread_evenly() {
 
 #[actix_rt::test]
 async fn a_server_without_a_free_slot_gets_nobody() {
-    let servers = [Manner::status(10.0, 4, 4), Manner::status(91.0, 9, 100), Manner::status(60.0, 2, 4)];
+    let servers = [
+        Manner::status(10.0, 4, 4),
+        Manner::status(91.0, 9, 100),
+        Manner::status(60.0, 2, 4),
+    ];
     let servers = servers.map(StandIn::start);
     let session = between_reports(&servers, 10.0).start().await;
     until_states(&session, &["full", "full", "up"]).await;
@@ -101,21 +107,34 @@ async fn somebody_who_only_asks_does_not_close_the_fleet() {
         "arrivals": 0}});
     let servers = [StandIn::start(Manner::Status(counting))];
     // The tests' own address is that of a trusted proxy, which names its clients. There is room for 43 clients.
-    let session = session_server(&addresses(&servers)).set("timing", json!({"placement": 0.5})).start().await;
+    let session = session_server(&addresses(&servers))
+        .set("timing", json!({"placement": 0.5}))
+        .start()
+        .await;
     until_states(&session, &["up"]).await;
     let (url, client) = (session.url("/session"), awc::Client::default());
     let ask = async || {
         let request = client.get(&url).insert_header(("X-Forwarded-For", "203.0.113.9"));
-        request.send().await.unwrap().body().await.unwrap().starts_with(b"ws://")
+        request
+            .send()
+            .await
+            .unwrap()
+            .body()
+            .await
+            .unwrap()
+            .starts_with(b"ws://")
     };
     let burst = async || futures_util::future::join_all((0..50).map(|_| ask())).await;
     // The address uses up its quota.
     let mut refused = 0;
-    until("it has asked for what closes the fleet, and is refused no longer", async || {
-        let answers = burst().await;
-        refused += answers.iter().filter(|placed| !**placed).count();
-        refused > 0 && answers.iter().all(|placed| *placed)
-    })
+    until(
+        "it has asked for what closes the fleet, and is refused no longer",
+        async || {
+            let answers = burst().await;
+            refused += answers.iter().filter(|placed| !**placed).count();
+            refused > 0 && answers.iter().all(|placed| *placed)
+        },
+    )
     .await;
     // From then on, no number of requests closes the fleet.
     for _ in 0..10 {

@@ -30,8 +30,15 @@ async fn deaf(session: &Server) -> TcpStream {
 #[actix_rt::test]
 async fn no_value_comes_twice_however_a_server_flaps() {
     let servers = [StandIn::start(Manner::idle(1.0, 1000))];
-    let session = session_server(&addresses(&servers)).set("loadRefresh", 0.01).set("clientCost", 0.1).start().await;
-    let paths = ["/session", "/"].into_iter().cycle().map(|path| session.websocket(path));
+    let session = session_server(&addresses(&servers))
+        .set("loadRefresh", 0.01)
+        .set("clientCost", 0.1)
+        .start()
+        .await;
+    let paths = ["/session", "/"]
+        .into_iter()
+        .cycle()
+        .map(|path| session.websocket(path));
     // More clients than are notified at a time.
     let mut clients = join_all(paths.take(150).map(|url| async move { Client::connect(&url).await })).await;
     let flap = async {
@@ -59,17 +66,27 @@ async fn no_value_comes_twice_however_a_server_flaps() {
         client.send("").await;
         client.until("ws://").await;
         let values: Vec<&String> = client.heard.iter().filter(|text| !text.starts_with("ws://")).collect();
-        assert!(values.iter().all(|value| ["0", "1"].contains(&value.as_str())), "{values:?}");
+        assert!(
+            values.iter().all(|value| ["0", "1"].contains(&value.as_str())),
+            "{values:?}"
+        );
         assert!(values.windows(2).all(|pair| pair[0] != pair[1]), "{values:?}");
         assert_eq!(values.last().unwrap().as_str(), "1");
     }
-    assert!(clients[0].heard.len() > 20, "the server did not flap: {:?}", clients[0].heard);
+    assert!(
+        clients[0].heard.len() > 20,
+        "the server did not flap: {:?}",
+        clients[0].heard
+    );
 }
 
 #[actix_rt::test]
 async fn a_silent_client_is_disconnected_in_time() {
     // The pings come at 3 and at 6 seconds.
-    let session = session_server(&[]).set("timing", serde_json::json!({"ping": 3, "silence": 4})).start().await;
+    let session = session_server(&[])
+        .set("timing", serde_json::json!({"ping": 3, "silence": 4}))
+        .start()
+        .await;
     let mut reader = Client::connect(&session.websocket("/session")).await;
     reader.until("0").await;
     let begin = std::time::Instant::now();
@@ -100,14 +117,23 @@ async fn nothing_piles_up_for_a_client_that_asks_without_reading() {
             assert!(flood < 1_000_000, "it may ask for ever");
         }
     };
-    actix_rt::time::timeout(crate::support::SOON, end).await.expect("it is sent away");
+    actix_rt::time::timeout(crate::support::SOON, end)
+        .await
+        .expect("it is sent away");
     until("it is forgotten", async || clients_of(&session).await == 0).await;
-    assert!(session.log().contains("asks too much between two pings"), "{}", session.log());
+    assert!(
+        session.log().contains("asks too much between two pings"),
+        "{}",
+        session.log()
+    );
 }
 
 #[actix_rt::test]
 async fn too_many_clients_are_refused() {
-    for (builder, least) in [(session_server(&[]).set("maxClients", 2), 2), (session_server(&[]).files(200), 20)] {
+    for (builder, least) in [
+        (session_server(&[]).set("maxClients", 2), 2),
+        (session_server(&[]).files(200), 20),
+    ] {
         let session = builder.start().await;
         let connect = || async { tokio_tungstenite::connect_async(session.websocket("/session")).await };
         let mut clients = Vec::new();
@@ -129,31 +155,44 @@ async fn too_many_clients_are_refused() {
         assert_eq!(is_told, least == 20, "{}", session.log());
     }
     let said = session_server(&[]).files(128).refused(1).await;
-    assert!(said.starts_with("error: 128 files may be open, which is not enough for one client"), "{said}");
+    assert!(
+        said.starts_with("error: 128 files may be open, which is not enough for one client"),
+        "{said}"
+    );
 }
 
 #[actix_rt::test]
 async fn a_client_that_reads_no_page_is_sent_away() {
-    let session = session_server(&[]).set("timing", serde_json::json!({"ping": 0.5, "silence": 1})).start().await;
+    let session = session_server(&[])
+        .set("timing", serde_json::json!({"ping": 0.5, "silence": 1}))
+        .start()
+        .await;
     let mut deaf = TcpStream::connect(session.address()).await.unwrap();
     let request = b"GET /assets/viewer.js HTTP/1.1\r\nHost: localhost\r\n\r\n";
     // The server stops reading requests because its answers are not read; then it cuts the connection.
     let flood = async { while deaf.write_all(request).await.is_ok() {} };
-    actix_rt::time::timeout(Duration::from_secs(40), flood).await.expect("the connection is still open");
+    actix_rt::time::timeout(Duration::from_secs(40), flood)
+        .await
+        .expect("the connection is still open");
     assert_eq!(http::get(&session.url("/health")).await.status, 200);
 }
 
 /// An open connection over which one request was answered.
 async fn served(session: &Server) -> Option<TcpStream> {
     let mut stream = TcpStream::connect(session.address()).await.unwrap();
-    stream.write_all(b"GET /health HTTP/1.1\r\nHost: localhost\r\n\r\n").await.ok()?;
+    stream
+        .write_all(b"GET /health HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        .await
+        .ok()?;
     let length = stream.read(&mut [0; 512]).await.ok()?;
     (length > 0).then_some(stream)
 }
 
 #[actix_rt::test]
 async fn an_address_has_only_so_many_connections_of_any_kind() {
-    let builder = session_server(&[]).set("trustedProxies", serde_json::json!([])).set("maxClientsPerAddress", 2);
+    let builder = session_server(&[])
+        .set("trustedProxies", serde_json::json!([]))
+        .set("maxClientsPerAddress", 2);
     let session = builder.start().await;
     let mut open = Vec::new();
     // The connection of the start check may still be open.
@@ -165,5 +204,8 @@ async fn an_address_has_only_so_many_connections_of_any_kind() {
     let more = join_all((0..4).map(|_| served(&session))).await;
     assert!(more.iter().all(Option::is_none), "it has more than four connections");
     drop(open);
-    until("there is room again", async || http::try_get(&session.url("/health")).await.is_ok()).await;
+    until("there is room again", async || {
+        http::try_get(&session.url("/health")).await.is_ok()
+    })
+    .await;
 }

@@ -77,7 +77,12 @@ impl StandIn {
     pub fn start_on(address: SocketAddr, manner: Manner) -> Self {
         // A test may start a thousand of them.
         raise_file_limit();
-        let socket = if address.is_ipv6() { TcpSocket::new_v6() } else { TcpSocket::new_v4() }.unwrap();
+        let socket = if address.is_ipv6() {
+            TcpSocket::new_v6()
+        } else {
+            TcpSocket::new_v4()
+        }
+        .unwrap();
         socket.set_reuseaddr(true).unwrap();
         socket.bind(address).unwrap();
         let listener = socket.listen(1024).unwrap();
@@ -129,7 +134,10 @@ async fn serve(listener: TcpListener, shared: Arc<Shared>, end: CancellationToke
     while let Ok((stream, _)) = listener.accept().await {
         shared.connections.fetch_add(1, Ordering::SeqCst);
         let shared = Arc::clone(&shared);
-        actix_rt::spawn(end.clone().run_until_cancelled_owned(async move { converse(stream, &shared).await }));
+        actix_rt::spawn(
+            end.clone()
+                .run_until_cancelled_owned(async move { converse(stream, &shared).await }),
+        );
     }
 }
 
@@ -179,7 +187,9 @@ async fn answer(stream: &mut TcpStream, path: &str, manner: Manner) -> std::io::
             return Ok(false);
         }
         Manner::Drip => {
-            stream.write_all(b"HTTP/1.1 200 OK\r\nContent-Length: 100000\r\n\r\n").await?;
+            stream
+                .write_all(b"HTTP/1.1 200 OK\r\nContent-Length: 100000\r\n\r\n")
+                .await?;
             loop {
                 stream.write_all(b" ").await?;
                 actix_rt::time::sleep(Duration::from_millis(20)).await;

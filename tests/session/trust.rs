@@ -16,7 +16,11 @@ fn simulation_server(certificate: &Certificate) -> String {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let port = listener.local_addr().unwrap().port();
     serve(listener, Some(certificate.server()), |request| {
-        let (status, content) = if request.path() == "/2000/load" { ("200 OK", "12.5") } else { ("404 Not Found", "") };
+        let (status, content) = if request.path() == "/2000/load" {
+            ("200 OK", "12.5")
+        } else {
+            ("404 Not Found", "")
+        };
         Some((status.to_owned(), content.into()))
     });
     format!("localhost:{port}/2000")
@@ -50,8 +54,14 @@ async fn a_certificate_that_is_not_trusted_is_named_with_the_reason() {
     let table = [
         (other.issue(&["localhost"]), "UnknownIssuer"),
         (lab.issue_as(&["localhost"], dated(2010, 2011)), "certificate expired"),
-        (lab.issue_as(&["localhost"], dated(2400, 2401)), "certificate not valid yet"),
-        (lab.issue(&["lab.example"]), "certificate not valid for name \"localhost\""),
+        (
+            lab.issue_as(&["localhost"], dated(2400, 2401)),
+            "certificate not valid yet",
+        ),
+        (
+            lab.issue(&["lab.example"]),
+            "certificate not valid for name \"localhost\"",
+        ),
     ];
     let mut servers = vec![simulation_server(&lab.issue(&["localhost"]))];
     servers.extend(table.iter().map(|(certificate, _)| simulation_server(certificate)));
@@ -66,7 +76,10 @@ async fn a_certificate_that_is_not_trusted_is_named_with_the_reason() {
         assert!(error.starts_with(&words), "{error:?} is not {words:?}");
         assert!(log.contains(&words), "{words:?} is not in the log");
     }
-    assert!(page.matches("its certificate is not trusted").count() >= table.len(), "{page}");
+    assert!(
+        page.matches("its certificate is not trusted").count() >= table.len(),
+        "{page}"
+    );
     assert_eq!(errors[4], "no connection: it does not speak https there");
 }
 
@@ -81,7 +94,10 @@ async fn a_self_signed_certificate_in_the_trust_store_is_trusted() {
     let session = watching(&servers, &folder.path().join("trusted.pem")).start().await;
     // Not trusted: another certificate for the same name, and one that may sign others, as `openssl req -x509` makes.
     let errors = errors_after_the_first(&session, 2).await;
-    for (error, words) in errors.iter().zip(["its certificate is not trusted", "CaUsedAsEndEntity"]) {
+    for (error, words) in errors
+        .iter()
+        .zip(["its certificate is not trusted", "CaUsedAsEndEntity"])
+    {
         assert!(error.contains(words), "{error}");
     }
 }
@@ -95,10 +111,14 @@ async fn authorities_that_cant_be_read_cost_only_their_servers() {
                 -----END CERTIFICATE-----\n";
     std::fs::write(&broken, text.replace("{}", &good)).unwrap();
     let servers = [simulation_server(&lab.issue(&["localhost"]))];
-    for (trusted, state, words) in
-        [(&*broken, "up", "can't be"), (Path::new("/nowhere.pem"), "down", "no certificate authority is known")]
-    {
-        let session = watching(&servers, trusted).env("SSL_CERT_DIR", "/nowhere").start().await;
+    for (trusted, state, words) in [
+        (&*broken, "up", "can't be"),
+        (Path::new("/nowhere.pem"), "down", "no certificate authority is known"),
+    ] {
+        let session = watching(&servers, trusted)
+            .env("SSL_CERT_DIR", "/nowhere")
+            .start()
+            .await;
         until_states(&session, &[state]).await;
         assert!(session.log().contains(words), "{}", session.log());
     }

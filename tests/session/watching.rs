@@ -58,7 +58,10 @@ fn bad_manners() -> Vec<Manner> {
 async fn no_bad_answer_is_taken_for_a_good_one() {
     let bad = bad_manners();
     let servers: Vec<StandIn> = bad.iter().map(|_| StandIn::start(good())).collect();
-    let session = session_server(&addresses(&servers)).set("timing", serde_json::json!({"answer": 3})).start().await;
+    let session = session_server(&addresses(&servers))
+        .set("timing", serde_json::json!({"answer": 3}))
+        .start()
+        .await;
     let mut client = Client::connect(&session.websocket("/session")).await;
     client.until("1").await;
     until_states(&session, &vec!["up"; bad.len()]).await;
@@ -81,18 +84,26 @@ async fn no_bad_answer_is_taken_for_a_good_one() {
     until_states(&session, &vec!["up"; bad.len()]).await;
     for (server, manner) in servers.iter().zip(&bad) {
         let address = server.address();
-        let logged =
-            (times_logged(&session, &format!("{address}: down")), times_logged(&session, &format!("{address}: up")));
+        let logged = (
+            times_logged(&session, &format!("{address}: down")),
+            times_logged(&session, &format!("{address}: up")),
+        );
         assert_eq!(logged, (1, 2), "{manner:?}");
     }
-    assert_eq!(client.heard, ["0", "1", "0", "1"].map(str::to_owned)[usize::from(client.heard[0] == "1")..]);
+    assert_eq!(
+        client.heard,
+        ["0", "1", "0", "1"].map(str::to_owned)[usize::from(client.heard[0] == "1")..]
+    );
 }
 
 #[actix_rt::test]
 async fn a_crashed_server_is_noticed_within_one_refresh() {
     // One comes back on its port, which the system assigns to no other program in between.
     let port = ports::block(1);
-    let mut servers = vec![StandIn::start_on(([127, 0, 0, 1], port).into(), good()), StandIn::start(good())];
+    let mut servers = vec![
+        StandIn::start_on(([127, 0, 0, 1], port).into(), good()),
+        StandIn::start(good()),
+    ];
     let session = session_server(&addresses(&servers)).set("loadRefresh", 1).start().await;
     let mut client = Client::connect(&session.websocket("/session")).await;
     until_states(&session, &["up", "up"]).await;
@@ -100,7 +111,11 @@ async fn a_crashed_server_is_noticed_within_one_refresh() {
     let crash = stopwatch.lap();
     drop(servers.remove(0));
     until_states(&session, &["down", "up"]).await;
-    assert!(crash.elapsed() < Duration::from_millis(1500), "noticed after {:?}", crash.elapsed());
+    assert!(
+        crash.elapsed() < Duration::from_millis(1500),
+        "noticed after {:?}",
+        crash.elapsed()
+    );
     for _ in 0..5 {
         assert_eq!(http::get(&session.url("/session")).await.text(), servers[0].url());
     }
@@ -117,18 +132,33 @@ async fn a_hung_server_is_noticed_in_time_and_delays_nobody() {
     let servers = [(); 10].map(|()| StandIn::start(Manner::idle(5.0, 1000)));
     let timing = serde_json::json!({"answer": 2, "placement": 0.2});
     // With this cost the requests of this test don't use up the capacity.
-    let builder = session_server(&addresses(&servers)).set("timing", timing).set("clientCost", 0.001);
+    let builder = session_server(&addresses(&servers))
+        .set("timing", timing)
+        .set("clientCost", 0.001);
     let session = builder.start().await;
     until_states(&session, &["up"; 10]).await;
     let stopwatch = Stopwatch::start();
     let hung = stopwatch.lap();
     servers[0].set(Manner::Hang);
     let states = ["down", "up", "up", "up", "up", "up", "up", "up", "up", "up"];
-    while session.log().matches(&format!("{}: down: no answer within 2 s", servers[0].address())).count() == 0 {
+    while session
+        .log()
+        .matches(&format!("{}: down: no answer within 2 s", servers[0].address()))
+        .count()
+        == 0
+    {
         let begin = stopwatch.lap();
         assert_eq!(http::get(&session.url("/session")).await.status, 200);
-        assert!(begin.elapsed() < Duration::from_secs(1), "an answer took {:?}", begin.elapsed());
-        assert!(hung.elapsed() < Duration::from_secs(4), "not noticed after {:?}", hung.elapsed());
+        assert!(
+            begin.elapsed() < Duration::from_secs(1),
+            "an answer took {:?}",
+            begin.elapsed()
+        );
+        assert!(
+            hung.elapsed() < Duration::from_secs(4),
+            "not noticed after {:?}",
+            hung.elapsed()
+        );
         actix_rt::time::sleep(Duration::from_millis(10)).await;
     }
     let others: Vec<usize> = servers.iter().map(StandIn::requests).collect();

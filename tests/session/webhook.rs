@@ -17,7 +17,9 @@ const SECRET: &str = "T0PSECRET";
 fn with_webhook(servers: &[StandIn], scheme: &str, port: u16) -> Builder {
     let url = format!("{scheme}://localhost:{port}/services/{SECRET}?key={SECRET}");
     let timing = json!({"answer": 4, "gather": 0.5, "flapping": 0.5, "mailRetry": 0.05, "mailAnswer": 5});
-    session_server(&addresses(servers)).set("webhook", url).set("timing", timing)
+    session_server(&addresses(servers))
+        .set("webhook", url)
+        .set("timing", timing)
 }
 
 /// Three servers that fail.
@@ -38,16 +40,26 @@ async fn the_notices_of_a_mail_are_one_message_and_need_no_mail() {
     for server in addresses(&servers) {
         assert!(text.contains(&format!("{server}: not responding")), "{text}");
     }
-    assert!(text.contains(&format!("http://localhost:{}/monitor", session.port)), "{text}");
+    assert!(
+        text.contains(&format!("http://localhost:{}/monitor", session.port)),
+        "{text}"
+    );
     let posted = receiver.posted().remove(0);
     assert_eq!(posted.line, format!("POST /services/{SECRET}?key={SECRET} HTTP/1.1"));
     assert_eq!(posted.body.as_object().unwrap().len(), 1);
     // A server's problem text must not become a mention, a link or a second line in a chat.
     servers[0].set(Manner::idle(7.0, 10));
     until_states(&session, &["up", "down", "down"]).await;
-    servers[0].set(Manner::Status(json!({"load": 100, "problem": "<!channel> & <https://evil.example|x>\nhello"})));
-    until("its words are told", async || receiver.posted().iter().any(|one| one.body.to_string().contains("channel")))
-        .await;
+    servers[0].set(Manner::Status(
+        json!({"load": 100, "problem": "<!channel> & <https://evil.example|x>\nhello"}),
+    ));
+    until("its words are told", async || {
+        receiver
+            .posted()
+            .iter()
+            .any(|one| one.body.to_string().contains("channel"))
+    })
+    .await;
     for text in receiver.texts(2).await {
         assert!(!text.contains(['<', '>', '&']) && !text.contains("\nhello"), "{text}");
     }
@@ -55,7 +67,10 @@ async fn the_notices_of_a_mail_are_one_message_and_need_no_mail() {
     for path in ["/status", "/monitor", "/metrics"] {
         assert!(!http::get(&session.url(path)).await.text().contains(SECRET), "{path}");
     }
-    until("it is logged", async || session.log().contains("webhook sent by localhost:")).await;
+    until("it is logged", async || {
+        session.log().contains("webhook sent by localhost:")
+    })
+    .await;
 }
 
 #[actix_rt::test]
@@ -63,18 +78,34 @@ async fn a_webhook_and_a_mail_are_retried_independently() {
     let (servers, receiver, other) = (fleet(), Receiver::start(None), Receiver::start(None));
     receiver.answer("503 Busy");
     let mut smtp = Smtp::start(&[]).await;
-    let session = with_webhook(&servers, "http", receiver.port).mails_to(smtp.port).start().await;
+    let session = with_webhook(&servers, "http", receiver.port)
+        .mails_to(smtp.port)
+        .start()
+        .await;
     // The mail does not wait for the webhook.
     assert_eq!(smtp.mail().await.subject(), "Simulation servers: 3 not responding");
     receiver.texts(3).await;
-    until("it is logged", async || session.log().contains("webhook not sent, it is tried again")).await;
+    until("it is logged", async || {
+        session.log().contains("webhook not sent, it is tried again")
+    })
+    .await;
     assert!(session.log().contains("503 Service Unavailable"), "{}", session.log());
     // Redirects are not followed: no other server receives the notices.
     receiver.answer(&format!("307 Elsewhere\r\nLocation: http://127.0.0.1:{}/", other.port));
-    until("it is logged", async || session.log().contains("307 Temporary Redirect")).await;
+    until("it is logged", async || {
+        session.log().contains("307 Temporary Redirect")
+    })
+    .await;
     receiver.answer("204 Taken");
     until("it is sent", async || session.log().contains("webhook sent by")).await;
-    assert!(receiver.texts(4).await.last().unwrap().starts_with("Simulation servers: 3 not responding"));
+    assert!(
+        receiver
+            .texts(4)
+            .await
+            .last()
+            .unwrap()
+            .starts_with("Simulation servers: 3 not responding")
+    );
     assert!(other.posted().is_empty());
     says_nothing_secret(&session);
 }
@@ -86,7 +117,10 @@ async fn a_messenger_whose_certificate_is_not_trusted_is_told_nothing() {
     for (authority, trusted) in [(&other, false), (&lab, true)] {
         let servers = fleet();
         let builder = with_webhook(&servers, "https", receiver.port);
-        let session = builder.env("SSL_CERT_FILE", authority.file().to_str().unwrap()).start().await;
+        let session = builder
+            .env("SSL_CERT_FILE", authority.file().to_str().unwrap())
+            .start()
+            .await;
         if trusted {
             receiver.texts(1).await;
         } else {
@@ -117,6 +151,9 @@ async fn the_webhook_can_be_tried_and_is_never_shown() {
     assert!(code == Some(0) && said.contains("\"webhook\": \"********\""), "{said}");
     for wrong in [SECRET, &format!("ftp://x/{SECRET}"), &format!("https:///{SECRET} x")] {
         let (code, said) = says("--check", wrong).await;
-        assert!(code == Some(2) && said.contains("webhook: it is no URL of a web server"), "{wrong}: {said}");
+        assert!(
+            code == Some(2) && said.contains("webhook: it is no URL of a web server"),
+            "{wrong}: {said}"
+        );
     }
 }

@@ -15,9 +15,22 @@ async fn the_cache_keeps_to_its_budget() {
     for name in ["lab/one", "lab/two", "lab/three"] {
         forge.commit(name, "main", &[("worlds/a.wbt", &world_text(name))]);
     }
-    let server = simulation_server(&webots.path(), forge.path(), 2).set("cacheSize", 1).start().await;
-    let ask = async |name: &str| assert!(outcome(&server, &world(name, "main", "worlds/a.wbt")).await.contains(name));
-    let has = |name: &str| cached(&server).iter().any(|path| path.to_string_lossy().contains(&name.replace('/', "-")));
+    let server = simulation_server(&webots.path(), forge.path(), 2)
+        .set("cacheSize", 1)
+        .start()
+        .await;
+    let ask = async |name: &str| {
+        assert!(
+            outcome(&server, &world(name, "main", "worlds/a.wbt"))
+                .await
+                .contains(name)
+        )
+    };
+    let has = |name: &str| {
+        cached(&server)
+            .iter()
+            .any(|path| path.to_string_lossy().contains(&name.replace('/', "-")))
+    };
     for name in ["lab/one", "lab/two", "lab/three"] {
         forge.commit_noise(name, 200_000);
         ask(name).await;
@@ -42,8 +55,12 @@ async fn a_damaged_cache_heals() {
             std::fs::remove_dir_all(repository).unwrap();
             std::fs::create_dir(repository).unwrap();
         }),
-        ("its settings are noise", |repository| std::fs::write(repository.join("config"), [0xff; 99]).unwrap()),
-        ("HEAD is gone", |repository| std::fs::remove_file(repository.join("HEAD")).unwrap()),
+        ("its settings are noise", |repository| {
+            std::fs::write(repository.join("config"), [0xff; 99]).unwrap()
+        }),
+        ("HEAD is gone", |repository| {
+            std::fs::remove_file(repository.join("HEAD")).unwrap()
+        }),
         ("an empty reference", |repository| {
             for reference in std::fs::read_dir(repository.join("refs/fleet")).unwrap().flatten() {
                 std::fs::write(reference.path(), "").unwrap();
@@ -61,22 +78,39 @@ async fn a_damaged_cache_heals() {
     }
     // Lock files of a killed git.
     for (mark, lock) in [("next", "shallow.lock"), ("last", "refs/fleet/COMMIT.lock")] {
-        let commit = server.forge().commit("lab/arm", "main", &[("worlds/a.wbt", &world_text(mark))]);
+        let commit = server
+            .forge()
+            .commit("lab/arm", "main", &[("worlds/a.wbt", &world_text(mark))]);
         std::fs::write(cached(&server)[0].join(lock.replace("COMMIT", &commit)), "").unwrap();
         healed(lock, &format!("opened [{mark}]")).await;
     }
     assert_eq!(cached(&server).len(), 1, "what was broken is gone");
     for folder in ["cache/runs", "cache/git", "cache"] {
         // The server may still be writing into the folder.
-        until("it is removed", async || std::fs::remove_dir_all(server.folder.join(folder)).is_ok()).await;
+        until("it is removed", async || {
+            std::fs::remove_dir_all(server.folder.join(folder)).is_ok()
+        })
+        .await;
         healed(folder, "opened [last]").await;
-        let run = std::fs::read_dir(server.folder.join("cache/runs")).unwrap().next().unwrap().unwrap().path();
-        assert!(std::fs::read_to_string(run.join("gitconfig")).unwrap().contains("hooksPath"));
+        let run = std::fs::read_dir(server.folder.join("cache/runs"))
+            .unwrap()
+            .next()
+            .unwrap()
+            .unwrap()
+            .path();
+        assert!(
+            std::fs::read_to_string(run.join("gitconfig"))
+                .unwrap()
+                .contains("hooksPath")
+        );
     }
 }
 
 fn cut_packs(repository: &Path) {
-    let files = std::fs::read_dir(repository.join("objects/pack")).unwrap().flatten().map(|entry| entry.path());
+    let files = std::fs::read_dir(repository.join("objects/pack"))
+        .unwrap()
+        .flatten()
+        .map(|entry| entry.path());
     for pack in files.filter(|path| path.extension().is_some_and(|extension| extension == "pack")) {
         // Packs are read-only.
         std::fs::remove_file(&pack).unwrap();
@@ -118,5 +152,8 @@ async fn a_cache_belongs_to_one_server() {
     is_told(&one, &arm(), "opened").await;
     one.signal(Signal::SIGKILL);
     one.ended().await;
-    assert!(outcome(&builder().start().await, &arm()).await.contains("opened"), "its lock ends with it");
+    assert!(
+        outcome(&builder().start().await, &arm()).await.contains("opened"),
+        "its lock ends with it"
+    );
 }

@@ -9,7 +9,11 @@ use crate::support::{Forge, WORLD, arm_at, outcome, simulation_server};
 async fn any_commit_of_a_branch_or_tag_runs() {
     let (forge, webots) = (Forge::new(), reader());
     let commit = |branch: &str, text: &str| forge.commit("lab/arm", branch, &[("worlds/a.wbt", &world_text(text))]);
-    let commits = [commit("main", "first"), commit("main", "second"), commit("main", "third")];
+    let commits = [
+        commit("main", "first"),
+        commit("main", "second"),
+        commit("main", "third"),
+    ];
     let tagged = [commit("side", "tagged before"), commit("side", "tagged")];
     forge.tag("lab/arm", "v1", "side");
     let bare = forge.path().join("lab/arm");
@@ -21,16 +25,28 @@ async fn any_commit_of_a_branch_or_tag_runs() {
         let builder = simulation_server(&webots.path(), forge.path(), 2).env("PATH", &wrapper.path());
         let server = builder.start().await;
         let run = async |commit: &str| outcome(&server, &arm_at(commit)).await;
-        for (commit, text) in [(&commits[0], "first"), (&tagged[0], "tagged before"), (&commits[1], "second")] {
+        for (commit, text) in [
+            (&commits[0], "first"),
+            (&tagged[0], "tagged before"),
+            (&commits[1], "second"),
+        ] {
             let told = run(commit).await;
             assert!(told.contains(&format!("opened [{text}]")), "{told}");
         }
         let repositories = cached(&server);
-        let history = repositories.iter().find(|path| path.to_string_lossy().contains("history")).unwrap();
+        let history = repositories
+            .iter()
+            .find(|path| path.to_string_lossy().contains("history"))
+            .unwrap();
         let objects = git(history, &["cat-file", "--batch-all-objects", "--batch-check"]);
         assert_eq!(objects.contains(" blob "), can_filter == "false", "{objects}");
         let fetches = || wrapper.calls().iter().filter(|call| call.contains(" fetch ")).count();
-        assert_eq!(fetches(), 4, "three commits, and the history once: {:#?}", wrapper.calls());
+        assert_eq!(
+            fetches(),
+            4,
+            "three commits, and the history once: {:#?}",
+            wrapper.calls()
+        );
         // Known commits are not fetched again. The `gc` after a fetch runs in the background.
         let calls = || wrapper.calls().iter().filter(|call| !call.contains(" gc ")).count();
         let before = calls();
@@ -42,7 +58,11 @@ async fn any_commit_of_a_branch_or_tag_runs() {
 #[actix_rt::test]
 async fn a_commit_of_no_branch_or_tag_runs_only_with_any_commit() {
     let (forge, webots) = (Forge::with_arm(), reader());
-    let proposed = forge.commit("lab/arm", "proposal", &[("worlds/a.wbt", WORLD), ("controllers/c/c.py", "evil")]);
+    let proposed = forge.commit(
+        "lab/arm",
+        "proposal",
+        &[("worlds/a.wbt", WORLD), ("controllers/c/c.py", "evil")],
+    );
     let bare = forge.path().join("lab/arm");
     git(&bare, &["update-ref", "refs/pull/1/head", &proposed]);
     git(&bare, &["update-ref", "-d", "refs/heads/proposal"]);
@@ -63,7 +83,10 @@ async fn a_commit_of_no_branch_or_tag_runs_only_with_any_commit() {
                 if any {
                     assert_eq!(told.contains("opened [WorldInfo"), hash != none, "{told}");
                 } else {
-                    assert!(told.contains("is in no branch or tag of https://github.com/lab/arm. Git hosts"), "{told}");
+                    assert!(
+                        told.contains("is in no branch or tag of https://github.com/lab/arm. Git hosts"),
+                        "{told}"
+                    );
                 }
             }
         }

@@ -12,20 +12,29 @@ fn ending(file: &Path) -> Webots {
     let begun = "printf 'begun\\nred \\033[31m text\\n\\377 no text\\n' >&2";
     let (demo, file) = (format!("{DEMO} \"$@\" >/dev/null 2>&1 &"), file.display());
     let ended = format!("until [ -e {file} ]; do sleep 0.02; done\nprintf 'last words\\nwithout end'");
-    Webots::script(&format!("{begun}\n{demo}\n{ended}\nkill %1 2>/dev/null\nexit $(cat {file})"))
+    Webots::script(&format!(
+        "{begun}\n{demo}\n{ended}\nkill %1 2>/dev/null\nexit $(cat {file})"
+    ))
 }
 
 /// A server with one such simulator, and the file with its folder.
 async fn ending_server() -> (Server, tempfile::TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("code");
-    (server_of(ending(&file), 1).set("isolation", "none").start().await, folder, file)
+    (
+        server_of(ending(&file), 1).set("isolation", "none").start().await,
+        folder,
+        file,
+    )
 }
 
 /// The lines of `simulations.csv` without the header.
 fn lines(server: &Server) -> Vec<Vec<String>> {
     let text = std::fs::read_to_string(server.folder.join("log/simulation/simulations.csv")).unwrap_or_default();
-    text.lines().skip(1).map(|line| line.split(',').map(str::to_owned).collect()).collect()
+    text.lines()
+        .skip(1)
+        .map(|line| line.split(',').map(str::to_owned).collect())
+        .collect()
 }
 
 /// Waits for the line of a simulation; returns its columns.
@@ -38,7 +47,12 @@ pub async fn line(server: &Server, id: &str) -> Vec<String> {
 async fn ends(server: &Server, reason: &str) -> f64 {
     let metrics = server.metrics().await;
     let begin = format!("webots_simulation_ends_total{{reason=\"{reason}\"}} ");
-    metrics.lines().find_map(|line| line.strip_prefix(&begin)).unwrap_or_else(|| panic!("{metrics}")).parse().unwrap()
+    metrics
+        .lines()
+        .find_map(|line| line.strip_prefix(&begin))
+        .unwrap_or_else(|| panic!("{metrics}"))
+        .parse()
+        .unwrap()
 }
 
 #[actix_rt::test]
@@ -61,21 +75,50 @@ async fn a_simulation_keeps_one_id() {
     let world = arm();
     let expected = ["127.0.0.1", "https://github.com/lab/arm", &world, &port, "none"];
     assert_eq!(line[3..8], expected, "{line:?}");
-    assert!(line[1] <= line[2] && line[1].ends_with('Z') && line[10] == "crashed", "{line:?}");
-    assert_eq!((ends(&server, "crashed").await, ends(&server, "left").await), (1.0, 0.0));
+    assert!(
+        line[1] <= line[2] && line[1].ends_with('Z') && line[10] == "crashed",
+        "{line:?}"
+    );
+    assert_eq!(
+        (ends(&server, "crashed").await, ends(&server, "left").await),
+        (1.0, 0.0)
+    );
     let kept = async || http::get(&url).await.text();
-    until("the output is kept with the events", async || kept().await.contains("ended (crashed)")).await;
+    until("the output is kept with the events", async || {
+        kept().await.contains("ended (crashed)")
+    })
+    .await;
     let kept = kept().await;
     let printed = format!("{begun}last words\nwithout end");
-    for words in ["asks for https://github.com/lab/arm", "Z ready\n", "Webots ended with exit code 3", &printed] {
+    for words in [
+        "asks for https://github.com/lab/arm",
+        "Z ready\n",
+        "Webots ended with exit code 3",
+        &printed,
+    ] {
         assert!(kept.contains(words), "{words:?}: {kept}");
     }
     let page = server.monitor().await;
-    assert!(page.contains("crashed") && page.contains(&format!("output?id={id}")), "{page}");
-    assert!(!page.contains("last words"), "who may see the page may not see the output");
+    assert!(
+        page.contains("crashed") && page.contains(&format!("output?id={id}")),
+        "{page}"
+    );
+    assert!(
+        !page.contains("last words"),
+        "who may see the page may not see the output"
+    );
     let log = server.log();
-    for words in ["asks for https", "is for Webots", "started ", ": ready", "Webots ended with exit code 3"] {
-        assert!(log.lines().any(|line| line.contains(&id) && line.contains(words)), "{words:?}: {log}");
+    for words in [
+        "asks for https",
+        "is for Webots",
+        "started ",
+        ": ready",
+        "Webots ended with exit code 3",
+    ] {
+        assert!(
+            log.lines().any(|line| line.contains(&id) && line.contains(words)),
+            "{words:?}: {log}"
+        );
     }
 }
 
@@ -107,7 +150,10 @@ async fn each_kind_of_end_is_told_as_such() {
     server.stops().await;
     let last = lines(&server);
     for client in [&running, &waiting] {
-        let line = last.iter().find(|line| line[0] == client.id()).unwrap_or_else(|| panic!("{last:?}"));
+        let line = last
+            .iter()
+            .find(|line| line[0] == client.id())
+            .unwrap_or_else(|| panic!("{last:?}"));
         assert_eq!(line[10], "stopped", "{line:?}");
     }
     assert_eq!(last.len(), 5, "{last:?}");
@@ -115,7 +161,10 @@ async fn each_kind_of_end_is_told_as_such() {
 
 #[actix_rt::test]
 async fn what_is_kept_needs_the_password_where_there_is_one() {
-    let server = server_of(Webots::script("exit 7"), 1).set("adminPassword", PASSWORD).start().await;
+    let server = server_of(Webots::script("exit 7"), 1)
+        .set("adminPassword", PASSWORD)
+        .start()
+        .await;
     let mut client = Client::start(&server, &arm()).await;
     client.until("loading: Error:").await;
     line(&server, client.id()).await;
@@ -145,13 +194,19 @@ async fn hidden_letters_in_a_worlds_name_are_shown() {
     }
     let hides = |text: &str| text.contains(['\u{202e}', '\u{2028}', '\u{200b}']);
     let page = server.monitor().await;
-    assert!(page.contains("a\u{fffd}b \u{fffd}.wbt") && page.contains("%E2%80%AEb"), "{page}");
+    assert!(
+        page.contains("a\u{fffd}b \u{fffd}.wbt") && page.contains("%E2%80%AEb"),
+        "{page}"
+    );
     assert!(!hides(&page), "{page}");
     for client in clients {
         client.leave().await;
     }
     let page = async || server.monitor().await;
-    until("their ends are shown", async || page().await.matches("data-label=\"After\"").count() == 2).await;
+    until("their ends are shown", async || {
+        page().await.matches("data-label=\"After\"").count() == 2
+    })
+    .await;
     let page = page().await;
     assert!(!hides(&page) && !hides(&server.log()), "{page}");
 }

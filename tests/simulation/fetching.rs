@@ -22,7 +22,9 @@ fn forge(branches: &[&str]) -> Forge {
 
 /// The commit of a branch.
 fn commit(forge: &Forge, branch: &str) -> String {
-    git(&forge.path().join("lab/arm"), &["rev-parse", branch]).trim().to_owned()
+    git(&forge.path().join("lab/arm"), &["rev-parse", branch])
+        .trim()
+        .to_owned()
 }
 
 #[actix_rt::test]
@@ -39,27 +41,40 @@ async fn a_fetch_that_hangs_delays_only_those_who_need_it() {
         is_told(&server, &arm_at(name), &format!("opened [{text}]")).await;
     };
     ask("main", "main").await;
-    let fetches = |commit: &str| wrapper.calls().iter().filter(|call| call.contains(&format!("+{commit}:"))).count();
+    let fetches = |commit: &str| {
+        wrapper
+            .calls()
+            .iter()
+            .filter(|call| call.contains(&format!("+{commit}:")))
+            .count()
+    };
     let mut stuck = Client::start(&server, &arm_at("slow")).await;
     until("it hangs", async || fetches(&slow) == 1).await;
     ask("main", "main").await;
     ask(&main, "main").await;
     // A commit is fetched once, whatever the reference and the world, also if the first client has left.
     let mut by_hash = Client::start(&server, &arm_at(&slow)).await;
-    by_hash.until("loading: Step 2/9 : fetching https://github.com/lab/arm: halted").await;
+    by_hash
+        .until("loading: Step 2/9 : fetching https://github.com/lab/arm: halted")
+        .await;
     let mut heir = Client::start(&server, &world("lab/arm", "as-slow", "worlds/b.wbt")).await;
-    heir.until("loading: Step 2/9 : fetching https://github.com/lab/arm: halted").await;
+    heir.until("loading: Step 2/9 : fetching https://github.com/lab/arm: halted")
+        .await;
     stuck.send("nothing that is known").await;
     stuck.until("loading: Error:").await;
     until("it has gone", async || stages(&server).await.len() == 2).await;
     // A client that comes late in a fetch has time left after it.
     actix_rt::time::sleep(Duration::from_secs(8)).await;
     let mut next = Client::start(&server, &arm_at("one")).await;
-    next.until("loading: Step 2/9 : fetching https://github.com/lab/arm: waiting for another fetch").await;
+    next.until("loading: Step 2/9 : fetching https://github.com/lab/arm: waiting for another fetch")
+        .await;
     assert_eq!(fetches(&slow), 1);
     // The fetch ends at its time limit, for all clients that wait for it.
     let told = heir.until("loading: Error:").await;
-    assert!(told.ends_with("Fetching https://github.com/lab/arm took longer than 18 seconds"), "{told}");
+    assert!(
+        told.ends_with("Fetching https://github.com/lab/arm took longer than 18 seconds"),
+        "{told}"
+    );
     let told = next.until("loading: Error:").await;
     assert!(told.contains("opened [one]"), "{told}");
     git(&cached(&server)[0], &["fsck", "--full"]);

@@ -28,7 +28,9 @@ impl Https {
         let authority = Authority::new();
         let root = forge.path().to_owned();
         let certificate = authority.issue(&["127.0.0.1"]).server();
-        serve(listener, Some(certificate), move |request| answer(request, &root, &elsewhere));
+        serve(listener, Some(certificate), move |request| {
+            answer(request, &root, &elsewhere)
+        });
         Self { forge, port, authority }
     }
 
@@ -48,7 +50,10 @@ fn answer(request: &Request, root: &Path, elsewhere: &str) -> Option<(String, Ve
     let is_known = request.header("authorization") == "Basic dTpw";
     let moved = |location: String| Some((format!("301 Moved Permanently\r\nLocation: {location}"), Vec::new()));
     if path.starts_with("/lab/private") && !is_known {
-        return Some(("401 Unauthorized\r\nWWW-Authenticate: Basic realm=\"x\"".to_owned(), Vec::new()));
+        return Some((
+            "401 Unauthorized\r\nWWW-Authenticate: Basic realm=\"x\"".to_owned(),
+            Vec::new(),
+        ));
     }
     if path.starts_with("/lab/away") {
         return Some((format!("302 Found\r\nLocation: {elsewhere}{target}"), Vec::new()));
@@ -58,24 +63,40 @@ fn answer(request: &Request, root: &Path, elsewhere: &str) -> Option<(String, Ve
         return moved(format!("/lab/dotted.git/{rest}"));
     }
     if let Some(name) = target.strip_prefix("/lab/old-") {
-        return moved(name.split_once("--").map_or(format!("/lab/{name}"), |(owner, name)| format!("/{owner}/{name}")));
+        return moved(
+            name.split_once("--")
+                .map_or(format!("/lab/{name}"), |(owner, name)| format!("/{owner}/{name}")),
+        );
     }
     let method = request.head.split(' ').next()?;
     let mut backend = Command::new("git");
-    backend.arg("http-backend").env("GIT_PROJECT_ROOT", root).env("GIT_HTTP_EXPORT_ALL", "1");
+    backend
+        .arg("http-backend")
+        .env("GIT_PROJECT_ROOT", root)
+        .env("GIT_HTTP_EXPORT_ALL", "1");
     backend.envs([("REQUEST_METHOD", method), ("PATH_INFO", path), ("QUERY_STRING", query)]);
     backend.env("CONTENT_TYPE", request.header("content-type"));
     backend.env("CONTENT_LENGTH", request.content.len().to_string());
     backend.env("HTTP_CONTENT_ENCODING", request.header("content-encoding"));
-    backend.env("GIT_PROTOCOL", request.header("git-protocol")).env("REMOTE_ADDR", "127.0.0.1");
-    let mut backend = backend.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
+    backend
+        .env("GIT_PROTOCOL", request.header("git-protocol"))
+        .env("REMOTE_ADDR", "127.0.0.1");
+    let mut backend = backend
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
     let (mut input, body) = (backend.stdin.take().unwrap(), request.content.clone());
     let fed = std::thread::spawn(move || input.write_all(&body));
     let output = backend.wait_with_output().unwrap().stdout;
     fed.join().unwrap().ok();
     let end = output.windows(4).position(|four| four == b"\r\n\r\n")?;
     let head = String::from_utf8_lossy(&output[..end]).into_owned();
-    let status = head.lines().find_map(|line| line.strip_prefix("Status: ")).unwrap_or("200 OK");
+    let status = head
+        .lines()
+        .find_map(|line| line.strip_prefix("Status: "))
+        .unwrap_or("200 OK");
     Some((format!("{status}\r\n{head}"), output[end + 4..].to_vec()))
 }
 
@@ -88,44 +109,80 @@ async fn a_forge_is_asked_over_https_and_followed_nowhere_else() {
     for hidden in ["lab/secret", "other/arm"] {
         forge.commit(hidden, "main", &[("worlds/a.wbt", &world_text("hidden"))]);
     }
-    git(&forge.path().join("lab/arm"), &["config", "uploadpack.allowFilter", "true"]);
+    git(
+        &forge.path().join("lab/arm"),
+        &["config", "uploadpack.allowFilter", "true"],
+    );
     let plain = TcpListener::bind("127.0.0.1:0").unwrap();
     plain.set_nonblocking(true).unwrap();
     let https = Https::new(forge, format!("https://{}", plain.local_addr().unwrap()));
-    let server = https.server(&webots).env("GIT_SSL_CAINFO", https.authority.file().to_str().unwrap());
-    let server = server.set("blockedRepositories", serde_json::json!(["https://github.com/lab/secret"])).start().await;
+    let server = https
+        .server(&webots)
+        .env("GIT_SSL_CAINFO", https.authority.file().to_str().unwrap());
+    let server = server
+        .set(
+            "blockedRepositories",
+            serde_json::json!(["https://github.com/lab/secret"]),
+        )
+        .start()
+        .await;
     let missing = "does not exist or is not public";
     let table = [
         (arm(), "opened [new]"),
         (arm_at(&old), "opened [old]"),
         (arm(), "opened [new]"),
-        ("https://www.GitHub.com/LAB/Arm.git/blob/main/worlds/a.wbt".to_owned(), "opened [new]"),
+        (
+            "https://www.GitHub.com/LAB/Arm.git/blob/main/worlds/a.wbt".to_owned(),
+            "opened [new]",
+        ),
         (world("lab/none", "main", "worlds/a.wbt"), missing),
         // git asks no user for a password.
         (world("lab/private", "main", "worlds/a.wbt"), missing),
         // Redirects to other hosts are not followed.
-        (world("lab/away", "main", "worlds/a.wbt"), "https://github.com/lab/away has moved to another host"),
+        (
+            world("lab/away", "main", "worlds/a.wbt"),
+            "https://github.com/lab/away has moved to another host",
+        ),
         // A repository that has moved within its host is found, also after several moves, and so are its commits.
         (world("lab/old-arm", "main", "worlds/a.wbt"), "opened [new]"),
         (world("lab/old-old-old-arm", "main", "worlds/a.wbt"), "opened [new]"),
         (world("lab/dotted", "main", "worlds/a.wbt"), "opened [dotted]"),
         (world("lab/old-arm", &old, "worlds/a.wbt"), "opened [old]"),
-        (world("lab/old-none", "main", "worlds/a.wbt"), "https://github.com/lab/none does not exist"),
+        (
+            world("lab/old-none", "main", "worlds/a.wbt"),
+            "https://github.com/lab/none does not exist",
+        ),
         // It is not found if its new name is not allowed, or if it is redirected too often.
         (
             world("lab/old-lab--secret", "main", "worlds/a.wbt"),
             "from blocked repository: https://github.com/lab/secret",
         ),
-        (world("lab/old-other--arm", "main", "worlds/a.wbt"), "and https://github.com/other/arm is not one of them"),
-        (world("lab/old-private", "main", "worlds/a.wbt"), "https://github.com/lab/private does not exist"),
-        (world(&format!("lab/{}arm", "old-".repeat(9)), "main", "worlds/a.wbt"), "has moved again and again"),
+        (
+            world("lab/old-other--arm", "main", "worlds/a.wbt"),
+            "and https://github.com/other/arm is not one of them",
+        ),
+        (
+            world("lab/old-private", "main", "worlds/a.wbt"),
+            "https://github.com/lab/private does not exist",
+        ),
+        (
+            world(&format!("lab/{}arm", "old-".repeat(9)), "main", "worlds/a.wbt"),
+            "has moved again and again",
+        ),
     ];
     for (url, words) in table {
         is_told(&server, &url, words).await;
     }
     assert!(plain.accept().is_err(), "a redirect was followed");
-    let cached: Vec<_> = cached(&server).into_iter().filter(|folder| folder.join("HEAD").is_file()).collect();
-    assert_eq!(cached.len(), 3, "two repositories and the history of one, in whatever spelling: {cached:?}");
+    let cached: Vec<_> = cached(&server)
+        .into_iter()
+        .filter(|folder| folder.join("HEAD").is_file())
+        .collect();
+    assert_eq!(
+        cached.len(),
+        3,
+        "two repositories and the history of one, in whatever spelling: {cached:?}"
+    );
     // Certificates of unknown authorities are refused.
     let server = https.server(&webots).start().await;
     is_told(&server, &arm(), "certificate").await;
@@ -146,5 +203,10 @@ async fn git_uses_the_administrators_settings_only() {
         builder.env("GIT_SSL_CAINFO", https.authority.file().to_str().unwrap())
     };
     is_told(&start().start().await, &url, "does not exist or is not public").await;
-    is_told(&start().set("gitConfig", ours.to_str().unwrap()).start().await, &url, "opened [private]").await;
+    is_told(
+        &start().set("gitConfig", ours.to_str().unwrap()).start().await,
+        &url,
+        "opened [private]",
+    )
+    .await;
 }

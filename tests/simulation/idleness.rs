@@ -27,7 +27,10 @@ async fn a_paused_simulation_ends_unless_its_client_keeps_it() {
     assert!(begin.elapsed() >= Duration::from_secs(3), "{:?}", begin.elapsed());
     nothing_left(&server, 1).await;
     let metrics = server.metrics().await;
-    assert!(metrics.contains("webots_simulation_ends_total{reason=\"idle\"} 1"), "{metrics}");
+    assert!(
+        metrics.contains("webots_simulation_ends_total{reason=\"idle\"} 1"),
+        "{metrics}"
+    );
 
     let (mut client, _) = Client::resumable(&server).await;
     for _ in 0..2 {
@@ -43,11 +46,18 @@ async fn a_paused_simulation_ends_unless_its_client_keeps_it() {
 async fn who_runs_is_never_ended_for_it() {
     let server = quick(demo_server(1)).set("idleTimeout", LIMIT).start().await;
     let (mut client, _) = Client::resumable(&server).await;
-    let mut viewer = Client::connect(&format!("ws://127.0.0.1:{}/", server.port + 1)).await.with_running_scene().await;
+    let mut viewer = Client::connect(&format!("ws://127.0.0.1:{}/", server.port + 1))
+        .await
+        .with_running_scene()
+        .await;
     // Twice as long as a simulation may be paused.
     while viewer.time().await < 6000.0 {}
     client.until(".").await;
-    assert!(!client.heard.iter().any(|text| text.starts_with("idle: 2")), "{:?}", client.heard);
+    assert!(
+        !client.heard.iter().any(|text| text.starts_with("idle: 2")),
+        "{:?}",
+        client.heard
+    );
     viewer.send("pause").await;
     assert_eq!(client.until("idle:").await, TOLD);
     viewer.send("real-time:-1").await;

@@ -13,24 +13,49 @@ const POINTER: &str = "version https://git-lfs.github.com/spec/v1\noid sha256:00
 #[actix_rt::test]
 async fn a_world_whose_large_files_are_missing_opens_without_them() {
     let (forge, webots) = (Forge::with_arm(), reader());
-    forge.commit("lab/arm", "main", &[("meshes/a.dae", POINTER), (".gitattributes", ATTRIBUTES)]);
-    is_told(&simulation_server(&webots.path(), forge.path(), 1).start().await, &arm(), "opened").await;
+    forge.commit(
+        "lab/arm",
+        "main",
+        &[("meshes/a.dae", POINTER), (".gitattributes", ATTRIBUTES)],
+    );
+    is_told(
+        &simulation_server(&webots.path(), forge.path(), 1).start().await,
+        &arm(),
+        "opened",
+    )
+    .await;
     // The same without git-lfs.
     let bin = programs(&["git", "bash", "sed", "env", "sh", "rm", "prlimit"]);
     let builder = simulation_server(&webots.path(), forge.path(), 1);
-    is_told(&builder.env("PATH", bin.path().to_str().unwrap()).start().await, &arm(), "opened").await;
+    is_told(
+        &builder.env("PATH", bin.path().to_str().unwrap()).start().await,
+        &arm(),
+        "opened",
+    )
+    .await;
 }
 
 #[actix_rt::test]
 async fn the_size_of_large_files_is_bounded() {
     let (forge, webots) = (Forge::with_arm(), reader());
-    forge.commit("lab/arm", "main", &[("meshes/a.dae", POINTER), (".gitattributes", ATTRIBUTES)]);
+    forge.commit(
+        "lab/arm",
+        "main",
+        &[("meshes/a.dae", POINTER), (".gitattributes", ATTRIBUTES)],
+    );
     // A git-lfs that loads far more than the 12345 bytes of its file.
     let wrapper = Wrapper::git("");
-    let lfs = wrapper.path().split(':').next().map(|folder| Path::new(folder).join("git-lfs")).unwrap();
+    let lfs = wrapper
+        .path()
+        .split(':')
+        .next()
+        .map(|folder| Path::new(folder).join("git-lfs"))
+        .unwrap();
     let loads = "mkdir -p \"$GIT_DIR/lfs/tmp\"\nhead -c 5000000 /dev/zero >\"$GIT_DIR/lfs/tmp/a\"\nexec sleep 1000";
     make_program(&lfs, loads);
-    let server = simulation_server(&webots.path(), forge.path(), 1).set("projectSize", 1).env("PATH", &wrapper.path());
+    let server = simulation_server(&webots.path(), forge.path(), 1)
+        .set("projectSize", 1)
+        .env("PATH", &wrapper.path());
     let told = outcome(&server.start().await, &arm()).await;
     assert_eq!(told, "loading: Error: The project is larger than 1 MiB");
 }

@@ -51,7 +51,10 @@ async fn a_client_that_leaves_in_any_way_leaves_nothing_behind() {
                 // Dropped without a close frame.
                 "breaks" => drop((scene.client.take(), scene.other.take())),
                 _ if *state == "connected" => {
-                    until("it is sent away", async || scene.server.log().contains("silent for too long")).await;
+                    until("it is sent away", async || {
+                        scene.server.log().contains("silent for too long")
+                    })
+                    .await;
                 }
                 _ => {}
             }
@@ -60,7 +63,10 @@ async fn a_client_that_leaves_in_any_way_leaves_nothing_behind() {
             } else {
                 gone_within(GRACE, left, &scene.server).await;
             }
-            assert!(!scene.server.log().contains("Wrong message"), "every closed laptop does that");
+            assert!(
+                !scene.server.log().contains("Wrong message"),
+                "every closed laptop does that"
+            );
         }
     }
 }
@@ -77,13 +83,18 @@ async fn a_server_that_stops_notifies_clients_and_leaves_nothing() {
             scene.client = Some(Client::start(&scene.server, &arm()).await);
         }
         for client in [&mut scene.client, &mut scene.other].into_iter().flatten() {
-            assert_eq!(client.until("loading: Error:").await, "loading: Error: This simulation server is stopping");
+            assert_eq!(
+                client.until("loading: Error:").await,
+                "loading: Error: This simulation server is stopping"
+            );
             assert_eq!(client.closed().await, Some(1001), "{state:?}");
         }
         assert_eq!(scene.server.ended().await, Some(0), "{state:?}");
         assert!(asked.elapsed() < Duration::from_secs(10), "{state:?}");
         assert_eq!(instances_below(scene.folder.path()), [], "{state:?}");
-        let runs = std::fs::read_dir(scene.folder.path().join("cache/runs")).unwrap().count();
+        let runs = std::fs::read_dir(scene.folder.path().join("cache/runs"))
+            .unwrap()
+            .count();
         assert_eq!(runs, 0, "{state:?}: the folder of the run is left");
     }
 }
@@ -95,9 +106,15 @@ async fn a_server_that_is_killed_leaves_nothing_in_any_state() {
         let mut scene = Scene::new(state, |builder| quick(builder).set("timing.grace", 2.0)).await;
         scene.server.signal(Signal::SIGKILL);
         scene.server.ended().await;
-        until("all processes are gone", async || instances_below(scene.folder.path()).is_empty()).await;
+        until("all processes are gone", async || {
+            instances_below(scene.folder.path()).is_empty()
+        })
+        .await;
         let runs = scene.folder.path().join("cache/runs");
-        until("its folder is gone", async || std::fs::read_dir(&runs).unwrap().count() == 0).await;
+        until("its folder is gone", async || {
+            std::fs::read_dir(&runs).unwrap().count() == 0
+        })
+        .await;
     }
 }
 
@@ -111,12 +128,19 @@ async fn what_a_killed_server_has_left_is_removed_at_the_next_start() {
     assert_eq!(instance_folders(scene.folder.path()).len(), 1);
     // The server recognizes processes of simulations by this mark.
     let mark = instance_folders(scene.folder.path()).remove(0).canonicalize().unwrap();
-    let mut orphan =
-        std::process::Command::new("sleep").arg("1000").env("WEBOTS_FLEET_INSTANCE", mark).spawn().unwrap();
+    let mut orphan = std::process::Command::new("sleep")
+        .arg("1000")
+        .env("WEBOTS_FLEET_INSTANCE", mark)
+        .spawn()
+        .unwrap();
     let next = demo_server(1).folder(scene.folder.path()).start().await;
     assert!(!orphan.wait().unwrap().success(), "it was killed");
     assert_eq!(instance_folders(scene.folder.path()).len(), 0);
-    assert!(next.log().contains("removed what 1 earlier runs had left"), "{}", next.log());
+    assert!(
+        next.log().contains("removed what 1 earlier runs had left"),
+        "{}",
+        next.log()
+    );
     until("git is gone", async || instances_below(scene.folder.path()).is_empty()).await;
 }
 
@@ -124,8 +148,14 @@ async fn what_a_killed_server_has_left_is_removed_at_the_next_start() {
 async fn a_client_is_told_how_webots_ended() {
     let table = [
         ("exit 0", "loading: Webots has ended"),
-        ("echo 'no licence' >&2; exit 3", "loading: Error: Webots ended with exit code 3. Its last output: no licence"),
-        ("kill -SEGV $$", "loading: Error: Webots was ended by the signal SIGSEGV"),
+        (
+            "echo 'no licence' >&2; exit 3",
+            "loading: Error: Webots ended with exit code 3. Its last output: no licence",
+        ),
+        (
+            "kill -SEGV $$",
+            "loading: Error: Webots was ended by the signal SIGSEGV",
+        ),
     ];
     for (end, words) in table {
         // It ends while it launches, after it has become ready, or while it runs.

@@ -17,12 +17,19 @@ pub fn size_of(folder: &Path) -> u64 {
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
     entries
         .map(|entry| {
-            if entry.path().is_dir() { size_of(&entry.path()) } else { entry.metadata().map_or(0, |about| about.len()) }
+            if entry.path().is_dir() {
+                size_of(&entry.path())
+            } else {
+                entry.metadata().map_or(0, |about| about.len())
+            }
         })
         .sum()
 }
 
 pub fn cached(server: &Server) -> Vec<PathBuf> {
-    let entries = std::fs::read_dir(server.folder.join("cache/git")).unwrap().flatten().map(|entry| entry.path());
+    let entries = std::fs::read_dir(server.folder.join("cache/git"))
+        .unwrap()
+        .flatten()
+        .map(|entry| entry.path());
     entries.filter(|path| path.is_dir()).collect()
 }

@@ -18,8 +18,15 @@ async fn failed_starts(server: &Server) -> u64 {
 async fn broken(places: u16) -> (Server, tempfile::TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
     let repaired = folder.path().join("repaired");
-    let webots = Webots::script(&format!("[ -e {} ] || exit 3\n{DEMO} \"$@\" & wait", repaired.display()));
-    (server_of(webots, places).set("isolation", "none").start().await, folder, repaired)
+    let webots = Webots::script(&format!(
+        "[ -e {} ] || exit 3\n{DEMO} \"$@\" & wait",
+        repaired.display()
+    ));
+    (
+        server_of(webots, places).set("isolation", "none").start().await,
+        folder,
+        repaired,
+    )
 }
 
 #[actix_rt::test]
@@ -29,7 +36,10 @@ async fn a_start_that_fails_because_of_the_server_is_sent_elsewhere() {
         let mut client = Client::start(&server, &arm()).await;
         let told = client.until("loading: Error:").await;
         let words = "Connect again: the session server chooses another simulation server";
-        assert!(told.contains("Webots ended with exit code 3.") && told.ends_with(words), "{told}");
+        assert!(
+            told.contains("Webots ended with exit code 3.") && told.ends_with(words),
+            "{told}"
+        );
         assert_eq!(client.closed().await, Some(1013));
         assert_eq!(failed_starts(&server).await, count);
         assert_eq!(line(&server, client.id()).await[10], "no_webots");
@@ -53,7 +63,13 @@ async fn a_black_hole_takes_a_handful_of_clients_and_not_a_class() {
     let servers = [healthy.address(), hole.address()];
     let session = session_server(&servers).set("loadThreshold", 1000).start().await;
     let status = async || session.status().await;
-    let work = async || status().await["servers"].as_array().unwrap().iter().all(|one| one["state"] == "up");
+    let work = async || {
+        status().await["servers"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .all(|one| one["state"] == "up")
+    };
     until("both work", work).await;
     let (mut running, mut failures) = (Vec::new(), 0_u64);
     while running.len() < 10 {
@@ -79,12 +95,26 @@ async fn a_black_hole_takes_a_handful_of_clients_and_not_a_class() {
     }
     assert_eq!(failures, 3, "{}", status().await);
     let page = status().await;
-    assert!(page["servers"][1]["error"].as_str().is_some_and(|why| why.contains("others are preferred")), "{page}");
-    assert!(session.log().contains("failed for a reason of its own; others are preferred"), "{}", session.log());
+    assert!(
+        page["servers"][1]["error"]
+            .as_str()
+            .is_some_and(|why| why.contains("others are preferred")),
+        "{page}"
+    );
+    assert!(
+        session
+            .log()
+            .contains("failed for a reason of its own; others are preferred"),
+        "{}",
+        session.log()
+    );
     // A direct client shows that it works again.
     std::fs::write(&repaired, "").unwrap();
     Client::ready(&hole).await;
-    until("it is as good as others", async || status().await["servers"][1]["error"].is_null()).await;
+    until("it is as good as others", async || {
+        status().await["servers"][1]["error"].is_null()
+    })
+    .await;
 }
 
 /// The texts that a client receives when its start fails.
@@ -102,7 +132,10 @@ async fn no_text_for_a_client_holds_a_path_of_the_machine() {
     let webots = Webots::script(end);
     let server = simulation_server(&webots.path(), forge.path(), 2).start().await;
     let mut all = heard(&server, &arm()).await;
-    assert!(all.iter().any(|text| text.contains("can't open worlds/a.wbt")), "{all:?}");
+    assert!(
+        all.iter().any(|text| text.contains("can't open worlds/a.wbt")),
+        "{all:?}"
+    );
     for (repository, place) in [("lab/none", "main"), ("lab/arm", "none"), ("lab/arm", "main")] {
         all.extend(heard(&server, &world(repository, place, "worlds/none.wbt")).await);
     }
@@ -115,7 +148,10 @@ async fn no_text_for_a_client_holds_a_path_of_the_machine() {
     std::fs::remove_file(forge.path()).unwrap();
     std::fs::rename(&away, forge.path()).unwrap();
     // The cached repositories are broken.
-    let cached = std::fs::read_dir(server.folder.join("cache/git")).unwrap().flatten().map(|entry| entry.path());
+    let cached = std::fs::read_dir(server.folder.join("cache/git"))
+        .unwrap()
+        .flatten()
+        .map(|entry| entry.path());
     for repository in cached.filter(|path| path.is_dir()) {
         std::fs::write(repository.join("config"), "[nonsense").unwrap();
     }
@@ -125,9 +161,19 @@ async fn no_text_for_a_client_holds_a_path_of_the_machine() {
     all.extend(heard(&server, &arm()).await);
     let temporary = std::env::temp_dir().to_str().unwrap().to_owned();
     for text in &all {
-        for path in [&temporary, "cache/", "runs/", env!("CARGO_MANIFEST_DIR"), "/bin/", "/git/"] {
+        for path in [
+            &temporary,
+            "cache/",
+            "runs/",
+            env!("CARGO_MANIFEST_DIR"),
+            "/bin/",
+            "/git/",
+        ] {
             assert!(!text.contains(path), "{path}: {text}");
         }
     }
-    assert!(all.iter().filter(|text| text.starts_with("loading: Error:")).count() >= 7, "{all:#?}");
+    assert!(
+        all.iter().filter(|text| text.starts_with("loading: Error:")).count() >= 7,
+        "{all:#?}"
+    );
 }

@@ -16,8 +16,15 @@ async fn the_waiting_line_is_served_in_order_and_forgets_who_leaves() {
     let mut inside = Vec::new();
     for place in 1..=2 {
         let mut client = start().await;
-        assert_eq!(client.until("webots:").await, format!("webots:ws://localhost:{}", server.port + place));
-        assert!(!client.heard.iter().any(|text| text.starts_with("queue")), "{:?}", client.heard);
+        assert_eq!(
+            client.until("webots:").await,
+            format!("webots:ws://localhost:{}", server.port + place)
+        );
+        assert!(
+            !client.heard.iter().any(|text| text.starts_with("queue")),
+            "{:?}",
+            client.heard
+        );
         inside.push(client);
     }
     let mut line = Vec::new();
@@ -38,11 +45,17 @@ async fn the_waiting_line_is_served_in_order_and_forgets_who_leaves() {
     assert_eq!(line[2].until("queue:").await, "queue: 2");
     assert!(line[0].is_silent(Duration::from_millis(50)).await);
     let instances = server.status().await["instances"].clone();
-    assert_eq!((instances["queued"].as_u64(), instances["places"].as_u64()), (Some(3), Some(2)));
+    assert_eq!(
+        (instances["queued"].as_u64(), instances["places"].as_u64()),
+        (Some(3), Some(2))
+    );
     assert_eq!(instances["arrivals"].as_u64(), Some(7));
     // The first in the queue gets the next free slot, with its port.
     inside.remove(1).leave().await;
-    assert_eq!(line[0].until("webots:").await, format!("webots:ws://localhost:{}", server.port + 2));
+    assert_eq!(
+        line[0].until("webots:").await,
+        format!("webots:ws://localhost:{}", server.port + 2)
+    );
     assert_eq!(line[1].until("queue:").await, "queue: 0");
     assert_eq!(line[2].until("queue:").await, "queue: 1");
     for client in inside.into_iter().chain(line) {
@@ -76,11 +89,17 @@ async fn one_address_leaves_places_and_a_part_of_the_line_to_others() {
     assert!(told.starts_with(words), "{told}");
     // Another address gets the fourth slot at once, although three clients wait, and the fourth place in the queue.
     let mut lucky = Client::start_from(&server, other, &arm()).await;
-    assert_eq!(lucky.until("webots:").await, format!("webots:ws://localhost:{}", server.port + 4));
+    assert_eq!(
+        lucky.until("webots:").await,
+        format!("webots:ws://localhost:{}", server.port + 4)
+    );
     let mut late = Client::start_from(&server, third, &arm()).await;
     assert_eq!(late.until("").await, "queue: 3");
     let told = Client::start_from(&server, other, &arm()).await.until("").await;
-    assert!(told.starts_with("loading: Error: All 4 places of this simulation server are taken"), "{told}");
+    assert!(
+        told.starts_with("loading: Error: All 4 places of this simulation server are taken"),
+        "{told}"
+    );
     // The next slot that the greedy address frees is for its first waiting client; slots of other addresses are not.
     lucky.leave().await;
     late.until("webots:").await;
@@ -93,7 +112,10 @@ async fn one_address_leaves_places_and_a_part_of_the_line_to_others() {
 async fn an_address_may_ask_only_so_often() {
     let server = demo_server(1).start().await;
     let ask = async |address: &str| {
-        Client::start_from(&server, address, "https://github.com/none").await.until("loading: Error:").await
+        Client::start_from(&server, address, "https://github.com/none")
+            .await
+            .until("loading: Error:")
+            .await
     };
     let mut asked = 1;
     let too_many = "loading: Error: Too many simulations were asked for from your address";
@@ -110,11 +132,17 @@ async fn a_port_that_somebody_else_has_is_not_lent() {
     let server = demo_server(2).start().await;
     let first = TcpListener::bind(("127.0.0.1", server.port + 1)).unwrap();
     let mut client = Client::start(&server, &arm()).await;
-    assert_eq!(client.until("webots:").await, format!("webots:ws://localhost:{}", server.port + 2));
+    assert_eq!(
+        client.until("webots:").await,
+        format!("webots:ws://localhost:{}", server.port + 2)
+    );
     let mut second = Client::start(&server, &arm()).await;
     assert_eq!(second.until("").await, "queue: 0");
     drop(first);
-    assert_eq!(second.until("webots:").await, format!("webots:ws://localhost:{}", server.port + 1));
+    assert_eq!(
+        second.until("webots:").await,
+        format!("webots:ws://localhost:{}", server.port + 1)
+    );
 }
 
 #[actix_rt::test]
@@ -133,11 +161,16 @@ async fn a_crowd_is_served_to_the_last_one_and_no_two_share_a_place() {
         url
     });
     let urls = futures_util::future::join_all(visits).await;
-    let allowed: Vec<String> = (1..=3).map(|place| format!("webots:ws://localhost:{}", server.port + place)).collect();
+    let allowed: Vec<String> = (1..=3)
+        .map(|place| format!("webots:ws://localhost:{}", server.port + place))
+        .collect();
     assert!(urls.iter().all(|url| allowed.contains(url)), "{urls:?}");
     nothing_left(&server, 3).await;
     until("all are counted", async || {
-        server.metrics().await.contains("webots_simulation_starts_total{outcome=\"ready\"} 12")
+        server
+            .metrics()
+            .await
+            .contains("webots_simulation_starts_total{outcome=\"ready\"} 12")
     })
     .await;
 }

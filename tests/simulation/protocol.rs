@@ -8,24 +8,39 @@ async fn a_message_that_is_none_is_answered_in_words() {
     let server = demo_server(2).start().await;
     let mut running = Client::start(&server, &arm()).await;
     let url = running.until("webots:").await;
-    let mut viewer = Client::connect(&format!("{}/", url.strip_prefix("webots:").unwrap())).await.with_scene().await;
+    let mut viewer = Client::connect(&format!("{}/", url.strip_prefix("webots:").unwrap()))
+        .await
+        .with_scene()
+        .await;
     let of_git = |(_, words): &(i32, String)| words.contains("git");
-    until("its checkout has ended", async || !instances_below(&server.folder).iter().any(of_git)).await;
+    until("its checkout has ended", async || {
+        !instances_below(&server.folder).iter().any(of_git)
+    })
+    .await;
     let processes = instances_below(&server.folder);
     assert!(processes.len() >= 2, "launcher and simulator");
     let start = |url: &str| serde_json::json!({"start": {"url": url}}).to_string();
     let table = [
         ("garbage".to_owned(), "Wrong message"),
         ("[".repeat(5000), "Wrong message"),
-        (r#"{"start":{"url":"x","mode":"vr"}}"#.to_owned(), "start.mode: unknown variant `vr`, expected one of `x3d`"),
+        (
+            r#"{"start":{"url":"x","mode":"vr"}}"#.to_owned(),
+            "start.mode: unknown variant `vr`, expected one of `x3d`",
+        ),
         (start("https://github.com/lab/arm"), "Wrong Webots simulation URL"),
-        (start("ftp://github.com/lab/arm/blob/main/worlds/a.wbt"), "does not begin with https://"),
+        (
+            start("ftp://github.com/lab/arm/blob/main/worlds/a.wbt"),
+            "does not begin with https://",
+        ),
     ];
     for (text, words) in table {
         let mut client = Client::connect(&server.websocket("/client")).await;
         client.send(&text).await;
         let told = client.until("").await;
-        assert!(told.starts_with("loading: Error: ") && told.contains(words), "{text}: {told}");
+        assert!(
+            told.starts_with("loading: Error: ") && told.contains(words),
+            "{text}: {told}"
+        );
         assert_eq!(client.closed().await, Some(1000));
     }
     // Text from a client is not interpreted as HTML.
@@ -39,7 +54,11 @@ async fn a_message_that_is_none_is_answered_in_words() {
         let mut client = Client::start(&server, &url).await;
         client.until("loading: Error: ").await;
         let html = client.heard.iter().find(|text| text.contains(['<', '>', '&']));
-        assert!(html.is_none() && client.heard.iter().any(|text| text.contains("\u{2039}img")), "{:?}", client.heard);
+        assert!(
+            html.is_none() && client.heard.iter().any(|text| text.contains("\u{2039}img")),
+            "{:?}",
+            client.heard
+        );
     }
     until("the others are gone", async || stages(&server).await.len() == 1).await;
     assert_eq!(instances_below(&server.folder), processes);
@@ -65,7 +84,10 @@ async fn oversized_and_binary_messages_end_the_connection_in_words() {
     clients[0].send_binary(&[0; 10]).await;
     clients[1].send_pieces(&[b"\xff", b"\xff"]).await;
     for mut client in clients {
-        assert_eq!(client.until("").await, "loading: Error: Wrong message: allowed are short texts");
+        assert_eq!(
+            client.until("").await,
+            "loading: Error: Wrong message: allowed are short texts"
+        );
         assert_eq!(client.closed().await, Some(1003));
     }
 }
@@ -86,11 +108,16 @@ async fn messages_in_pieces_too_early_or_again_and_again_do_no_harm() {
     client.send(reset).await;
     client.until(refused).await;
     client.until("webots:").await;
-    client.send_pieces(&[b"{\"reset controller\": ", b"", b"\"c/c.py\"}"]).await;
+    client
+        .send_pieces(&[b"{\"reset controller\": ", b"", b"\"c/c.py\"}"])
+        .await;
     client.until("reset controller: c/c.py").await;
     let start = serde_json::json!({"start": {"url": arm()}}).to_string();
     client.send(&start).await;
-    until("it is logged", async || server.log().contains("second simulation on one connection; ignored")).await;
+    until("it is logged", async || {
+        server.log().contains("second simulation on one connection; ignored")
+    })
+    .await;
     assert_eq!(stages(&server).await.len(), 1);
     // A client that sends requests without reading is disconnected.
     for _ in 0..150 {
@@ -112,7 +139,11 @@ async fn connections_are_bounded() {
     // One address leaves some connections to others.
     let server = demo_server(1).set("maxClients", 4).start().await;
     let connect = async |address| Client::from_address(&server, address).await;
-    let greedy = [connect("203.0.113.9").await, connect("203.0.113.9").await, connect("203.0.113.9").await];
+    let greedy = [
+        connect("203.0.113.9").await,
+        connect("203.0.113.9").await,
+        connect("203.0.113.9").await,
+    ];
     assert!(greedy.iter().all(Result::is_ok));
     assert_eq!(connect("203.0.113.9").await.err(), Some(429));
     connect("203.0.113.10").await.unwrap();
@@ -132,10 +163,16 @@ async fn pages_tell_what_they_should() {
     let status = server.status().await;
     let one = &status["simulations"][0];
     assert_eq!(one["world"], arm());
-    assert_eq!((one["stage"].as_str(), one["version"].as_str()), (Some("idle"), Some("R2025a")));
+    assert_eq!(
+        (one["stage"].as_str(), one["version"].as_str()),
+        (Some("idle"), Some("R2025a"))
+    );
     assert_eq!(one["port"], server.port + 1);
     assert_eq!((&status["docker"], &status["draining"]), (&false.into(), &false.into()));
-    assert_eq!(status["allowedRepositories"], serde_json::json!(["https://github.com/lab"]));
+    assert_eq!(
+        status["allowedRepositories"],
+        serde_json::json!(["https://github.com/lab"])
+    );
     assert_eq!(status["version"], env!("CARGO_PKG_VERSION"));
     assert!(status["machine"]["memory"].is_number() && status["host"]["threads"].as_u64() > Some(0));
     let page = server.monitor().await;

@@ -22,12 +22,28 @@ async fn a_server_without_webots_is_not_offered() {
     until("it does not work", async || !works(&session).await).await;
     assert_eq!(http::get(&session.url("/request")).await.text(), "0");
     let (status, text) = server.health().await;
-    assert!(status == 503 && text.contains("has no Webots that it can run at"), "{status} {text}");
+    assert!(
+        status == 503 && text.contains("has no Webots that it can run at"),
+        "{status} {text}"
+    );
     assert_eq!(http::get(&server.url("/load")).await.text(), "100");
     let page: Value = server.status().await;
-    assert!(page["problem"].as_str().unwrap().contains("has no Webots that it can run at"), "{page}");
-    assert!(server.log().contains("no simulation can be started"), "{}", server.log());
-    until("the session server tells why", async || session.log().contains("can start no simulation")).await;
+    assert!(
+        page["problem"]
+            .as_str()
+            .unwrap()
+            .contains("has no Webots that it can run at"),
+        "{page}"
+    );
+    assert!(
+        server.log().contains("no simulation can be started"),
+        "{}",
+        server.log()
+    );
+    until("the session server tells why", async || {
+        session.log().contains("can start no simulation")
+    })
+    .await;
     std::fs::rename(&away, webots.path()).unwrap();
     until("it works again", async || works(&session).await).await;
     assert_eq!(server.health().await, (200, "ok".to_owned()));
@@ -37,7 +53,11 @@ async fn a_server_without_webots_is_not_offered() {
 async fn a_display_that_is_missing_is_a_problem_for_webots_itself() {
     let webots = Webots::launcher();
     let home = webots.path().parent().unwrap().to_str().unwrap().to_owned();
-    let itself = || demo_server(1).set("webots", Value::Null).set("webotsHome", home.as_str());
+    let itself = || {
+        demo_server(1)
+            .set("webots", Value::Null)
+            .set("webotsHome", home.as_str())
+    };
     let server = itself().set("display", ":59").start().await;
     until("it is told", async || server.health().await.0 == 503).await;
     assert!(server.health().await.1.contains("no display answers at :59"));
@@ -45,17 +65,34 @@ async fn a_display_that_is_missing_is_a_problem_for_webots_itself() {
     // The display of each GPU is required.
     let displays = serde_json::json!([":59000", ":59001"]);
     let server = itself().set("gpus", "spread").set("displays", displays).start().await;
-    until("the first is missing", async || server.health().await.1.contains("no display answers at :59000")).await;
+    until("the first is missing", async || {
+        server.health().await.1.contains("no display answers at :59000")
+    })
+    .await;
 }
 
 #[actix_rt::test]
 async fn the_limit_of_open_files_is_raised_as_needed() {
-    let server = demo_server(10).set("maxClients", 300).before("ulimit -Sn 256").start().await;
+    let server = demo_server(10)
+        .set("maxClients", 300)
+        .before("ulimit -Sn 256")
+        .start()
+        .await;
     let limits = procfs::process::Process::new(server.pid()).unwrap().limits().unwrap();
-    let procfs::process::LimitValue::Value(soft) = limits.max_open_files.soft_limit else { panic!("{limits:?}") };
+    let procfs::process::LimitValue::Value(soft) = limits.max_open_files.soft_limit else {
+        panic!("{limits:?}")
+    };
     assert_eq!(soft, 128 + 10 * 8 + 300 * 2);
     let few = demo_server(10).files(300).start().await;
-    assert!(few.log().contains("300 files may be open, which is enough for 46 clients"), "{}", few.log());
+    assert!(
+        few.log()
+            .contains("300 files may be open, which is enough for 46 clients"),
+        "{}",
+        few.log()
+    );
     let said = demo_server(1).files(128).refused(1).await;
-    assert!(said.starts_with("error: 128 files may be open, which is not enough for 1 places"), "{said}");
+    assert!(
+        said.starts_with("error: 128 files may be open, which is not enough for 1 places"),
+        "{said}"
+    );
 }

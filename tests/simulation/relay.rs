@@ -23,7 +23,10 @@ const UPGRADE: &str = "Host: localhost\r\nConnection: upgrade\r\nUpgrade: websoc
 
 /// A server that relays the streams of this Webots.
 async fn relaying(webots: Webots, change: impl FnOnce(Builder) -> Builder) -> Server {
-    let files = [("worlds/textures/a.png", "a picture"), ("plugins/a.html", "<p>a page</p>")];
+    let files = [
+        ("worlds/textures/a.png", "a picture"),
+        ("plugins/a.html", "<p>a page</p>"),
+    ];
     let builder = quick(server_of(webots, 2)).set("streaming", "relay");
     builder.forge().commit("lab/arm", "main", &files);
     change(builder).start().await
@@ -37,7 +40,9 @@ async fn relay(change: impl FnOnce(Builder) -> Builder) -> Server {
 /// A client with a simulation, and the path of its stream.
 async fn start(server: &Server) -> (Client, String) {
     let mut client = Client::connect(&server.websocket("/client")).await;
-    client.send(&json!({"start": {"url": arm(), "resumable": true}}).to_string()).await;
+    client
+        .send(&json!({"start": {"url": arm(), "resumable": true}}).to_string())
+        .await;
     let path = path_of(server, &mut client).await;
     (client, path)
 }
@@ -45,7 +50,9 @@ async fn start(server: &Server) -> (Client, String) {
 async fn path_of(server: &Server, client: &mut Client) -> String {
     let told = client.until("webots:").await;
     let beginning = format!("webots:ws://localhost:{}", server.port);
-    told.strip_prefix(&beginning).unwrap_or_else(|| panic!("{told}")).to_owned()
+    told.strip_prefix(&beginning)
+        .unwrap_or_else(|| panic!("{told}"))
+        .to_owned()
 }
 
 async fn look_on(server: &Server, path: &str) -> Client {
@@ -54,7 +61,10 @@ async fn look_on(server: &Server, path: &str) -> Client {
 
 /// The status code of the answer to a WebSocket request.
 async fn refused(server: &Server, path: &str) -> u16 {
-    Client::with_headers(&server.websocket(path), &[]).await.err().unwrap_or(101)
+    Client::with_headers(&server.websocket(path), &[])
+        .await
+        .err()
+        .unwrap_or(101)
 }
 
 /// Sends these bytes, and returns what is received until the connection ends.
@@ -62,7 +72,10 @@ async fn raw(server: &Server, bytes: &str) -> String {
     let mut socket = TcpStream::connect(server.address()).await.unwrap();
     socket.write_all(bytes.as_bytes()).await.unwrap();
     let mut answer = Vec::new();
-    actix_rt::time::timeout(SOON, socket.read_to_end(&mut answer)).await.expect("the connection ends").ok();
+    actix_rt::time::timeout(SOON, socket.read_to_end(&mut answer))
+        .await
+        .expect("the connection ends")
+        .ok();
     String::from_utf8_lossy(&answer).into_owned()
 }
 
@@ -81,7 +94,10 @@ impl Played {
         let port = listener.local_addr().unwrap().port();
         let webots = Webots::script(&format!("exec python3 '{script}' \"$@\" {port}"));
         let change = |builder: Builder| change(builder.set("isolation", "none"));
-        Self { server: relaying(webots, change).await, listener }
+        Self {
+            server: relaying(webots, change).await,
+            listener,
+        }
     }
 
     /// Both ends of a stream: the client's and Webots'.
@@ -91,9 +107,13 @@ impl Played {
         let client = tokio_tungstenite::connect_async_with_config(url, Some(config), true);
         let webots = async {
             let (socket, _) = self.listener.accept().await.unwrap();
-            tokio_tungstenite::accept_async_with_config(socket, Some(config)).await.unwrap()
+            tokio_tungstenite::accept_async_with_config(socket, Some(config))
+                .await
+                .unwrap()
         };
-        let both = actix_rt::time::timeout(SOON, async { tokio::join!(client, webots) }).await.expect("a connection");
+        let both = actix_rt::time::timeout(SOON, async { tokio::join!(client, webots) })
+            .await
+            .expect("a connection");
         (both.0.unwrap().0, both.1)
     }
 
@@ -111,7 +131,9 @@ async fn next<S>(socket: &mut Socket<S>) -> Option<Message>
 where
     S: tokio::io::AsyncRead + tokio::io::AsyncWrite + Unpin,
 {
-    let next = actix_rt::time::timeout(SOON, socket.next()).await.expect("something comes");
+    let next = actix_rt::time::timeout(SOON, socket.next())
+        .await
+        .expect("something comes");
     next.and_then(Result::ok)
 }
 
@@ -129,17 +151,29 @@ async fn a_simulation_and_its_files_are_reached_through_the_server() {
         let picture = http::get(&server.url(&format!("{path}/worlds/textures/a.png"))).await;
         assert_eq!((picture.status.as_u16(), picture.text().as_str()), (200, "a picture"));
         let common = [("access-control-allow-origin", "*"), ("referrer-policy", "no-referrer")];
-        let own = [("content-type", "image/png"), ("cache-control", "public, max-age=3600"), ("content-length", "9")];
-        for (name, value) in common.into_iter().chain(own).chain([("content-security-policy", "sandbox allow-scripts")])
+        let own = [
+            ("content-type", "image/png"),
+            ("cache-control", "public, max-age=3600"),
+            ("content-length", "9"),
+        ];
+        for (name, value) in common
+            .into_iter()
+            .chain(own)
+            .chain([("content-security-policy", "sandbox allow-scripts")])
         {
             assert_eq!(picture.header(name), Some(value), "{name}: {:?}", picture.headers);
         }
         let url = server.url(&format!("{path}/worlds/textures/a.png?now"));
-        let again = awc::Client::new().get(url).insert_header(("if-none-match", picture.header("etag").unwrap()));
+        let again = awc::Client::new()
+            .get(url)
+            .insert_header(("if-none-match", picture.header("etag").unwrap()));
         assert_eq!(again.send().await.unwrap().status(), 304);
         let page = http::get(&server.url(&format!("{path}/plugins/a.html"))).await;
         assert_eq!(page.header("content-security-policy"), Some("sandbox allow-scripts"));
-        assert_eq!(http::get(&server.url(&format!("{path}/worlds/none.png"))).await.status, 404);
+        assert_eq!(
+            http::get(&server.url(&format!("{path}/worlds/none.png"))).await.status,
+            404
+        );
         client.close_with(1000).await;
         nothing_left(&server, 2).await;
     }
@@ -151,20 +185,38 @@ async fn all_frames_and_close_codes_pass_in_both_directions() {
     let (_client, path) = start(&played.server).await;
     let (mut viewer, mut webots) = played.connect(&path).await;
     let picture = vec![7; 4 << 20];
-    for message in [Message::text("a text"), Message::binary(vec![0, 255]), Message::binary(picture), Message::text("")]
-    {
+    for message in [
+        Message::text("a text"),
+        Message::binary(vec![0, 255]),
+        Message::binary(picture),
+        Message::text(""),
+    ] {
         webots.send(message.clone()).await.unwrap();
-        assert!(next(&mut viewer).await == Some(message.clone()), "{} bytes to the client", message.len());
+        assert!(
+            next(&mut viewer).await == Some(message.clone()),
+            "{} bytes to the client",
+            message.len()
+        );
         viewer.send(message.clone()).await.unwrap();
-        assert!(next(&mut webots).await == Some(message.clone()), "{} bytes to Webots", message.len());
+        assert!(
+            next(&mut webots).await == Some(message.clone()),
+            "{} bytes to Webots",
+            message.len()
+        );
     }
     viewer.send(Message::Ping(vec![1].into())).await.unwrap();
     assert_eq!(next(&mut webots).await, Some(Message::Ping(vec![1].into())));
     webots.flush().await.unwrap();
     assert_eq!(next(&mut viewer).await, Some(Message::Pong(vec![1].into())));
-    let frame = |code, reason: &str| CloseFrame { code: CloseCode::from(code), reason: reason.into() };
+    let frame = |code, reason: &str| CloseFrame {
+        code: CloseCode::from(code),
+        reason: reason.into(),
+    };
     webots.send(Message::Close(Some(frame(4321, "enough")))).await.unwrap();
-    assert_eq!(next(&mut viewer).await, Some(Message::Close(Some(frame(4321, "enough")))));
+    assert_eq!(
+        next(&mut viewer).await,
+        Some(Message::Close(Some(frame(4321, "enough"))))
+    );
 
     let (mut viewer, mut webots) = played.connect(&path).await;
     viewer.send(Message::Close(Some(frame(3000, "")))).await.unwrap();
@@ -222,7 +274,9 @@ async fn a_viewer_that_has_vanished_is_noticed_though_nothing_is_sent() {
     let played = Played::new(|builder| builder.set("timing.ping", 1).set("timing.silence", 2)).await;
     let (_client, path) = start(&played.server).await;
     let (viewer, mut webots) = played.connect(&path).await;
-    let MaybeTlsStream::Plain(tcp) = viewer.get_ref() else { panic!("{viewer:?}") };
+    let MaybeTlsStream::Plain(tcp) = viewer.get_ref() else {
+        panic!("{viewer:?}")
+    };
     let _lost = network.lose(1.0, &[tcp.local_addr().unwrap().port().to_string()]);
     assert_eq!(next(&mut webots).await, None);
 }
@@ -236,7 +290,10 @@ async fn streams_have_connections_of_their_own() {
         streams.push(played.connect(&path).await);
     }
     assert_eq!(refused(&played.server, &path).await, 503);
-    assert_eq!(http::get(&played.server.url(&format!("{path}/a.png"))).await.status, 503);
+    assert_eq!(
+        http::get(&played.server.url(&format!("{path}/a.png"))).await.status,
+        503
+    );
     assert_eq!(played.server.simulations().await.len(), 1);
     let (mut viewer, mut webots) = streams.remove(0);
     viewer.close(None).await.unwrap();
@@ -244,7 +301,10 @@ async fn streams_have_connections_of_their_own() {
     drop((viewer, webots));
     // Without a key it is refused, but not for lack of room.
     let upgrade = format!("GET {path} HTTP/1.1\r\nHost: a\r\nConnection: upgrade, close\r\nUpgrade: websocket\r\n\r\n");
-    until("there is room again", async || raw(&played.server, &upgrade).await.starts_with("HTTP/1.1 400 ")).await;
+    until("there is room again", async || {
+        raw(&played.server, &upgrade).await.starts_with("HTTP/1.1 400 ")
+    })
+    .await;
     client.leave().await;
 }
 
@@ -269,7 +329,10 @@ async fn no_trick_leads_anywhere_else() {
         format!("/%73tream/{token}/a.png"),
         format!("/stream/{wrong}/a.png"),
         format!("/stream/{}/a.png", &token[..47]),
-        format!("/stream/{}/a.png", token.replace(|one: char| one.is_ascii_digit(), "%30")),
+        format!(
+            "/stream/{}/a.png",
+            token.replace(|one: char| one.is_ascii_digit(), "%30")
+        ),
         "/stream/".to_owned(),
         "/stream".to_owned(),
     ] {
@@ -280,22 +343,52 @@ async fn no_trick_leads_anywhere_else() {
         }
     }
     for (request, status) in [
-        (format!("POST {path}/a.png HTTP/1.1\r\n{headers}Content-Length: 1\r\n\r\nx"), 405),
+        (
+            format!("POST {path}/a.png HTTP/1.1\r\n{headers}Content-Length: 1\r\n\r\nx"),
+            405,
+        ),
         (format!("PUT {path}/a.png HTTP/1.1\r\n{headers}\r\n"), 405),
         (format!("CONNECT {elsewhere} HTTP/1.1\r\n{headers}\r\n"), 404),
-        (format!("GET {path}/a.png HTTP/1.1\r\n{headers}Content-Length: 1\r\n\r\nx"), 400),
-        (format!("GET {path}/a.png HTTP/1.1\r\n{headers}Transfer-Encoding: chunked\r\n\r\n0\r\n\r\n"), 400),
-        (format!("GET {path} HTTP/1.1\r\n{UPGRADE}Content-Length: 1\r\n\r\nx"), 400),
-        (format!("GET {path} HTTP/1.1\r\n{UPGRADE}Transfer-Encoding: chunked\r\n\r\n1\r\nx\r\n0\r\n\r\n"), 400),
-        (format!("GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: upgrade, close\r\nUpgrade: h2c\r\n\r\n"), 400),
-        (format!("GET {path}/{} HTTP/1.1\r\n{headers}\r\n", "x".repeat(200_000)), 431),
-        (format!("GET /client HTTP/1.1\r\n{UPGRADE}Content-Length: 1\r\n\r\nx"), 400),
-        (format!("GET /client HTTP/1.1\r\n{UPGRADE}Transfer-Encoding: chunked\r\n\r\n1\r\nx\r\n0\r\n\r\n"), 400),
+        (
+            format!("GET {path}/a.png HTTP/1.1\r\n{headers}Content-Length: 1\r\n\r\nx"),
+            400,
+        ),
+        (
+            format!("GET {path}/a.png HTTP/1.1\r\n{headers}Transfer-Encoding: chunked\r\n\r\n0\r\n\r\n"),
+            400,
+        ),
+        (
+            format!("GET {path} HTTP/1.1\r\n{UPGRADE}Content-Length: 1\r\n\r\nx"),
+            400,
+        ),
+        (
+            format!("GET {path} HTTP/1.1\r\n{UPGRADE}Transfer-Encoding: chunked\r\n\r\n1\r\nx\r\n0\r\n\r\n"),
+            400,
+        ),
+        (
+            format!("GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: upgrade, close\r\nUpgrade: h2c\r\n\r\n"),
+            400,
+        ),
+        (
+            format!("GET {path}/{} HTTP/1.1\r\n{headers}\r\n", "x".repeat(200_000)),
+            431,
+        ),
+        (
+            format!("GET /client HTTP/1.1\r\n{UPGRADE}Content-Length: 1\r\n\r\nx"),
+            400,
+        ),
+        (
+            format!("GET /client HTTP/1.1\r\n{UPGRADE}Transfer-Encoding: chunked\r\n\r\n1\r\nx\r\n0\r\n\r\n"),
+            400,
+        ),
     ] {
         let answer = raw(server, &request).await;
         let shown: String = request.chars().take(300).collect();
         assert!(answer.starts_with(&format!("HTTP/1.1 {status} ")), "{shown}: {answer}");
-        assert!(!shown.contains("/client") || answer.ends_with("Error: a request for this has no body."), "{answer}");
+        assert!(
+            !shown.contains("/client") || answer.ends_with("Error: a request for this has no body."),
+            "{answer}"
+        );
     }
     // No request has reached Webots or the address that it named.
     let reached = actix_rt::time::timeout(Duration::from_millis(200), async {
@@ -313,9 +406,16 @@ async fn no_trick_leads_anywhere_else() {
     let port = server.port + 1;
     assert!(head.starts_with("GET /a.png?x=1 HTTP/1.1\r\n"), "{head}");
     assert!(head.contains(&format!("\r\nHost: 127.0.0.1:{port}\r\n")), "{head}");
-    let names: Vec<&str> = head.lines().skip(1).filter_map(|line| Some(line.split_once(':')?.0)).collect();
+    let names: Vec<&str> = head
+        .lines()
+        .skip(1)
+        .filter_map(|line| Some(line.split_once(':')?.0))
+        .collect();
     assert_eq!(names, ["Content-Length", "Connection", "Host", "Date"], "{head}");
-    assert!(answer.starts_with("HTTP/1.1 302 Found\r\n") && !answer.contains("ocation:"), "{answer}");
+    assert!(
+        answer.starts_with("HTTP/1.1 302 Found\r\n") && !answer.contains("ocation:"),
+        "{answer}"
+    );
     assert_eq!(answer.matches("HTTP/1.1 ").count(), 1, "{answer}");
     assert!(!server.log().contains(&token[16..]));
 }
@@ -337,7 +437,10 @@ async fn a_webots_that_does_not_answer_costs_its_client_an_error() {
     let webots = played.answer(b"HTTP/1.1 304 Not Modified\r\nETag: \"x\"\r\n\r\n");
     let (answer, head) = tokio::join!(raw(&played.server, &request), webots);
     assert!(head.contains("\r\nIf-None-Match: \"x\"\r\n"), "{head}");
-    assert!(answer.starts_with("HTTP/1.1 304 ") && answer.split_once("\r\n\r\n").unwrap().1.is_empty(), "{answer}");
+    assert!(
+        answer.starts_with("HTTP/1.1 304 ") && answer.split_once("\r\n\r\n").unwrap().1.is_empty(),
+        "{answer}"
+    );
 }
 
 #[actix_rt::test]
@@ -359,8 +462,18 @@ async fn a_token_is_valid_as_long_as_its_simulation() {
     client.close_with(1000).await;
     viewer.closed().await;
     until("the token is gone", async || refused(&server, &path).await == 404).await;
-    assert_eq!(http::get(&server.url(&format!("{path}/worlds/textures/a.png"))).await.status, 404);
-    assert_eq!(http::get(&server.url(&format!("{others}/worlds/textures/a.png"))).await.status, 200);
+    assert_eq!(
+        http::get(&server.url(&format!("{path}/worlds/textures/a.png")))
+            .await
+            .status,
+        404
+    );
+    assert_eq!(
+        http::get(&server.url(&format!("{others}/worlds/textures/a.png")))
+            .await
+            .status,
+        200
+    );
     // Also if the next simulation has the same port.
     let (_next, third) = start(&server).await;
     assert_eq!(refused(&server, &path).await, 404);
@@ -388,14 +501,24 @@ async fn a_stranger_sees_no_port_and_steers_nobody() {
         let port = server.port + 1;
         let is_shown = (mode, has_password) == ("direct", false);
         let simulation = server.simulations().await.remove(0);
-        assert_eq!(simulation["port"], if is_shown { json!(port) } else { Value::Null }, "{mode} {has_password}");
+        assert_eq!(
+            simulation["port"],
+            if is_shown { json!(port) } else { Value::Null },
+            "{mode} {has_password}"
+        );
         let page = server.monitor().await;
         assert_eq!(page.contains(&format!(">{port}<")), is_shown, "{mode} {has_password}");
         // Credentials may be meant for another service, so a wrong password is not refused.
-        for (password, shown) in [("wrong", Value::Null), (PASSWORD, json!(port))].into_iter().filter(|_| has_password)
+        for (password, shown) in [("wrong", Value::Null), (PASSWORD, json!(port))]
+            .into_iter()
+            .filter(|_| has_password)
         {
             let answer = get_with_password(&server.url("/status"), password).await;
-            assert_eq!((answer.status.as_u16(), &answer.json()["simulations"][0]["port"]), (200, &shown), "{password}");
+            assert_eq!(
+                (answer.status.as_u16(), &answer.json()["simulations"][0]["port"]),
+                (200, &shown),
+                "{password}"
+            );
         }
         // If there is a password, outputs are for administrators only.
         let url = server.url(&format!("/output?id={}", client.id()));
@@ -418,15 +541,22 @@ async fn a_stranger_sees_no_port_and_steers_nobody() {
     let (_stranger, own) = start(&server).await;
     let mut victim = look_on(&server, &path).await.with_running_scene().await;
     let (number, secret) = (&path["/stream/".len()..][..16], &own["/stream/".len() + 16..]);
-    for guess in [format!("/stream/{number}{secret}"), format!("{own}/../{number}{secret}"), "/stream/2001".to_owned()]
-    {
+    for guess in [
+        format!("/stream/{number}{secret}"),
+        format!("{own}/../{number}{secret}"),
+        "/stream/2001".to_owned(),
+    ] {
         assert_eq!(refused(&server, &guess).await, 404, "{guess}");
     }
     let mut stranger = look_on(&server, &own).await.with_scene().await;
     stranger.send("pause").await;
     stranger.until("paused by client").await;
     for _ in 0..20 {
-        assert!(victim.until("").await.starts_with("application/json:"), "{:?}", victim.heard.last());
+        assert!(
+            victim.until("").await.starts_with("application/json:"),
+            "{:?}",
+            victim.heard.last()
+        );
     }
 }
 
@@ -435,16 +565,26 @@ async fn pages_of_other_origins_start_nothing_and_get_no_stream() {
     let server = relay(|builder| builder.set("allowedOrigins", json!(["https://lab.org"]))).await;
     let (_client, path) = start(&server).await;
     // Webots' own viewer runs in a frame with an opaque origin.
-    for (origin, may_start, allowed) in
-        [("https://lab.org", true, true), ("null", false, true), ("https://evil.org", false, false)]
-    {
+    for (origin, may_start, allowed) in [
+        ("https://lab.org", true, true),
+        ("null", false, true),
+        ("https://evil.org", false, false),
+    ] {
         let status = async |path: &str| {
-            Client::with_headers(&server.websocket(path), &[("origin", origin)]).await.err().unwrap_or(101)
+            Client::with_headers(&server.websocket(path), &[("origin", origin)])
+                .await
+                .err()
+                .unwrap_or(101)
         };
         assert_eq!(status("/client").await, if may_start { 101 } else { 403 }, "{origin}");
         assert_eq!(status(&path).await, if allowed { 101 } else { 403 }, "{origin}");
         let file = server.url(&format!("{path}/worlds/textures/a.png"));
-        let answer = awc::Client::new().get(file).insert_header(("origin", origin)).send().await.unwrap();
+        let answer = awc::Client::new()
+            .get(file)
+            .insert_header(("origin", origin))
+            .send()
+            .await
+            .unwrap();
         assert_eq!(answer.status(), if allowed { 200 } else { 403 }, "{origin}");
     }
 }
@@ -453,7 +593,10 @@ async fn pages_of_other_origins_start_nothing_and_get_no_stream() {
 async fn watched_by(server: &Server, client: &Client) -> String {
     let url = server.url(&format!("/watch?id={}", client.id()));
     let answer = get_as_administrator(&url).await;
-    assert_eq!((answer.status.as_u16(), answer.header("referrer-policy")), (200, Some("no-referrer")));
+    assert_eq!(
+        (answer.status.as_u16(), answer.header("referrer-policy")),
+        (200, Some("no-referrer"))
+    );
     let page = answer.text();
     let (_, rest) = page.split_once("data-stream=\"").unwrap();
     format!("/{}", rest.split_once('"').unwrap().0)
@@ -483,7 +626,11 @@ async fn an_administrator_watches_and_changes_nothing() {
         }
         watcher.send_binary(b"pause").await;
         for _ in 0..20 {
-            assert!(student.until("").await.starts_with("application/json:"), "{:?}", student.heard.last());
+            assert!(
+                student.until("").await.starts_with("application/json:"),
+                "{:?}",
+                student.heard.last()
+            );
         }
         watcher.until("application/json:").await;
         let files = server.url(&format!("{path}/worlds/textures/a.png"));
@@ -522,7 +669,10 @@ async fn nobody_watches_without_the_password() {
     let page = get_as_administrator(&server.url("/monitor")).await.text();
     assert!(page.contains(&link), "{page:?}");
     let ask = async |id: &str, password: &str| {
-        get_with_password(&server.url(&format!("/watch?id={id}")), password).await.status.as_u16()
+        get_with_password(&server.url(&format!("/watch?id={id}")), password)
+            .await
+            .status
+            .as_u16()
     };
     assert_eq!(ask(client.id(), "wrong").await, 401);
     for id in ["", "x", "20261122T220517042-17", "%3Cscript%3E"] {

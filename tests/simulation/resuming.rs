@@ -41,9 +41,20 @@ async fn who_comes_back_finds_the_simulation_as_it_runs_at_each_level() {
 
         let mut client = Client::resuming(&server, &first).await;
         let second = client.token().await;
-        let heard: Vec<_> = client.heard.iter().filter(|text| *text != ".").map(String::as_str).collect();
-        assert_eq!(heard[0], format!("session: {}", server.simulations().await[0]["id"].as_str().unwrap()));
-        assert_eq!(heard[2..4], [&format!("webots:ws://localhost:{}", server.port + 1), "absence: 60"]);
+        let heard: Vec<_> = client
+            .heard
+            .iter()
+            .filter(|text| *text != ".")
+            .map(String::as_str)
+            .collect();
+        assert_eq!(
+            heard[0],
+            format!("session: {}", server.simulations().await[0]["id"].as_str().unwrap())
+        );
+        assert_eq!(
+            heard[2..4],
+            [&format!("webots:ws://localhost:{}", server.port + 1), "absence: 60"]
+        );
         let rest: u64 = heard[1]["shutdownTimeout: ".len()..].parse().unwrap();
         assert!((7000..=7200).contains(&rest) && heard.len() == 5, "{heard:?}");
         assert_ne!(first, second);
@@ -53,9 +64,15 @@ async fn who_comes_back_finds_the_simulation_as_it_runs_at_each_level() {
         assert!(back >= left, "it began anew: {left} {back}");
         viewer.until("real-time").await;
         while viewer.time().await <= back {}
-        until("it is not away", async || server.simulations().await[0]["awayUntil"].is_null()).await;
+        until("it is not away", async || {
+            server.simulations().await[0]["awayUntil"].is_null()
+        })
+        .await;
         let after = server.simulations().await;
-        assert_eq!((&after[0]["pid"], &after[0]["id"]), (&before[0]["pid"], &before[0]["id"]));
+        assert_eq!(
+            (&after[0]["pid"], &after[0]["id"]),
+            (&before[0]["pid"], &before[0]["id"])
+        );
         client.close_with(1000).await;
         nothing_left(&server, 2).await;
     }
@@ -71,7 +88,13 @@ async fn a_token_works_once_and_its_client_alone_is_told_it() {
     assert_eq!(first.until("loading: Error").await, TAKEN_OVER);
     assert_eq!(first.closed().await, Some(1000));
     assert_eq!(refused(&server, &one).await, TAKEN_OVER);
-    for nonsense in ["", "x", &one[1..], &"0".repeat(48), &one.to_uppercase().replace('A', "Z")] {
+    for nonsense in [
+        "",
+        "x",
+        &one[1..],
+        &"0".repeat(48),
+        &one.to_uppercase().replace('A', "Z"),
+    ] {
         let told = refused(&server, nonsense).await;
         assert!([ENDED, TAKEN_OVER].contains(&told.as_str()), "{nonsense}: {told}");
     }
@@ -88,7 +111,10 @@ async fn a_token_works_once_and_its_client_alone_is_told_it() {
         told += &http::get(&server.url(path)).await.text();
     }
     assert!(told.contains("away"), "{told}");
-    assert!([&one, &two, &three].iter().all(|token| !told.contains(&token[16..])), "{told}");
+    assert!(
+        [&one, &two, &three].iter().all(|token| !told.contains(&token[16..])),
+        "{told}"
+    );
     let mut last = Client::resuming(&server, &three).await;
     last.token().await;
     last.close_with(1000).await;
@@ -114,10 +140,17 @@ async fn only_a_close_with_1000_ends_a_resumable_simulation_at_once() {
     let never = quick(demo_server(2)).set("timing.absence", 0).start().await;
     for (server, resumable) in [(&server, false), (&never, true)] {
         let mut client = Client::connect(&server.websocket("/client")).await;
-        client.send(&json!({"start": {"url": arm(), "resumable": resumable}}).to_string()).await;
+        client
+            .send(&json!({"start": {"url": arm(), "resumable": resumable}}).to_string())
+            .await;
         client.until("webots:").await;
         client.until(".").await;
-        assert!(!client.heard.iter().any(|text| text.starts_with("resume") || text.starts_with("absence")));
+        assert!(
+            !client
+                .heard
+                .iter()
+                .any(|text| text.starts_with("resume") || text.starts_with("absence"))
+        );
         drop(client);
         nothing_left(server, 2).await;
     }
@@ -125,8 +158,12 @@ async fn only_a_close_with_1000_ends_a_resumable_simulation_at_once() {
 
 #[actix_rt::test]
 async fn a_client_behind_a_stalled_link_resumes_or_is_given_up() {
-    let change =
-        |builder: Builder| builder.set("timing.ping", 0.2).set("timing.silence", 3.0).set("timing.absence", 1.5);
+    let change = |builder: Builder| {
+        builder
+            .set("timing.ping", 0.2)
+            .set("timing.silence", 3.0)
+            .set("timing.absence", 1.5)
+    };
     let server = change(quick(demo_server(1))).start().await;
     let relay = Relay::to(server.port).await;
     let through = format!("ws://127.0.0.1:{}/client", relay.port);
@@ -156,7 +193,9 @@ async fn who_comes_back_too_late_hears_why_it_has_ended() {
     // A silent Webots is not a lost connection.
     let server = quick(demo_server(1)).set("timing.heartbeat", 3600).start().await;
     let crash = async || {
-        let webots = instances_below(&server.folder).into_iter().find(|one| one.1.contains("demo-simulator"));
+        let webots = instances_below(&server.folder)
+            .into_iter()
+            .find(|one| one.1.contains("demo-simulator"));
         kill(Pid::from_raw(webots.unwrap().0), Signal::SIGKILL).unwrap();
         until("it has crashed", async || server.simulations().await.is_empty()).await;
     };
@@ -213,7 +252,9 @@ async fn a_server_that_stops_leaves_nothing_of_who_is_away() {
 #[actix_rt::test]
 async fn who_resumes_counts_for_the_first_address() {
     let change = |builder: Builder| {
-        let builder = builder.set("trustedProxies", json!(["127.0.0.1"])).set("maxPlacesPerAddress", 1);
+        let builder = builder
+            .set("trustedProxies", json!(["127.0.0.1"]))
+            .set("maxPlacesPerAddress", 1);
         builder.set("allowedOrigins", json!(["https://fleet.example.org"]))
     };
     let server = change(quick(demo_server(2))).start().await;
@@ -236,13 +277,20 @@ async fn who_resumes_counts_for_the_first_address() {
 async fn a_whole_class_resumes_its_simulations() {
     const CLASS: usize = 50;
     let change = |builder: Builder| builder.set("timing.launch", 60).set("timing.heartbeat", 2);
-    let server = change(quick(demo_server(2 * u16::try_from(CLASS).unwrap()))).start().await;
+    let server = change(quick(demo_server(2 * u16::try_from(CLASS).unwrap())))
+        .start()
+        .await;
     let mut class = Vec::new();
     for _ in 0..CLASS / 10 {
         class.extend(join_all((0..10).map(|_| Client::resumable(&server))).await);
     }
     let pids = async || {
-        let mut pids: Vec<_> = server.simulations().await.iter().map(|one| one["pid"].as_i64().unwrap()).collect();
+        let mut pids: Vec<_> = server
+            .simulations()
+            .await
+            .iter()
+            .map(|one| one["pid"].as_i64().unwrap())
+            .collect();
         pids.sort_unstable();
         pids
     };

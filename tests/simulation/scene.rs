@@ -7,7 +7,15 @@ use std::time::{Duration, Instant};
 use crate::support::{Builder, Client, Server, arm, instance_folders_in, instances_below, server_that_is, until};
 
 /// The states: connected without a simulation, and the states of simulations that servers show.
-pub const ALL: [&str; 7] = ["connected", "queued", "checkingout", "launching", "idle", "running", "stopping"];
+pub const ALL: [&str; 7] = [
+    "connected",
+    "queued",
+    "checkingout",
+    "launching",
+    "idle",
+    "running",
+    "stopping",
+];
 
 /// A server and its clients in one state. The server ends with this value.
 pub struct Scene {
@@ -27,10 +35,20 @@ impl Scene {
         let (builder, hanging) = server_that_is(state);
         let builder = builder.folder(folder.path());
         let server = change(builder).start().await;
-        let other = if state == "queued" { Some(Client::ready(&server).await) } else { None };
+        let other = if state == "queued" {
+            Some(Client::ready(&server).await)
+        } else {
+            None
+        };
         let client = Client::connect(&server.websocket("/client")).await;
         if state == "connected" {
-            return Self { server, client: Some(client), other, folder, _hanging: hanging };
+            return Self {
+                server,
+                client: Some(client),
+                other,
+                folder,
+                _hanging: hanging,
+            };
         }
         let mut client = client.asking(&arm()).await;
         let told = match state {
@@ -41,7 +59,11 @@ impl Scene {
         };
         client.until(told).await;
         if state == "checkingout" {
-            let runs = || instances_below(folder.path()).iter().any(|one| one.1.contains("ls-remote"));
+            let runs = || {
+                instances_below(folder.path())
+                    .iter()
+                    .any(|one| one.1.contains("ls-remote"))
+            };
             until("git runs", async || runs()).await;
         }
         let mut client = Some(client);
@@ -49,13 +71,24 @@ impl Scene {
             client.take().unwrap().leave().await;
         }
         until(state, async || stages(&server).await.iter().any(|stage| stage == state)).await;
-        Self { server, client, other, folder, _hanging: hanging }
+        Self {
+            server,
+            client,
+            other,
+            folder,
+            _hanging: hanging,
+        }
     }
 }
 
 pub async fn stages(server: &Server) -> Vec<String> {
     let status = server.status().await;
-    status["simulations"].as_array().unwrap().iter().map(|one| one["stage"].as_str().unwrap().to_owned()).collect()
+    status["simulations"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|one| one["stage"].as_str().unwrap().to_owned())
+        .collect()
 }
 
 /// Waits until nothing of any simulation remains: process, slot, port and folder.
@@ -75,7 +108,10 @@ pub async fn nothing_left(server: &Server, places: u16) {
 pub async fn gone_within(grace: f64, left: Instant, server: &Server) -> Duration {
     nothing_left(server, 1).await;
     let took = left.elapsed();
-    assert!(took < Duration::from_secs_f64(grace + 5.0), "it took {took:?}, and the grace time is {grace} s");
+    assert!(
+        took < Duration::from_secs_f64(grace + 5.0),
+        "it took {took:?}, and the grace time is {grace} s"
+    );
     took
 }
 

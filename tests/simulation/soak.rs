@@ -33,7 +33,9 @@ impl Holdings {
             processes: instances_below(&server.folder).len() as u64,
             descriptors: process.fd_count().unwrap() as u64,
             threads: status.threads,
-            ports: (server.port + 1..=server.port + AT_A_TIME as u16 + 10).filter(used).count() as u64,
+            ports: (server.port + 1..=server.port + AT_A_TIME as u16 + 10)
+                .filter(used)
+                .count() as u64,
             folders: folders(&server.folder.join("cache")),
             memory_kib: status.vmrss.unwrap(),
         }
@@ -67,14 +69,19 @@ impl Holdings {
 
 fn folders(folder: &Path) -> u64 {
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
-    entries.filter(|entry| entry.path().is_dir()).map(|entry| 1 + folders(&entry.path())).sum()
+    entries
+        .filter(|entry| entry.path().is_dir())
+        .map(|entry| 1 + folders(&entry.path()))
+        .sum()
 }
 
 /// Starts and stops this many simulations; returns what the server used before and after. On a busy machine pools fill
 /// later, so all growth must stop within this many rounds, which a leak never does.
 pub async fn soak(starts: usize, rounds: usize) -> (Holdings, Holdings) {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = simulation_server(&webots.path(), forge.path(), AT_A_TIME as u16).start().await;
+    let server = simulation_server(&webots.path(), forge.path(), AT_A_TIME as u16)
+        .start()
+        .await;
     visit(&server, WARM_UP).await;
     let mut before = Holdings::of(&server);
     let mut round = 1;
@@ -117,7 +124,9 @@ async fn visit(server: &Server, visits: usize) {
     .await;
     until("its connections are closed", async || {
         let sockets = procfs::net::tcp().unwrap();
-        let mut own = sockets.iter().filter(|socket| socket.local_address.port() == server.port && socket.inode != 0);
+        let mut own = sockets
+            .iter()
+            .filter(|socket| socket.local_address.port() == server.port && socket.inode != 0);
         own.all(|socket| socket.state == TcpState::Listen)
     })
     .await;
@@ -129,6 +138,10 @@ mod tests {
     #[actix_rt::test]
     async fn starts_and_stops_leave_the_server_as_it_was() {
         let (before, after) = super::soak(40, 4).await;
-        assert_eq!(after.leaks_since(&before, 40), Vec::<String>::new(), "{before:?} {after:?}");
+        assert_eq!(
+            after.leaks_since(&before, 40),
+            Vec::<String>::new(),
+            "{before:?} {after:?}"
+        );
     }
 }

@@ -29,7 +29,11 @@ async fn a_simulation_is_stopped_in_any_state() {
         let mut scene = Scene::new(state, with_password).await;
         let (server, client) = (&scene.server, scene.client.as_mut().unwrap());
         let id = client.id().to_owned();
-        assert_eq!(stop(server, &id, r#"{"reason": "<b>Back to work"}"#).await, 202, "{state:?}");
+        assert_eq!(
+            stop(server, &id, r#"{"reason": "<b>Back to work"}"#).await,
+            202,
+            "{state:?}"
+        );
         let told = client.until("loading: Error:").await;
         assert_eq!(told, format!("{TOLD}: \u{2039}b\u{203a}Back to work"), "{state:?}");
         assert_eq!(client.closed().await, Some(1000), "{state:?}");
@@ -41,10 +45,16 @@ async fn a_simulation_is_stopped_in_any_state() {
             nothing_left(server, 1).await;
         }
         let metrics = server.metrics().await;
-        assert!(metrics.contains("webots_simulation_ends_total{reason=\"administrator\"} 1"), "{metrics}");
+        assert!(
+            metrics.contains("webots_simulation_ends_total{reason=\"administrator\"} 1"),
+            "{metrics}"
+        );
         let page = server.monitor().await;
         assert!(page.contains("The administrator has stopped it"), "{state:?}");
-        assert!(!page.contains("to work"), "what a student was told is not for everybody");
+        assert!(
+            !page.contains("to work"),
+            "what a student was told is not for everybody"
+        );
     }
 }
 
@@ -56,19 +66,34 @@ async fn only_the_password_stops_a_simulation() {
     assert_eq!(post(&url, None, "").await, 401);
     assert_eq!(post(&url, Some("guess"), "").await, 401);
     let foreign = awc::Client::default().post(&url).basic_auth("admin", PASSWORD);
-    let answer = foreign.insert_header(("Origin", "https://evil.example")).send().await.unwrap();
+    let answer = foreign
+        .insert_header(("Origin", "https://evil.example"))
+        .send()
+        .await
+        .unwrap();
     assert_eq!(answer.status(), 403);
     assert_eq!(http::get(&url).await.status.as_u16(), 405);
     for body in ["{", "5", r#"{"reason": 5}"#, r#"{"why": "x"}"#, "please"] {
         assert_eq!(stop(&server, client.id(), body).await, 400, "{body}");
     }
-    assert_eq!(stop(&server, client.id(), &format!(r#"{{"reason": "{}"}}"#, "x".repeat(9000))).await, 413);
+    assert_eq!(
+        stop(
+            &server,
+            client.id(),
+            &format!(r#"{{"reason": "{}"}}"#, "x".repeat(9000))
+        )
+        .await,
+        413
+    );
     client.until(".").await;
     // Without a reason, and with one that is too long.
     let mut other = Client::ready(&server).await;
     assert_eq!(stop(&server, client.id(), "").await, 202);
     assert_eq!(client.until("loading: Error:").await, TOLD);
-    assert_eq!(stop(&server, other.id(), &json!({"reason": "x\n".repeat(200)}).to_string()).await, 202);
+    assert_eq!(
+        stop(&server, other.id(), &json!({"reason": "x\n".repeat(200)}).to_string()).await,
+        202
+    );
     let told = other.until("loading: Error:").await;
     assert!(told.len() < 400 && told.ends_with("..."), "{told}");
     // Without an `adminPassword`, a server allows no actions.
@@ -84,7 +109,10 @@ async fn statuses(server: &Server, requests: &[String], count: usize) -> Vec<u16
     let mut answers = Vec::new();
     let statuses = |answers: &[u8]| -> Vec<u16> {
         let text = String::from_utf8_lossy(answers);
-        text.split("HTTP/1.1 ").skip(1).map(|answer| answer[..3].parse().unwrap()).collect()
+        text.split("HTTP/1.1 ")
+            .skip(1)
+            .map(|answer| answer[..3].parse().unwrap())
+            .collect()
     };
     for request in requests {
         socket.write_all(request.as_bytes()).await.unwrap();
@@ -98,7 +126,11 @@ async fn statuses(server: &Server, requests: &[String], count: usize) -> Vec<u16
 async fn a_body_belongs_to_its_request_and_holds_up_nobody() {
     let server = with_password(demo_server(1)).start().await;
     let post = |password: bool, more: &str, body: &str| {
-        let password = if password { "Authorization: Basic YWRtaW46b3BlbiBzZXNhbWU=\r\n" } else { "" };
+        let password = if password {
+            "Authorization: Basic YWRtaW46b3BlbiBzZXNhbWU=\r\n"
+        } else {
+            ""
+        };
         format!("POST /simulations/1-1/stop HTTP/1.1\r\nHost: x\r\n{password}{more}\r\n{body}")
     };
     let load = || "GET /load HTTP/1.1\r\nHost: x\r\n\r\n".to_owned();
@@ -113,13 +145,26 @@ async fn a_body_belongs_to_its_request_and_holds_up_nobody() {
         (vec![post(true, "Transfer-Encoding: chunked\r\n", "5\r\n")], vec![413]),
         (vec![post(true, "Content-Length: 9000\r\n", "x")], vec![413]),
         (vec![post(true, "Content-Length: 99\r\n", "{")], vec![408]),
-        (vec![post(true, "Content-Length: 18446744073709551616\r\n", "x")], vec![400]),
+        (
+            vec![post(true, "Content-Length: 18446744073709551616\r\n", "x")],
+            vec![400],
+        ),
     ] {
-        assert_eq!(statuses(&server, &requests, expected.len()).await, expected, "{requests:?}");
+        assert_eq!(
+            statuses(&server, &requests, expected.len()).await,
+            expected,
+            "{requests:?}"
+        );
     }
     // Without the password, the server does not wait for the body.
-    assert_eq!(statuses(&server, &[post(false, "Content-Length: 99\r\n", "{")], 1).await, [401]);
-    assert_eq!(statuses(&server, &[post(false, &length(body), body), load()], 2).await[0], 401);
+    assert_eq!(
+        statuses(&server, &[post(false, "Content-Length: 99\r\n", "{")], 1).await,
+        [401]
+    );
+    assert_eq!(
+        statuses(&server, &[post(false, &length(body), body), load()], 2).await[0],
+        401
+    );
 }
 
 #[actix_rt::test]
@@ -140,8 +185,18 @@ async fn a_stop_never_ends_the_next_simulation_of_a_slot() {
     let mut client = Client::ready(&server).await;
     let id = client.id().to_owned();
     let number = id.split_once('-').unwrap().1;
-    assert!(ids[0].ends_with(&format!("-{number}")) && !ids.contains(&id), "{ids:?} {id}");
-    let like = [&id[1..], &format!("{id}0"), &format!("%20{id}"), number, "..", &format!("x-{number}")];
+    assert!(
+        ids[0].ends_with(&format!("-{number}")) && !ids.contains(&id),
+        "{ids:?} {id}"
+    );
+    let like = [
+        &id[1..],
+        &format!("{id}0"),
+        &format!("%20{id}"),
+        number,
+        "..",
+        &format!("x-{number}"),
+    ];
     for other in ids.iter().map(String::as_str).chain(like) {
         let status = stop(&server, other, "").await;
         assert!([404, 405].contains(&status), "{other}: {status}");

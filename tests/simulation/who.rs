@@ -7,13 +7,19 @@ use crate::support::http::{self, PASSWORD, get_as_administrator, get_with_passwo
 use crate::support::{Builder, Client, Server, arm, demo_server, until};
 
 fn with_users(places: u16) -> Builder {
-    demo_server(places).set("adminPassword", PASSWORD).set("userHeader", "X-Forwarded-User")
+    demo_server(places)
+        .set("adminPassword", PASSWORD)
+        .set("userHeader", "X-Forwarded-User")
 }
 
 /// A client with headers of a web server, and with a name of its own choice.
 async fn start(server: &Server, headers: &[(&'static str, &str)], name: Option<&str>) -> Client {
-    let mut client = Client::with_headers(&server.websocket("/client"), headers).await.unwrap();
-    client.send(&json!({"start": {"url": arm(), "name": name}}).to_string()).await;
+    let mut client = Client::with_headers(&server.websocket("/client"), headers)
+        .await
+        .unwrap();
+    client
+        .send(&json!({"start": {"url": arm(), "name": name}}).to_string())
+        .await;
     client
 }
 
@@ -23,7 +29,9 @@ async fn page(server: &Server) -> String {
 
 /// The first event for a live page with the password.
 async fn event(server: &Server) -> String {
-    let request = awc::Client::default().get(server.url("/events")).basic_auth("admin", PASSWORD);
+    let request = awc::Client::default()
+        .get(server.url("/events"))
+        .basic_auth("admin", PASSWORD);
     let mut answer = request.send().await.unwrap();
     let mut text = String::new();
     while !text.contains("simulations") || !text.ends_with("\n\n") {
@@ -41,11 +49,17 @@ async fn a_name_is_for_administrators_alone_and_never_markup() {
     let id = client.id().to_owned();
     let watch = server.url(&format!("/watch?id={id}"));
     let watched = get_as_administrator(&watch).await.text();
-    assert!(watched.contains(&format!("href=\"{}\"", arm())) && watched.contains(">a.wbt</a>"), "{watched}");
+    assert!(
+        watched.contains(&format!("href=\"{}\"", arm())) && watched.contains(">a.wbt</a>"),
+        "{watched}"
+    );
     let refused = http::get(&watch).await;
     assert_eq!((refused.status.as_u16(), refused.text().contains("anna")), (401, false));
     for text in [page(&server).await, event(&server).await, watched] {
-        assert!(text.contains("anna@lab") && text.contains("alert(1)") && text.contains("unverified"), "{text}");
+        assert!(
+            text.contains("anna@lab") && text.contains("alert(1)") && text.contains("unverified"),
+            "{text}"
+        );
         assert!(!text.contains("<b>anna") && !text.contains("<script>alert"), "{text}");
     }
     let output = server.url(&format!("/output?id={id}"));
@@ -55,18 +69,37 @@ async fn a_name_is_for_administrators_alone_and_never_markup() {
     let line = csv().lines().find(|line| line.starts_with(&id)).unwrap().to_owned();
     let written = "<b>anna@lab</b>,\"\"\"<script>alert(1)</script>\u{fffd} =1+1,x\"";
     assert!(line.ends_with(written), "{line}");
-    assert!(csv().lines().next().unwrap().ends_with(",reason,user,label (unverified)"));
+    assert!(
+        csv()
+            .lines()
+            .next()
+            .unwrap()
+            .ends_with(",reason,user,label (unverified)")
+    );
     let log = server.log();
-    assert!(log.lines().any(|line| line.contains(&id) && line.contains("user \"<b>anna@lab</b>\"")), "{log}");
-    assert!(page(&server).await.contains("anna@lab"), "the simulations that ended have a name, too");
+    assert!(
+        log.lines()
+            .any(|line| line.contains(&id) && line.contains("user \"<b>anna@lab</b>\"")),
+        "{log}"
+    );
+    assert!(
+        page(&server).await.contains("anna@lab"),
+        "the simulations that ended have a name, too"
+    );
     // Pages without the password.
     for path in ["/monitor", "/status", "/metrics", "/load"] {
         let text = http::get(&server.url(path)).await.text();
         assert!(!text.contains("anna") && !text.contains("alert(1)"), "{path}: {text}");
     }
-    until("the output is kept", async || get_as_administrator(&output).await.status == 200).await;
+    until("the output is kept", async || {
+        get_as_administrator(&output).await.status == 200
+    })
+    .await;
     let kept = get_as_administrator(&output).await.text();
-    assert!(kept.contains("asks for") && !kept.contains("anna") && !kept.contains("alert(1)"), "{kept}");
+    assert!(
+        kept.contains("asks for") && !kept.contains("anna") && !kept.contains("alert(1)"),
+        "{kept}"
+    );
     // If there is no password, no user is shown.
     let server = demo_server(1).set("userHeader", "X-Forwarded-User").start().await;
     let mut client = start(&server, &[("x-forwarded-user", user)], Some(label)).await;
@@ -82,21 +115,47 @@ async fn a_user_is_believed_from_a_trusted_web_server_only() {
         (json!([]), "X-Forwarded-User", vec![anna], false),
         (json!(["203.0.113.0/24"]), "X-Forwarded-User", vec![anna], false),
         (json!(["127.0.0.1"]), "X-Auth-Name", vec![anna], false),
-        (json!(["127.0.0.1"]), "X-Forwarded-User", vec![anna, ("x-forwarded-user", "ben")], false),
+        (
+            json!(["127.0.0.1"]),
+            "X-Forwarded-User",
+            vec![anna, ("x-forwarded-user", "ben")],
+            false,
+        ),
     ] {
-        let server = with_users(1).set("trustedProxies", trusted.clone()).set("userHeader", header).start().await;
+        let server = with_users(1)
+            .set("trustedProxies", trusted.clone())
+            .set("userHeader", header)
+            .start()
+            .await;
         let mut client = start(&server, &headers, None).await;
         client.until("webots:").await;
-        assert_eq!(page(&server).await.contains("<b>anna</b>"), known, "{trusted} {header} {headers:?}");
-        assert_eq!(server.log().contains("user \"anna\""), known, "{trusted} {header} {headers:?}");
+        assert_eq!(
+            page(&server).await.contains("<b>anna</b>"),
+            known,
+            "{trusted} {header} {headers:?}"
+        );
+        assert_eq!(
+            server.log().contains("user \"anna\""),
+            known,
+            "{trusted} {header} {headers:?}"
+        );
     }
 }
 
 #[actix_rt::test]
 async fn one_user_has_a_share_of_the_places_wherever_it_is() {
-    let server = with_users(4).set("waitingLine", 4).set("maxPlacesPerUser", 1).start().await;
+    let server = with_users(4)
+        .set("waitingLine", 4)
+        .set("maxPlacesPerUser", 1)
+        .start()
+        .await;
     let from = async |user: &str, address: &str| {
-        start(&server, &[("x-forwarded-user", user), ("x-forwarded-for", address)], None).await
+        start(
+            &server,
+            &[("x-forwarded-user", user), ("x-forwarded-for", address)],
+            None,
+        )
+        .await
     };
     let mut first = from("anna", "203.0.113.1").await;
     first.until("webots:").await;
@@ -120,9 +179,16 @@ async fn who_has_sent_too_many_passwords_is_not_taken_for_a_stranger() {
     let ask = async |path: &str, password| get_with_password(&server.url(path), password).await.status.as_u16();
     let guesses = futures_util::stream::iter(0..60).then(|_| ask("/monitor", "guess"));
     let answers: Vec<u16> = guesses.collect().await;
-    assert!(answers.starts_with(&[200; 30]) && answers.ends_with(&[429; 10]), "{answers:?}");
+    assert!(
+        answers.starts_with(&[200; 30]) && answers.ends_with(&[429; 10]),
+        "{answers:?}"
+    );
     for path in ["/monitor", "/events", "/status"] {
         assert_eq!(ask(path, PASSWORD).await, 429, "{path}");
     }
-    assert_eq!(http::get(&server.url("/monitor")).await.status, 200, "without a password it is the page for all");
+    assert_eq!(
+        http::get(&server.url("/monitor")).await.status,
+        200,
+        "without a password it is the page for all"
+    );
 }

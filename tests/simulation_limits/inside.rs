@@ -31,14 +31,25 @@ impl Inside {
         // Before the server starts: it would take processes that are started later for its own.
         let (mut builder, hanging) = server_that_is(&format!("{stage:?}").to_lowercase());
         let folder = tempfile::tempdir().unwrap();
-        let mut config = config::load::<SimulationConfig>(&builder.write(folder.path())).unwrap().config;
+        let mut config = config::load::<SimulationConfig>(&builder.write(folder.path()))
+            .unwrap()
+            .config;
         change(&mut config);
         let port = config.port;
         let assembly = Application::new(config).unwrap();
         let server = Arc::clone(&assembly.server);
         let running = actix_rt::spawn(app::serve(assembly));
-        until("the server listens", async || std::net::TcpStream::connect(("127.0.0.1", port)).is_ok()).await;
-        Self { server, port, running, folder, _parts: (builder, hanging) }
+        until("the server listens", async || {
+            std::net::TcpStream::connect(("127.0.0.1", port)).is_ok()
+        })
+        .await;
+        Self {
+            server,
+            port,
+            running,
+            folder,
+            _parts: (builder, hanging),
+        }
     }
 
     /// A client that has requested the world.
@@ -58,7 +69,13 @@ impl Inside {
     }
 
     pub fn stages(&self) -> Vec<Stage> {
-        self.server.slots.snapshot().simulations.iter().map(|one| one.stage).collect()
+        self.server
+            .slots
+            .snapshot()
+            .simulations
+            .iter()
+            .map(|one| one.stage)
+            .collect()
     }
 
     /// Waits until nothing of any simulation remains: connection, process, slot, port and folder.
@@ -76,13 +93,21 @@ impl Inside {
 
     /// Waits until the server ends by itself; returns its result.
     pub async fn ended(self) -> Result<(), AppError> {
-        actix_rt::time::timeout(crate::support::SOON, self.running).await.unwrap().unwrap()
+        actix_rt::time::timeout(crate::support::SOON, self.running)
+            .await
+            .unwrap()
+            .unwrap()
     }
 
     /// Stops the server.
     pub async fn stop(self) {
         kill(Pid::this(), Signal::SIGTERM).unwrap();
         self.running.await.unwrap().unwrap();
-        assert_eq!(std::fs::read_dir(self.folder.path().join("cache/runs")).unwrap().count(), 0);
+        assert_eq!(
+            std::fs::read_dir(self.folder.path().join("cache/runs"))
+                .unwrap()
+                .count(),
+            0
+        );
     }
 }

@@ -46,14 +46,26 @@ fn main() {
         "time::a_simulation_ends_at_its_time_limit_in_any_state",
         time::a_simulation_ends_at_its_time_limit_in_any_state,
     );
-    run("time::who_is_away_at_the_time_limit_hears_it", time::who_is_away_at_the_time_limit_hears_it);
-    run("panics::a_client_leaves_nothing_in_any_state", panics::a_client_leaves_nothing_in_any_state);
-    run("panics::an_actor_that_must_live_ends_the_server", panics::an_actor_that_must_live_ends_the_server);
+    run(
+        "time::who_is_away_at_the_time_limit_hears_it",
+        time::who_is_away_at_the_time_limit_hears_it,
+    );
+    run(
+        "panics::a_client_leaves_nothing_in_any_state",
+        panics::a_client_leaves_nothing_in_any_state,
+    );
+    run(
+        "panics::an_actor_that_must_live_ends_the_server",
+        panics::an_actor_that_must_live_ends_the_server,
+    );
 }
 
 /// Runs a test, unless the command line names only others.
 fn run<F: Future<Output = ()>>(name: &str, test: fn() -> F) {
-    let mut wanted = std::env::args().skip(1).filter(|argument| !argument.starts_with('-')).peekable();
+    let mut wanted = std::env::args()
+        .skip(1)
+        .filter(|argument| !argument.starts_with('-'))
+        .peekable();
     if wanted.peek().is_none() || wanted.any(|part| name.contains(&part)) {
         actix_rt::System::new().block_on(test());
         println!("test {name} ... ok");

@@ -47,17 +47,28 @@ async fn gate(
     let peer = server.config.trusted_proxies.peer(&request);
     let connection = server.connections.admit(ConnectionKind::Client, peer).unwrap();
     let client = WebClient::new(Arc::clone(&server), (peer, None), connection);
-    let (address, response) = WsResponseBuilder::new(client, &request, stream).start_with_addr().unwrap();
+    let (address, response) = WsResponseBuilder::new(client, &request, stream)
+        .start_with_addr()
+        .unwrap();
     clients.send(address).unwrap();
     response
 }
 
 pub async fn a_client_leaves_nothing_in_any_state() {
-    let stages = [Stage::Queued, Stage::CheckingOut, Stage::Launching, Stage::Idle, Stage::Running];
+    let stages = [
+        Stage::Queued,
+        Stage::CheckingOut,
+        Stage::Launching,
+        Stage::Idle,
+        Stage::Running,
+    ];
     for stage in std::iter::once(None).chain(stages.map(Some)) {
         let inside = Inside::new(stage.unwrap_or(Stage::Idle), |_| ()).await;
         let (sender, mut clients) = unbounded_channel::<Addr<WebClient>>();
-        let (server, socket) = (web::Data::from(Arc::clone(&inside.server)), TcpListener::bind("127.0.0.1:0").unwrap());
+        let (server, socket) = (
+            web::Data::from(Arc::clone(&inside.server)),
+            TcpListener::bind("127.0.0.1:0").unwrap(),
+        );
         let port = socket.local_addr().unwrap().port();
         let app = move || {
             App::new()
@@ -65,7 +76,13 @@ pub async fn a_client_leaves_nothing_in_any_state() {
                 .app_data(web::Data::new(sender.clone()))
                 .route("/client", web::get().to(gate))
         };
-        let door = HttpServer::new(app).workers(1).disable_signals().shutdown_timeout(1).listen(socket).unwrap().run();
+        let door = HttpServer::new(app)
+            .workers(1)
+            .disable_signals()
+            .shutdown_timeout(1)
+            .listen(socket)
+            .unwrap()
+            .run();
         let handle = door.handle();
         actix_rt::spawn(door);
         let mut first = None;
@@ -96,5 +113,8 @@ pub async fn an_actor_that_must_live_ends_the_server() {
     let inside = Inside::new(Stage::Idle, |_| ()).await;
     inside.server.load_monitor.do_send(Panic);
     // Any error here makes the program end with exit code 1.
-    assert_eq!(inside.ended().await.unwrap_err().to_string(), "the actor LoadMonitor is gone");
+    assert_eq!(
+        inside.ended().await.unwrap_err().to_string(),
+        "the actor LoadMonitor is gone"
+    );
 }

@@ -24,12 +24,26 @@ pub async fn a_simulation_ends_at_its_time_limit_in_any_state() {
             inside.until(stage).await;
         }
         let told = client.until("loading: Error:").await;
-        assert!(told.starts_with("loading: Error: The time limit of 5 seconds was reached"), "{stage:?}: {told}");
+        assert!(
+            told.starts_with("loading: Error: The time limit of 5 seconds was reached"),
+            "{stage:?}: {told}"
+        );
         // A simulation that does not become ready counts as the server's own fault: another server may take its client.
-        assert_eq!(client.closed().await, Some(if stage == Stage::Launching { 1013 } else { 1000 }), "{stage:?}");
-        assert!(begin.elapsed() >= Duration::from_secs(5), "{stage:?}: it came too early");
+        assert_eq!(
+            client.closed().await,
+            Some(if stage == Stage::Launching { 1013 } else { 1000 }),
+            "{stage:?}"
+        );
+        assert!(
+            begin.elapsed() >= Duration::from_secs(5),
+            "{stage:?}: it came too early"
+        );
         inside.until_nothing_is_left().await;
-        assert_eq!(inside.server.ends.latest()[0].how.reason, EndReason::TimeLimit, "{stage:?}");
+        assert_eq!(
+            inside.server.ends.latest()[0].how.reason,
+            EndReason::TimeLimit,
+            "{stage:?}"
+        );
         inside.stop().await;
     }
 }

@@ -24,14 +24,21 @@ impl Certificate {
     /// A self-signed certificate for `localhost`, with or without the right to sign others.
     pub fn self_signed(folder: &Path, name: &str, signs_others: bool) -> Self {
         let mut params = CertificateParams::new(["localhost".to_owned()]).unwrap();
-        params.is_ca = if signs_others { IsCa::Ca(BasicConstraints::Unconstrained) } else { IsCa::ExplicitNoCa };
+        params.is_ca = if signs_others {
+            IsCa::Ca(BasicConstraints::Unconstrained)
+        } else {
+            IsCa::ExplicitNoCa
+        };
         let key = KeyPair::generate().unwrap();
         Self::write(folder, name, &params.self_signed(&key).unwrap(), &key)
     }
 
     fn write(folder: &Path, name: &str, certificate: &rcgen::Certificate, key: &KeyPair) -> Self {
         let file = |part: &str| folder.join(format!("{name}-{part}.pem"));
-        let files = Self { chain: file("chain"), key: file("key") };
+        let files = Self {
+            chain: file("chain"),
+            key: file("key"),
+        };
         std::fs::write(&files.chain, certificate.pem()).unwrap();
         std::fs::write(&files.key, key.serialize_pem()).unwrap();
         files
@@ -42,7 +49,9 @@ impl Certificate {
         let chain = vec![CertificateDer::from_pem_file(&self.chain).unwrap()];
         let key = PrivateKeyDer::from_pem_file(&self.key).unwrap();
         let provider = Arc::new(rustls::crypto::ring::default_provider());
-        let config = ServerConfig::builder_with_provider(provider).with_safe_default_protocol_versions().unwrap();
+        let config = ServerConfig::builder_with_provider(provider)
+            .with_safe_default_protocol_versions()
+            .unwrap();
         Arc::new(config.with_no_client_auth().with_single_cert(chain, key).unwrap())
     }
 }
@@ -51,7 +60,9 @@ impl Authority {
     pub fn new() -> Self {
         let mut params = CertificateParams::default();
         params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
-        params.distinguished_name.push(DnType::CommonName, format!("Authority {}", rand::random::<u64>()));
+        params
+            .distinguished_name
+            .push(DnType::CommonName, format!("Authority {}", rand::random::<u64>()));
         let issuer = CertifiedIssuer::self_signed(params, KeyPair::generate().unwrap()).unwrap();
         let folder = tempfile::tempdir().unwrap();
         std::fs::write(folder.path().join("authority.pem"), issuer.pem()).unwrap();
@@ -85,6 +96,8 @@ pub fn trusting(authority: &Path) -> Arc<ClientConfig> {
     let mut roots = rustls::RootCertStore::empty();
     roots.add(CertificateDer::from_pem_file(authority).unwrap()).unwrap();
     let provider = Arc::new(rustls::crypto::ring::default_provider());
-    let builder = ClientConfig::builder_with_provider(provider).with_safe_default_protocol_versions().unwrap();
+    let builder = ClientConfig::builder_with_provider(provider)
+        .with_safe_default_protocol_versions()
+        .unwrap();
     Arc::new(builder.with_root_certificates(roots).with_no_client_auth())
 }

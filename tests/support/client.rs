@@ -29,19 +29,26 @@ pub enum Heard {
 
 impl Client {
     pub async fn connect(url: &str) -> Self {
-        Self::try_connect(url).await.unwrap_or_else(|error| panic!("{url}: {error}"))
+        Self::try_connect(url)
+            .await
+            .unwrap_or_else(|error| panic!("{url}: {error}"))
     }
 
     /// Connects to a server that may be down.
     pub async fn try_connect(url: &str) -> Result<Self, String> {
         let connecting = actix_rt::time::timeout(SOON, tokio_tungstenite::connect_async(url)).await;
         let connected = connecting.map_err(|error| error.to_string())?;
-        connected.map(|(socket, _)| Self::new(socket)).map_err(|error| error.to_string())
+        connected
+            .map(|(socket, _)| Self::new(socket))
+            .map_err(|error| error.to_string())
     }
 
     /// Uses an open connection.
     pub fn new(socket: WebSocketStream<MaybeTlsStream<TcpStream>>) -> Self {
-        Self { socket, heard: Vec::new() }
+        Self {
+            socket,
+            heard: Vec::new(),
+        }
     }
 
     /// Connects to a simulation server and asks for a world.
@@ -51,7 +58,8 @@ impl Client {
 
     /// Asks for a world.
     pub async fn asking(mut self, world: &str) -> Self {
-        self.send(&serde_json::json!({"start": {"url": world}}).to_string()).await;
+        self.send(&serde_json::json!({"start": {"url": world}}).to_string())
+            .await;
         self
     }
 
@@ -64,7 +72,10 @@ impl Client {
 
     /// A client with a ready simulation that it can resume, and the token for that.
     pub async fn resumable(server: &super::program::Server) -> (Self, String) {
-        Self::connect(&server.websocket("/client")).await.start_resumable().await
+        Self::connect(&server.websocket("/client"))
+            .await
+            .start_resumable()
+            .await
     }
 
     /// A client that resumes a simulation with a token.
@@ -74,7 +85,8 @@ impl Client {
 
     /// Requests the world of [`arm`](super::git::arm) as resumable; waits until it is ready, and for the token.
     pub async fn start_resumable(mut self) -> (Self, String) {
-        self.send(&serde_json::json!({"start": {"url": super::git::arm(), "resumable": true}}).to_string()).await;
+        self.send(&serde_json::json!({"start": {"url": super::git::arm(), "resumable": true}}).to_string())
+            .await;
         self.until("webots:").await;
         let token = self.token().await;
         (self, token)
@@ -88,7 +100,11 @@ impl Client {
 
     /// The next token that the server sends.
     pub async fn token(&mut self) -> String {
-        self.until("resume: ").await.strip_prefix("resume: ").unwrap().to_owned()
+        self.until("resume: ")
+            .await
+            .strip_prefix("resume: ")
+            .unwrap()
+            .to_owned()
     }
 
     /// Like [`Client::start`], but through a web server that reports this client address.
@@ -148,12 +164,16 @@ impl Client {
 
     /// Sends a text over a connection that may be broken.
     pub async fn try_send(&mut self, text: &str) -> Result<(), String> {
-        self.socket.send(Message::text(text)).await.map_err(|error| error.to_string())
+        self.socket
+            .send(Message::text(text))
+            .await
+            .map_err(|error| error.to_string())
     }
 
     /// Requests a reset of a controller; returns the answer.
     pub async fn reset(&mut self, controller: &str) -> String {
-        self.send(&serde_json::json!({ "reset controller": controller }).to_string()).await;
+        self.send(&serde_json::json!({ "reset controller": controller }).to_string())
+            .await;
         loop {
             let answer = self.until("").await;
             if answer.starts_with("reset") || answer.starts_with("loading: Error") {
@@ -255,13 +275,18 @@ impl Client {
     /// Closes with this code, and waits for the close frame of the server as browsers do. Dropping a socket with unread
     /// data resets the connection, and the server may not see the code.
     pub async fn close_with(mut self, code: u16) {
-        let frame = CloseFrame { code: CloseCode::from(code), reason: "".into() };
+        let frame = CloseFrame {
+            code: CloseCode::from(code),
+            reason: "".into(),
+        };
         let closing = async {
             if self.socket.close(Some(frame)).await.is_ok() {
                 while let Some(Ok(_)) = self.socket.next().await {}
             }
         };
-        actix_rt::time::timeout(SOON, closing).await.expect("the closing handshake");
+        actix_rt::time::timeout(SOON, closing)
+            .await
+            .expect("the closing handshake");
     }
 
     /// Closes without a code.
@@ -275,7 +300,11 @@ pub async fn outcome(server: &super::program::Server, world: &str) -> String {
     let mut client = Client::start(server, world).await;
     let told = client.patiently("loading: Error:").await;
     // The text and the code agree on whether the client may try another server.
-    let code = if told.contains(". Connect again: the session server") { 1013 } else { 1000 };
+    let code = if told.contains(". Connect again: the session server") {
+        1013
+    } else {
+        1000
+    };
     assert_eq!(client.closed().await, Some(code), "{told}");
     told
 }

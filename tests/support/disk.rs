@@ -11,14 +11,28 @@ use nix::sched::{CloneFlags, unshare};
 /// that, tests of disk faults are not possible.
 pub fn hide_mounts_from_others() {
     if unshare(CloneFlags::CLONE_NEWNS).is_ok() {
-        mount(None::<&str>, "/", None::<&str>, MsFlags::MS_REC | MsFlags::MS_PRIVATE, None::<&str>).unwrap();
+        mount(
+            None::<&str>,
+            "/",
+            None::<&str>,
+            MsFlags::MS_REC | MsFlags::MS_PRIVATE,
+            None::<&str>,
+        )
+        .unwrap();
     }
 }
 
 /// Mounts a disk of this many MiB; returns whether that worked.
 pub fn small_disk(folder: &Path, size: u32) -> bool {
     std::fs::create_dir_all(folder).unwrap();
-    mount(Some("small"), folder, Some("tmpfs"), MsFlags::empty(), Some(&*format!("size={size}m"))).is_ok()
+    mount(
+        Some("small"),
+        folder,
+        Some("tmpfs"),
+        MsFlags::empty(),
+        Some(&*format!("size={size}m")),
+    )
+    .is_ok()
 }
 
 /// A file that fills up a disk.

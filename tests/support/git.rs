@@ -15,13 +15,19 @@ pub const WORLD: &str = "#VRML_SIM R2025a utf8\nWorldInfo { title \"Test\" basic
 
 impl Forge {
     pub fn new() -> Self {
-        Self { folder: super::open_folder() }
+        Self {
+            folder: super::open_folder(),
+        }
     }
 
     /// A forge with `lab/arm`, whose branch `main` has `worlds/a.wbt` and a controller.
     pub fn with_arm() -> Self {
         let forge = Self::new();
-        forge.commit("lab/arm", "main", &[("worlds/a.wbt", WORLD), ("controllers/c/c.py", "print('original')\n")]);
+        forge.commit(
+            "lab/arm",
+            "main",
+            &[("worlds/a.wbt", WORLD), ("controllers/c/c.py", "print('original')\n")],
+        );
         forge
     }
 
@@ -34,8 +40,10 @@ impl Forge {
         let bare = self.bare(repository);
         let mut stream =
             format!("commit refs/heads/{branch}\nmark :1\ncommitter Test <test@localhost> now\ndata 4\ntest\n");
-        if let Some(parent) =
-            [branch, "main"].map(|name| format!("refs/heads/{name}")).iter().find(|name| exists(&bare, name))
+        if let Some(parent) = [branch, "main"]
+            .map(|name| format!("refs/heads/{name}"))
+            .iter()
+            .find(|name| exists(&bare, name))
         {
             stream += &format!("from {parent}^0\n");
         }
@@ -61,7 +69,10 @@ impl Forge {
         let bare = self.folder.path().join(repository);
         if !bare.exists() {
             std::fs::create_dir_all(&bare).unwrap();
-            git(&bare, &["init", "--quiet", "--bare", "--template=", "--initial-branch=main"]);
+            git(
+                &bare,
+                &["init", "--quiet", "--bare", "--template=", "--initial-branch=main"],
+            );
         }
         bare
     }
@@ -70,11 +81,17 @@ impl Forge {
     pub fn work_tree(&self, repository: &str, branch: &str) -> PathBuf {
         let (bare, work) = (self.bare(repository), self.folder.path().join(".work").join(repository));
         if !work.exists() {
-            git(self.folder.path(), &["clone", "--quiet", bare.to_str().unwrap(), work.to_str().unwrap()]);
+            git(
+                self.folder.path(),
+                &["clone", "--quiet", bare.to_str().unwrap(), work.to_str().unwrap()],
+            );
         }
         if exists(&bare, &format!("refs/heads/{branch}")) {
             git(&work, &["fetch", "--quiet", "origin"]);
-            git(&work, &["checkout", "--quiet", "-B", branch, &format!("origin/{branch}")]);
+            git(
+                &work,
+                &["checkout", "--quiet", "-B", branch, &format!("origin/{branch}")],
+            );
         } else {
             git(&work, &["checkout", "--quiet", "-B", branch]);
         }
@@ -86,7 +103,16 @@ impl Forge {
         let work = self.folder.path().join(".work").join(repository);
         git(&work, &["add", "--all"]);
         git(&work, &["commit", "--quiet", "--allow-empty", "--message", "test"]);
-        git(&work, &["push", "--quiet", "--force", "origin", &format!("{branch}:refs/heads/{branch}")]);
+        git(
+            &work,
+            &[
+                "push",
+                "--quiet",
+                "--force",
+                "origin",
+                &format!("{branch}:refs/heads/{branch}"),
+            ],
+        );
         git(&work, &["rev-parse", "HEAD"]).trim().to_owned()
     }
 
@@ -100,13 +126,19 @@ impl Forge {
 
     /// Tags the head of a branch.
     pub fn tag(&self, repository: &str, name: &str, branch: &str) {
-        git(&self.bare(repository), &["tag", "--annotate", "--message", "test", name, branch]);
+        git(
+            &self.bare(repository),
+            &["tag", "--annotate", "--message", "test", name, branch],
+        );
     }
 }
 
 /// Whether a repository has a reference.
 fn exists(bare: &Path, reference: &str) -> bool {
-    let asked = Command::new("git").current_dir(bare).args(["show-ref", "--quiet", "--verify", reference]).status();
+    let asked = Command::new("git")
+        .current_dir(bare)
+        .args(["show-ref", "--quiet", "--verify", reference])
+        .status();
     asked.unwrap().success()
 }
 
@@ -127,8 +159,24 @@ pub fn arm_at(reference: &str) -> String {
 
 /// Runs git in a folder; returns its output.
 pub fn git(folder: &Path, arguments: &[&str]) -> String {
-    let fixed = ["-c", "user.name=Test", "-c", "user.email=test@localhost", "-c", "commit.gpgSign=false"];
-    let output = Command::new("git").current_dir(folder).args(fixed).args(arguments).output().unwrap();
-    assert!(output.status.success(), "git {arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
+    let fixed = [
+        "-c",
+        "user.name=Test",
+        "-c",
+        "user.email=test@localhost",
+        "-c",
+        "commit.gpgSign=false",
+    ];
+    let output = Command::new("git")
+        .current_dir(folder)
+        .args(fixed)
+        .args(arguments)
+        .output()
+        .unwrap();
+    assert!(
+        output.status.success(),
+        "git {arguments:?}: {}",
+        String::from_utf8_lossy(&output.stderr)
+    );
     String::from_utf8(output.stdout).unwrap()
 }

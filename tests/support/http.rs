@@ -68,5 +68,9 @@ fn client() -> awc::Client {
 async fn read(request: awc::ClientRequest) -> Result<Answer, String> {
     let mut answer = request.send().await.map_err(|error| error.to_string())?;
     let body = answer.body().limit(64 << 20).await.map_err(|error| error.to_string())?;
-    Ok(Answer { status: answer.status(), headers: answer.headers().clone(), body })
+    Ok(Answer {
+        status: answer.status(),
+        headers: answer.headers().clone(),
+        body,
+    })
 }

@@ -20,7 +20,11 @@ impl Request {
     /// The value of a header, whose name is given in lower case; empty if it is missing.
     pub fn header(&self, name: &str) -> &str {
         let headers = self.head.lines().filter_map(|line| line.split_once(": "));
-        headers.filter(|(other, _)| other.to_lowercase() == name).map(|(_, value)| value).next().unwrap_or_default()
+        headers
+            .filter(|(other, _)| other.to_lowercase() == name)
+            .map(|(_, value)| value)
+            .next()
+            .unwrap_or_default()
     }
 }
 
@@ -30,7 +34,9 @@ pub fn listen(listener: TcpListener, mut answer: impl FnMut(Request) -> Option<(
         for connection in listener.incoming().flatten() {
             // The client broke off its request.
             let Some(request) = read(&connection) else { continue };
-            let Some((status, content)) = answer(request) else { return };
+            let Some((status, content)) = answer(request) else {
+                return;
+            };
             write(&connection, &format!("{status} -"), content.as_bytes());
         }
     });
@@ -64,7 +70,12 @@ fn exchange(stream: &mut (impl Read + Write), answer: &impl Fn(&Request) -> Opti
 }
 
 fn write(mut stream: impl Write, head: &str, content: &[u8]) -> Option<()> {
-    write!(stream, "HTTP/1.1 {head}\r\nContent-Length: {}\r\nConnection: close\r\n\r\n", content.len()).ok()?;
+    write!(
+        stream,
+        "HTTP/1.1 {head}\r\nContent-Length: {}\r\nConnection: close\r\n\r\n",
+        content.len()
+    )
+    .ok()?;
     stream.write_all(content).ok()
 }
 
@@ -76,7 +87,10 @@ fn read(stream: impl Read) -> Option<Request> {
             return None;
         }
     }
-    let mut request = Request { head, content: Vec::new() };
+    let mut request = Request {
+        head,
+        content: Vec::new(),
+    };
     request.content = vec![0; request.header("content-length").parse().unwrap_or(0)];
     reader.read_exact(&mut request.content).ok()?;
     Some(request)

@@ -2,7 +2,12 @@
 //!
 //! Everything that a test starts ends with it. A failed test prints the logs of the programs that it started.
 
-#![allow(dead_code, unused_imports, unused_macros, reason = "each test crate uses its own part of this")]
+#![allow(
+    dead_code,
+    unused_imports,
+    unused_macros,
+    reason = "each test crate uses its own part of this"
+)]
 
 /// Skips a test, or a part of it that then returns `nothing`, and says so if a program is missing. Fails if CI is set:
 /// CI tests everything.
@@ -78,7 +83,11 @@ pub fn shared_library(source: &str, name: &str) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests").join(source);
     let mut compiler = Command::new("cc");
-    let made = compiler.args(["-shared", "-fPIC", "-O1", "-o"]).arg(folder.path().join(name)).arg(source).status();
+    let made = compiler
+        .args(["-shared", "-fPIC", "-O1", "-o"])
+        .arg(folder.path().join(name))
+        .arg(source)
+        .status();
     assert!(made.unwrap().success());
     folder
 }
@@ -87,7 +96,9 @@ pub fn shared_library(source: &str, name: &str) -> tempfile::TempDir {
 pub fn programs(names: &[&str]) -> tempfile::TempDir {
     let (folder, paths) = (open_folder(), std::env::var_os("PATH").unwrap());
     for name in names {
-        let real = std::env::split_paths(&paths).map(|folder| folder.join(name)).find(|path| path.is_file());
+        let real = std::env::split_paths(&paths)
+            .map(|folder| folder.join(name))
+            .find(|path| path.is_file());
         let real = real.unwrap_or_else(|| panic!("this test needs {name}"));
         std::os::unix::fs::symlink(real, folder.path().join(name)).unwrap();
     }
@@ -97,7 +108,9 @@ pub fn programs(names: &[&str]) -> tempfile::TempDir {
 /// Reports that a test or a part of it is skipped, and why. `eprintln!` would be shown only if the test fails.
 pub fn skip(why: &str) {
     let test = std::thread::current().name().unwrap_or_default().to_owned();
-    std::io::stderr().write_all(format!("SKIPPED, for {why}: {test}\n").as_bytes()).unwrap();
+    std::io::stderr()
+        .write_all(format!("SKIPPED, for {why}: {test}\n").as_bytes())
+        .unwrap();
 }
 
 /// Whether a condition becomes true within [`SOON`].

@@ -22,9 +22,17 @@ pub struct NameServer {
 
 /// The command that creates a mount namespace, if this machine allows it: for root, or in a user namespace.
 fn own_mounts() -> Option<&'static str> {
-    let works =
-        |command: &&str| Command::new("sh").args(["-c", &format!("{command} true")]).output().unwrap().status.success();
-    ["unshare --mount", "unshare --mount --map-root-user"].into_iter().find(works)
+    let works = |command: &&str| {
+        Command::new("sh")
+            .args(["-c", &format!("{command} true")])
+            .output()
+            .unwrap()
+            .status
+            .success()
+    };
+    ["unshare --mount", "unshare --mount --map-root-user"]
+        .into_iter()
+        .find(works)
 }
 
 /// A loopback address for a name server of this process alone; `None` if this process may not use the port.
@@ -60,7 +68,11 @@ impl NameServer {
         };
         let folder = tempfile::tempdir().unwrap();
         std::fs::write(folder.path().join("hosts"), "").unwrap();
-        let mut server = Self { child: None, folder, address };
+        let mut server = Self {
+            child: None,
+            folder,
+            address,
+        };
         server.start_again();
         Some(server)
     }
@@ -70,9 +82,17 @@ impl NameServer {
         let user = nix::unistd::User::from_uid(nix::unistd::getuid()).unwrap().unwrap();
         let mut command = Command::new("dnsmasq");
         // Its answers have a TTL of ten minutes, as those of Docker Swarm do.
-        command.args(["--keep-in-foreground", "--conf-file=/dev/null", "--no-resolv", "--no-hosts", "--local-ttl=600"]);
+        command.args([
+            "--keep-in-foreground",
+            "--conf-file=/dev/null",
+            "--no-resolv",
+            "--no-hosts",
+            "--local-ttl=600",
+        ]);
         command.args(["--bind-interfaces", "--local=/test/", "--pid-file="]);
-        command.arg(format!("--listen-address={}", self.address)).arg(format!("--user={}", user.name));
+        command
+            .arg(format!("--listen-address={}", self.address))
+            .arg(format!("--user={}", user.name));
         command.arg(format!("--addn-hosts={}", self.folder.path().join("hosts").display()));
         self.child = Some(command.stdin(Stdio::null()).spawn().unwrap());
         // A signal before it listens would end it.

@@ -17,7 +17,10 @@ impl Network {
             return None;
         }
         unshare(CloneFlags::CLONE_NEWNET).unwrap();
-        assert!(done("ip", &["link", "set", "lo", "up"]), "the loopback is not to be had");
+        assert!(
+            done("ip", &["link", "set", "lo", "up"]),
+            "the loopback is not to be had"
+        );
         Some(Self(()))
     }
 
@@ -26,8 +29,23 @@ impl Network {
         for ports in ports {
             for side in ["--sport", "--dport"] {
                 let share = share.to_string();
-                let arguments = ["-w", "-A", "INPUT", "-p", "tcp", side, ports, "-m", "statistic", "--mode", "random"];
-                assert!(done("iptables", &[&arguments[..], &["--probability", &share, "-j", "DROP"]].concat()));
+                let arguments = [
+                    "-w",
+                    "-A",
+                    "INPUT",
+                    "-p",
+                    "tcp",
+                    side,
+                    ports,
+                    "-m",
+                    "statistic",
+                    "--mode",
+                    "random",
+                ];
+                assert!(done(
+                    "iptables",
+                    &[&arguments[..], &["--probability", &share, "-j", "DROP"]].concat()
+                ));
             }
         }
         Lost
@@ -46,6 +64,10 @@ impl Drop for Lost {
 
 fn done(program: &str, arguments: &[&str]) -> bool {
     let mut command = Command::new(program);
-    command.args(arguments).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
+    command
+        .args(arguments)
+        .stdin(Stdio::null())
+        .stdout(Stdio::null())
+        .stderr(Stdio::null());
     command.status().is_ok_and(|status| status.success())
 }

@@ -9,7 +9,9 @@ pub fn page(name: &str) -> String {
 
 /// The text below a heading such as `## Kubernetes`.
 pub fn section(page: &str, heading: &str) -> String {
-    let (_, rest) = page.split_once(&format!("\n{heading}\n")).unwrap_or_else(|| panic!("there is no {heading}"));
+    let (_, rest) = page
+        .split_once(&format!("\n{heading}\n"))
+        .unwrap_or_else(|| panic!("there is no {heading}"));
     rest.split("\n## ").next().unwrap().to_owned()
 }
 
@@ -24,9 +26,11 @@ pub fn blocks(page: &str, language: &str) -> Vec<String> {
                 blocks.extend(is_wanted.then_some(block));
                 None
             }
-            (Some((is_wanted, indentation, block)), None) => {
-                Some((is_wanted, indentation, block + line.get(indentation..).unwrap_or_default() + "\n"))
-            }
+            (Some((is_wanted, indentation, block)), None) => Some((
+                is_wanted,
+                indentation,
+                block + line.get(indentation..).unwrap_or_default() + "\n",
+            )),
             (None, None) => None,
         };
     }

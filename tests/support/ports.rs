@@ -14,12 +14,22 @@ const LAST: u16 = 21_000;
 pub fn block(count: u16) -> u16 {
     // The next port is in a file that the processes of all tests lock.
     let path = std::env::temp_dir().join(format!("webots-fleet-test-ports-{}", nix::unistd::getuid()));
-    let file = File::options().create(true).truncate(false).read(true).write(true).open(&path).unwrap();
-    let _locked = Flock::lock(file, FlockArg::LockExclusive).map_err(|(_, error)| error).unwrap();
+    let file = File::options()
+        .create(true)
+        .truncate(false)
+        .read(true)
+        .write(true)
+        .open(&path)
+        .unwrap();
+    let _locked = Flock::lock(file, FlockArg::LockExclusive)
+        .map_err(|(_, error)| error)
+        .unwrap();
     let next = std::fs::read_to_string(&path).unwrap().trim().parse().unwrap_or(FIRST);
     let free = |port| TcpListener::bind((Ipv4Addr::UNSPECIFIED, port)).is_ok();
     let starts = (next..LAST - count).chain(FIRST..next);
-    let first = starts.step_by(usize::from(count)).find(|first| (*first..first + count).all(free));
+    let first = starts
+        .step_by(usize::from(count))
+        .find(|first| (*first..first + count).all(free));
     let first = first.unwrap_or_else(|| panic!("no {count} free ports in a row"));
     std::fs::write(&path, (first + count).to_string()).unwrap();
     first

@@ -71,7 +71,10 @@ pub fn demo_server(places: u16) -> Builder {
 pub fn server_of(webots: Webots, places: u16) -> Builder {
     let forge = Forge::with_arm();
     let builder = simulation_server(&webots.path(), forge.path(), places);
-    Builder { parts: Some((forge, webots)), ..builder }
+    Builder {
+        parts: Some((forge, webots)),
+        ..builder
+    }
 }
 
 /// A server with one slot, whose simulation reaches a state, as servers call it, and stays there. In `checkingout` it
@@ -83,7 +86,10 @@ pub fn server_that_is(state: &str) -> (Builder, Option<TcpListener>) {
     }
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let mirror = format!("https://127.0.0.1:{}/", listener.local_addr().unwrap().port());
-    (builder.set("gitMirrors", serde_json::json!({"https://github.com/": mirror})), Some(listener))
+    (
+        builder.set("gitMirrors", serde_json::json!({"https://github.com/": mirror})),
+        Some(listener),
+    )
 }
 
 impl Builder {
@@ -91,7 +97,16 @@ impl Builder {
         let name = program.rsplit('/').next().unwrap();
         // An unused display: sandboxes would otherwise get one that other tests start and end.
         let environment = vec![("DISPLAY".to_owned(), ":59000".to_owned())];
-        Self { program, name, config, port, environment, folder: None, before: None, parts: None }
+        Self {
+            program,
+            name,
+            config,
+            port,
+            environment,
+            folder: None,
+            before: None,
+            parts: None,
+        }
     }
 
     pub fn forge(&self) -> &Forge {
@@ -107,7 +122,9 @@ impl Builder {
 
     /// Makes a session server send mails to an SMTP server on this machine.
     pub fn mails_to(self, port: u16) -> Self {
-        let addressed = self.set("administrator", "admin@example.org").set("mailSender", "fleet@example.org");
+        let addressed = self
+            .set("administrator", "admin@example.org")
+            .set("mailSender", "fleet@example.org");
         addressed.set("mailServer", "127.0.0.1").set("mailServerPort", port)
     }
 
@@ -157,9 +174,16 @@ impl Builder {
         // Some tests with a thousand connections run in parallel with others.
         raise_file_limit();
         let temporary = self.folder.is_none().then(|| tempfile::tempdir().unwrap());
-        let folder = self.folder.take().unwrap_or_else(|| temporary.as_ref().unwrap().path().to_owned());
+        let folder = self
+            .folder
+            .take()
+            .unwrap_or_else(|| temporary.as_ref().unwrap().path().to_owned());
         let file = self.write(&folder);
-        let log = File::options().create(true).append(true).open(folder.join("output.txt")).unwrap();
+        let log = File::options()
+            .create(true)
+            .append(true)
+            .open(folder.join("output.txt"))
+            .unwrap();
         let mut command = Command::new(if self.before.is_some() { "bash" } else { self.program });
         if let Some(script) = &self.before {
             command.args(["-c", &format!("{script}\nexec \"$0\" \"$@\""), self.program]);
@@ -172,7 +196,14 @@ impl Builder {
             .stderr(log)
             .spawn()
             .unwrap();
-        Server { child, folder, port: self.port, name: self.name, _temporary: temporary, _parts: self.parts }
+        Server {
+            child,
+            folder,
+            port: self.port,
+            name: self.name,
+            _temporary: temporary,
+            _parts: self.parts,
+        }
     }
 
     /// Starts the program, which must end with this exit code and one error line. It may print log lines too, but none
@@ -229,13 +260,22 @@ impl Server {
     /// The direct child processes.
     pub fn children(&self) -> Vec<i32> {
         let all = procfs::process::all_processes().unwrap().flatten();
-        all.filter(|one| one.stat().is_ok_and(|stat| stat.ppid == self.pid())).map(|one| one.pid()).collect()
+        all.filter(|one| one.stat().is_ok_and(|stat| stat.ppid == self.pid()))
+            .map(|one| one.pid())
+            .collect()
     }
 
     /// The child process that ends the simulations if the server dies.
     pub fn guardian(&self) -> i32 {
-        let words = |pid: &i32| procfs::process::Process::new(*pid).and_then(|one| one.cmdline()).unwrap_or_default();
-        self.children().into_iter().find(|pid| words(pid).get(1).is_some_and(|word| word == "guard")).unwrap()
+        let words = |pid: &i32| {
+            procfs::process::Process::new(*pid)
+                .and_then(|one| one.cmdline())
+                .unwrap_or_default()
+        };
+        self.children()
+            .into_iter()
+            .find(|pid| words(pid).get(1).is_some_and(|word| word == "guard"))
+            .unwrap()
     }
 
     /// Sends a signal to the server itself.
@@ -261,8 +301,14 @@ impl Server {
 
     /// Waits until this many simulations wait for their clients to resume them.
     pub async fn until_away(&self, count: usize) {
-        let are_away =
-            async || self.simulations().await.iter().filter(|one| one["awayUntil"].is_u64()).count() == count;
+        let are_away = async || {
+            self.simulations()
+                .await
+                .iter()
+                .filter(|one| one["awayUntil"].is_u64())
+                .count()
+                == count
+        };
         super::until(&format!("{count} are away"), are_away).await;
     }
 
@@ -296,12 +342,18 @@ impl Server {
 
     /// The output file of a running simulation.
     pub fn output_file(&self, client: &super::client::Client) -> PathBuf {
-        self.folder.join(format!("log/simulation/instances/{}.log", client.id()))
+        self.folder
+            .join(format!("log/simulation/instances/{}.log", client.id()))
     }
 
     /// Makes a session server reload its configuration with these keys changed.
     pub fn reload(&self, keys: Value) {
-        self.rewrite_config(|config| config.as_object_mut().unwrap().extend(keys.as_object().unwrap().clone()));
+        self.rewrite_config(|config| {
+            config
+                .as_object_mut()
+                .unwrap()
+                .extend(keys.as_object().unwrap().clone())
+        });
         self.signal(Signal::SIGHUP);
     }
 

@@ -29,12 +29,19 @@ impl Receiver {
     pub fn start(certificate: Option<&Certificate>) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let port = listener.local_addr().unwrap().port();
-        let receiver = Self { port, posted: Arc::default(), answer: Arc::new(Mutex::new("200 OK".to_owned())) };
+        let receiver = Self {
+            port,
+            posted: Arc::default(),
+            answer: Arc::new(Mutex::new("200 OK".to_owned())),
+        };
         let (posted, answer) = (Arc::clone(&receiver.posted), Arc::clone(&receiver.answer));
         serve(listener, certificate.map(Certificate::server), move |request| {
             assert_eq!(request.header("content-type"), "application/json");
             let line = request.head.lines().next().unwrap().to_owned();
-            posted.lock().push(Posted { line, body: serde_json::from_slice(&request.content).unwrap() });
+            posted.lock().push(Posted {
+                line,
+                body: serde_json::from_slice(&request.content).unwrap(),
+            });
             Some((answer.lock().clone(), Vec::new()))
         });
         receiver

@@ -33,7 +33,12 @@ impl Smtp {
         let (output, errors) = (child.stdout.take().unwrap(), child.stderr.take().unwrap());
         tell_lines(output, sender.clone(), |line| serde_json::from_str(&line).unwrap());
         tell_lines(errors, sender, |line| json!({"stderr": line}));
-        let mut server = Self { child, events, told: Vec::new(), port: 0 };
+        let mut server = Self {
+            child,
+            events,
+            told: Vec::new(),
+            port: 0,
+        };
         let port = server.wait_for("port").await;
         server.port = u16::try_from(port.as_u64().unwrap()).unwrap();
         server
@@ -80,7 +85,11 @@ impl Smtp {
         commands
             .map(|event| {
                 let name = event["command"].as_str().unwrap();
-                if event["encrypted"] == true { format!("{name}*") } else { name.to_owned() }
+                if event["encrypted"] == true {
+                    format!("{name}*")
+                } else {
+                    name.to_owned()
+                }
             })
             .collect()
     }
@@ -114,13 +123,21 @@ impl Mail {
     }
 
     pub fn recipients(&self) -> Vec<&str> {
-        self.0["to"].as_array().unwrap().iter().map(|to| to.as_str().unwrap()).collect()
+        self.0["to"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .map(|to| to.as_str().unwrap())
+            .collect()
     }
 
     /// The values of a header.
     pub fn header(&self, name: &str) -> Vec<&str> {
         let headers = self.0["headers"].as_array().unwrap().iter();
-        headers.filter(|header| header[0] == name).map(|header| header[1].as_str().unwrap()).collect()
+        headers
+            .filter(|header| header[0] == name)
+            .map(|header| header[1].as_str().unwrap())
+            .collect()
     }
 
     pub fn subject(&self) -> &str {

@@ -59,8 +59,10 @@ impl StandIn {
 
     /// Starts a stand-in that is reachable only over TLS, with this certificate for `localhost`.
     pub async fn start_behind_tls(script: Script, certificate: &Certificate) -> Self {
-        let (listener, door) =
-            (TcpListener::bind("127.0.0.1:0").await.unwrap(), TcpListener::bind("127.0.0.1:0").await.unwrap());
+        let (listener, door) = (
+            TcpListener::bind("127.0.0.1:0").await.unwrap(),
+            TcpListener::bind("127.0.0.1:0").await.unwrap(),
+        );
         let address = format!("localhost:{}", door.local_addr().unwrap().port());
         let behind = listener.local_addr().unwrap();
         let acceptor = TlsAcceptor::from(certificate.server());
@@ -69,7 +71,9 @@ impl StandIn {
                 let acceptor = acceptor.clone();
                 actix_rt::spawn(async move {
                     // A client that does not trust the certificate closes the connection.
-                    let Ok(mut outside) = acceptor.accept(socket).await else { return };
+                    let Ok(mut outside) = acceptor.accept(socket).await else {
+                        return;
+                    };
                     let mut inside = TcpStream::connect(behind).await.unwrap();
                     tokio::io::copy_bidirectional(&mut outside, &mut inside).await.ok();
                 });
@@ -80,7 +84,11 @@ impl StandIn {
 
     fn serve(script: Script, listener: TcpListener, address: String) -> Self {
         let asked = Arc::default();
-        let part = Part { script, address: address.clone(), asked: Arc::clone(&asked) };
+        let part = Part {
+            script,
+            address: address.clone(),
+            asked: Arc::clone(&asked),
+        };
         actix_rt::spawn(async move {
             while let Ok((socket, _)) = listener.accept().await {
                 actix_rt::spawn(part.clone().answer(socket));
@@ -91,7 +99,13 @@ impl StandIn {
 
     /// The requested paths that begin like this, in order.
     pub fn asked(&self, begin: &str) -> Vec<String> {
-        self.asked.lock().unwrap().iter().filter(|path| path.starts_with(begin)).cloned().collect()
+        self.asked
+            .lock()
+            .unwrap()
+            .iter()
+            .filter(|path| path.starts_with(begin))
+            .cloned()
+            .collect()
     }
 }
 
@@ -110,7 +124,11 @@ impl Part {
         let before = {
             let mut asked = self.asked.lock().unwrap();
             asked.push(path.clone());
-            asked.iter().filter(|one| one.starts_with("/session")).count().saturating_sub(1)
+            asked
+                .iter()
+                .filter(|one| one.starts_with("/session"))
+                .count()
+                .saturating_sub(1)
         };
         if head.to_lowercase().contains("upgrade: websocket") {
             return self.talk(socket, &path).await;
@@ -120,8 +138,14 @@ impl Part {
             "/load" => "1.0".to_owned(),
             _ => self.fill(self.script.session[before.min(self.script.session.len() - 1)]),
         };
-        let head = format!("HTTP/1.1 200 OK\r\nContent-Length: {}\r\nConnection: close", content.len());
-        socket.write_all(format!("{head}\r\n\r\n{content}").as_bytes()).await.ok()
+        let head = format!(
+            "HTTP/1.1 200 OK\r\nContent-Length: {}\r\nConnection: close",
+            content.len()
+        );
+        socket
+            .write_all(format!("{head}\r\n\r\n{content}").as_bytes())
+            .await
+            .ok()
     }
 
     async fn talk(self, socket: TcpStream, path: &str) -> Option<()> {

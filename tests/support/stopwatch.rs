@@ -38,7 +38,11 @@ impl Stopwatch {
 
     /// Starts a measurement.
     pub fn lap(&self) -> Lap<'_> {
-        Lap { watch: self, begin: Instant::now(), held_up: self.held_up() }
+        Lap {
+            watch: self,
+            begin: Instant::now(),
+            held_up: self.held_up(),
+        }
     }
 
     fn held_up(&self) -> Duration {

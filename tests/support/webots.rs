@@ -50,7 +50,9 @@ pub fn instances_below(folder: &Path) -> Vec<(i32, String)> {
     processes
         .filter(|process| {
             let environment = process.environ().unwrap_or_default();
-            environment.get(mark).is_some_and(|value| Path::new(value).starts_with(&folder))
+            environment
+                .get(mark)
+                .is_some_and(|value| Path::new(value).starts_with(&folder))
         })
         .map(|process| (process.pid(), process.cmdline().unwrap_or_default().join(" ")))
         .collect()
@@ -58,7 +60,13 @@ pub fn instances_below(folder: &Path) -> Vec<(i32, String)> {
 
 /// The instance directories in a cache.
 pub fn instance_folders_in(cache: &Path) -> Vec<PathBuf> {
-    let inside = |folder: PathBuf| std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
+    let inside = |folder: PathBuf| {
+        std::fs::read_dir(folder)
+            .into_iter()
+            .flatten()
+            .flatten()
+            .map(|entry| entry.path())
+    };
     let runs = inside(cache.join("runs"));
     let is_instance = |path: &PathBuf| path.file_name().unwrap().to_string_lossy().starts_with("instance-");
     runs.flat_map(inside).filter(is_instance).collect()

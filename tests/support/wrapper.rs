@@ -17,11 +17,16 @@ impl Wrapper {
     pub fn of(program: &str, script: &str) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let paths = std::env::var_os("PATH").unwrap();
-        let real =
-            std::env::split_paths(&paths).map(|folder| folder.join(program)).find(|path| path.is_file()).unwrap();
+        let real = std::env::split_paths(&paths)
+            .map(|folder| folder.join(program))
+            .find(|path| path.is_file())
+            .unwrap();
         let (real, log) = (real.display(), folder.path().join("calls"));
         let note = format!("REAL={real}\necho \"$*\" >> {}", log.display());
-        make_program(&folder.path().join(program), &format!("{note}\n{script}\nexec \"$REAL\" \"$@\""));
+        make_program(
+            &folder.path().join(program),
+            &format!("{note}\n{script}\nexec \"$REAL\" \"$@\""),
+        );
         Self { folder }
     }
 

@@ -8,8 +8,15 @@ use crate::clock::Mode;
 
 /// The demo simulator behaves like Webots towards a simulation server and its clients.
 #[derive(Debug, Parser)]
-#[command(name = "webots", override_usage = "webots [options] [worldfile]", args_override_self = true)]
-#[expect(clippy::struct_excessive_bools, reason = "each is an independent switch of the command line")]
+#[command(
+    name = "webots",
+    override_usage = "webots [options] [worldfile]",
+    args_override_self = true
+)]
+#[expect(
+    clippy::struct_excessive_bools,
+    reason = "each is an independent switch of the command line"
+)]
 pub(crate) struct Args {
     /// World file to simulate
     #[arg(required_unless_present_any = ["version", "sysinfo"])]

@@ -88,7 +88,13 @@ impl Client {
         static NEXT_ID: AtomicU64 = AtomicU64::new(1);
         let id = ClientId(NEXT_ID.fetch_add(1, Ordering::Relaxed));
         let [incoming, updates] = [MAX_INCOMING, MAX_UPDATES].map(|permits| Arc::new(Semaphore::new(permits)));
-        Self { id, simulation, incoming, updates, closing: false }
+        Self {
+            id,
+            simulation,
+            incoming,
+            updates,
+            closing: false,
+        }
     }
 
     fn receive(&self, text: ByteString, ctx: &mut WebsocketContext<Self>) {
@@ -112,7 +118,10 @@ impl Actor for Client {
 
     fn started(&mut self, ctx: &mut Self::Context) {
         ctx.set_mailbox_capacity(MAX_OUTGOING);
-        let handle = ClientHandle { client: ctx.address().recipient(), updates: Arc::clone(&self.updates) };
+        let handle = ClientHandle {
+            client: ctx.address().recipient(),
+            updates: Arc::clone(&self.updates),
+        };
         self.simulation.do_send(Event::Connected(self.id, handle));
     }
 

@@ -27,7 +27,14 @@ struct Connected {
 impl Clients {
     /// Adds a client, which gets no broadcasts yet.
     pub(crate) fn add(&mut self, id: ClientId, handle: ClientHandle) {
-        self.connected.insert(id, Connected { handle, watching: false, missed_update: false });
+        self.connected.insert(
+            id,
+            Connected {
+                handle,
+                watching: false,
+                missed_update: false,
+            },
+        );
     }
 
     /// Removes a disconnected client.

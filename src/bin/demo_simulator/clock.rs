@@ -53,7 +53,13 @@ pub(crate) struct Clock {
 impl Clock {
     /// A clock at time 0, whose steps are `step` milliseconds long.
     pub(crate) fn new(mode: Mode, step: f64) -> Self {
-        Self { mode, step, now: 0.0, pause_at: f64::INFINITY, remainder: 0.0 }
+        Self {
+            mode,
+            step,
+            now: 0.0,
+            pause_at: f64::INFINITY,
+            remainder: 0.0,
+        }
     }
 
     /// Simulation time, in milliseconds.
@@ -85,7 +91,10 @@ impl Clock {
     /// Sets the time to 0 for another world, in the same mode and with the same time to the timeout.
     pub(crate) fn restart(&mut self, step: f64) {
         let remaining = (self.pause_at - self.now).max(0.0);
-        *self = Self { pause_at: remaining, ..Self::new(self.mode, step) };
+        *self = Self {
+            pause_at: remaining,
+            ..Self::new(self.mode, step)
+        };
     }
 
     /// Makes one step, in any mode.
@@ -148,10 +157,18 @@ mod tests {
         for (timeout, expected) in [(0.0, 32.0), (32.0, 32.0), (33.0, 64.0), (100.0, 128.0)] {
             let mut clock = Clock::new(Mode::Fast, 32.0);
             clock.set_timeout(timeout);
-            assert_eq!(clock.advance(Duration::from_millis(100)), Progress::TimedOut, "{timeout}");
+            assert_eq!(
+                clock.advance(Duration::from_millis(100)),
+                Progress::TimedOut,
+                "{timeout}"
+            );
             assert_eq!((clock.now(), clock.mode()), (expected, Mode::Pause), "{timeout}");
             clock.set_mode(Mode::Fast);
-            assert_eq!(clock.advance(Duration::from_millis(100)), Progress::Advanced, "it pauses only once");
+            assert_eq!(
+                clock.advance(Duration::from_millis(100)),
+                Progress::Advanced,
+                "it pauses only once"
+            );
         }
     }
 

@@ -12,7 +12,9 @@ use percent_encoding::percent_decode_str;
 use crate::client::{Client, Event};
 
 /// The extensions of the files that are served: what a client needs to draw a scene.
-const EXTENSIONS: [&str; 11] = ["png", "jpg", "jpeg", "ico", "html", "css", "js", "dae", "obj", "mtl", "stl"];
+const EXTENSIONS: [&str; 11] = [
+    "png", "jpg", "jpeg", "ico", "html", "css", "js", "dae", "obj", "mtl", "stl",
+];
 const NOT_FOUND: &str = include_str!("../../../templates/demo/not_found.html");
 
 /// The directory whose files are served, without symlinks.
@@ -42,7 +44,8 @@ impl ProjectFolder {
 
 /// Adds the routes to an application.
 pub(crate) fn configure(app: &mut web::ServiceConfig) {
-    app.route("/", web::get().to(open_websocket)).default_service(web::get().to(send_file));
+    app.route("/", web::get().to(open_websocket))
+        .default_service(web::get().to(send_file));
 }
 
 async fn open_websocket(
@@ -62,9 +65,18 @@ async fn send_file(request: HttpRequest, project: web::Data<ProjectFolder>) -> H
             .content_type("text/html; charset=utf-8")
             .body(NOT_FOUND);
     };
-    let mut response = file.use_last_modified(false).disable_content_disposition().into_response(&request);
+    let mut response = file
+        .use_last_modified(false)
+        .disable_content_disposition()
+        .into_response(&request);
     let headers = response.headers_mut();
-    headers.insert(header::ACCESS_CONTROL_ALLOW_ORIGIN, header::HeaderValue::from_static("*"));
-    headers.insert(header::CACHE_CONTROL, header::HeaderValue::from_static("public, max-age=3600"));
+    headers.insert(
+        header::ACCESS_CONTROL_ALLOW_ORIGIN,
+        header::HeaderValue::from_static("*"),
+    );
+    headers.insert(
+        header::CACHE_CONTROL,
+        header::HeaderValue::from_static("public, max-age=3600"),
+    );
     response
 }

@@ -40,14 +40,21 @@ impl Robot {
             y - self.radius * (angle.cos() - self.heading.cos()),
             z,
         ];
-        Pose { id: self.id, translation: text(&translation), rotation: text(&[0.0, 0.0, 1.0, angle % TAU]) }
+        Pose {
+            id: self.id,
+            translation: text(&translation),
+            rotation: text(&[0.0, 0.0, 1.0, angle % TAU]),
+        }
     }
 }
 
 /// The numbers, rounded to 0.0001.
 fn text(numbers: &[f64]) -> String {
     // adding zero makes 0 of -0
-    let texts: Vec<String> = numbers.iter().map(|number| ((number * 1e4).round() / 1e4 + 0.0).to_string()).collect();
+    let texts: Vec<String> = numbers
+        .iter()
+        .map(|number| ((number * 1e4).round() / 1e4 + 0.0).to_string())
+        .collect();
     texts.join(" ")
 }
 
@@ -58,7 +65,13 @@ mod tests {
     use super::*;
 
     fn pose(heading: f64, radius: f64, seconds: f64) -> (String, String) {
-        let robot = Robot { id: 1, start: [1.0, 2.0, 0.5], heading, radius, speed: 0.25 };
+        let robot = Robot {
+            id: 1,
+            start: [1.0, 2.0, 0.5],
+            heading,
+            radius,
+            speed: 0.25,
+        };
         let pose = robot.pose(seconds * 1000.0);
         (pose.translation, pose.rotation)
     }

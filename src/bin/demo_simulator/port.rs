@@ -21,7 +21,9 @@ pub(crate) fn listen(first: u16, console: Console) -> Result<TcpListener, Box<dy
         match TcpListener::bind(SocketAddr::new(address, port)) {
             Ok(listener) => {
                 if port != first {
-                    console.warning(format_args!("Could not listen to port {first}. Using port {port} instead."));
+                    console.warning(format_args!(
+                        "Could not listen to port {first}. Using port {port} instead."
+                    ));
                 }
                 console.info(format_args!("Streaming server listening on port {port}."));
                 return Ok(listener);
@@ -34,7 +36,9 @@ pub(crate) fn listen(first: u16, console: Console) -> Result<TcpListener, Box<dy
 
 fn bind_address() -> Result<IpAddr, String> {
     match env::var(BIND_VARIABLE) {
-        Ok(text) => text.parse().map_err(|_| format!("{BIND_VARIABLE} must be an IP address, not {text:?}")),
+        Ok(text) => text
+            .parse()
+            .map_err(|_| format!("{BIND_VARIABLE} must be an IP address, not {text:?}")),
         Err(_) => Ok(IpAddr::V4(Ipv4Addr::UNSPECIFIED)),
     }
 }

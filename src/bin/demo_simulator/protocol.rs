@@ -37,9 +37,9 @@ impl Command {
             "step" => Self::Step,
             "reset" => Self::Reset,
             "reload" | "revert" => Self::Reload,
-            _ if text.starts_with("x3d") || text.starts_with("w3d") => {
-                Self::Watch { broadcast: text.ends_with(";broadcast") }
-            }
+            _ if text.starts_with("x3d") || text.starts_with("w3d") => Self::Watch {
+                broadcast: text.ends_with(";broadcast"),
+            },
             _ => match text.split_once(':')? {
                 ("real-time", timeout) => Self::RealTime(parse_timeout(timeout)?),
                 ("fast", timeout) => Self::Fast(parse_timeout(timeout)?),
@@ -56,7 +56,9 @@ impl Command {
 
 fn parse_timeout(text: &str) -> Option<f64> {
     let timeout: f64 = text.trim().parse().ok()?;
-    timeout.is_finite().then_some(if timeout < 0.0 { f64::INFINITY } else { timeout })
+    timeout
+        .is_finite()
+        .then_some(if timeout < 0.0 { f64::INFINITY } else { timeout })
 }
 
 /// Answers `pause` and `step`.

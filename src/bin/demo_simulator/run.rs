@@ -52,8 +52,16 @@ fn fail(error: Box<dyn Error>) -> i32 {
 }
 
 async fn simulate(args: &Args) -> Result<(), Box<dyn Error>> {
-    let console = Console { stdout: args.stdout, stderr: args.stderr };
-    let kinds = [SignalKind::terminate(), SignalKind::interrupt(), SignalKind::hangup(), SignalKind::quit()];
+    let console = Console {
+        stdout: args.stdout,
+        stderr: args.stderr,
+    };
+    let kinds = [
+        SignalKind::terminate(),
+        SignalKind::interrupt(),
+        SignalKind::hangup(),
+        SignalKind::quit(),
+    ];
     let signals = kinds.into_iter().map(signal).collect::<Result<_, _>>()?;
     let listener = port::listen(args.port, console)?;
     if args.stream.is_some() && !args.batch {
@@ -95,7 +103,10 @@ fn serve(listener: TcpListener, simulation: Recipient<Event>, project: ProjectFo
     let simulation = web::Data::new(simulation);
     let project = web::Data::new(project);
     let server = HttpServer::new(move || {
-        App::new().app_data(simulation.clone()).app_data(project.clone()).configure(http::configure)
+        App::new()
+            .app_data(simulation.clone())
+            .app_data(project.clone())
+            .configure(http::configure)
     });
     Ok(server
         .workers(1)

@@ -69,7 +69,11 @@ struct Update {
 
 impl Default for Motion {
     fn default() -> Self {
-        Self { basic_time_step: 32.0, fps: 60.0, robots: BTreeMap::new() }
+        Self {
+            basic_time_step: 32.0,
+            fps: 60.0,
+            robots: BTreeMap::new(),
+        }
     }
 }
 
@@ -83,18 +87,31 @@ impl Scene {
             Some(text) => serde_json::from_str(&text)?,
             None => Motion::default(),
         };
-        Ok(Self { model: on_one_line(&model), motion })
+        Ok(Self {
+            model: on_one_line(&model),
+            motion,
+        })
     }
 
     fn built_in(world: &Path) -> Result<Self, SceneError> {
-        let title: String = world.file_name().unwrap_or_default().to_string_lossy().replace(char::is_control, "");
+        let title: String = world
+            .file_name()
+            .unwrap_or_default()
+            .to_string_lossy()
+            .replace(char::is_control, "");
         let model = DefaultModel { title: &title }.to_string();
-        Ok(Self { model: on_one_line(&model), motion: serde_json::from_str(DEFAULT_MOTION)? })
+        Ok(Self {
+            model: on_one_line(&model),
+            motion: serde_json::from_str(DEFAULT_MOTION)?,
+        })
     }
 
     /// The scene of a world that cannot be shown.
     pub(crate) fn empty() -> Self {
-        Self { model: on_one_line(EMPTY_MODEL), motion: Motion::default() }
+        Self {
+            model: on_one_line(EMPTY_MODEL),
+            motion: Motion::default(),
+        }
     }
 
     /// Length of a step, in milliseconds.
@@ -118,7 +135,10 @@ impl Scene {
 
 /// Returns a file's text; `None` if there is no such file.
 fn read(path: &Path) -> Result<Option<String>, SceneError> {
-    let unreadable = |source| SceneError::Unreadable { path: path.to_owned(), source };
+    let unreadable = |source| SceneError::Unreadable {
+        path: path.to_owned(),
+        source,
+    };
     let file = match File::open(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
         file => file.map_err(unreadable)?,

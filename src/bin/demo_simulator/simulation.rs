@@ -88,7 +88,10 @@ impl Handler<Event> for Simulation {
             Event::Received(..) if !self.stream => (),
             Event::Received(id, text, _permit) => match Command::parse(&text) {
                 Some(command) => self.obey(command, id, ctx),
-                None => self.error(&format!("Unsupported message: {:?}.", text.chars().take(100).collect::<String>())),
+                None => self.error(&format!(
+                    "Unsupported message: {:?}.",
+                    text.chars().take(100).collect::<String>()
+                )),
             },
         }
     }
@@ -225,7 +228,8 @@ impl Simulation {
             }
             // like Webots: the empty world replaces it
             (Err(error), _) => {
-                self.console.error(format_args!("'{}': {error}", self.file.path().display()));
+                self.console
+                    .error(format_args!("'{}': {error}", self.file.path().display()));
                 Scene::empty()
             }
         };
@@ -287,7 +291,8 @@ impl Simulation {
 
     fn send_update(&mut self) {
         if let Some(scene) = &self.scene {
-            self.clients.broadcast_update(protocol::update(&scene.update(self.clock.now())));
+            self.clients
+                .broadcast_update(protocol::update(&scene.update(self.clock.now())));
         }
     }
 }

@@ -48,7 +48,10 @@ impl WorldFile {
             Some(project) if folder.ends_with("worlds") => project,
             _ => folder,
         };
-        Self { project: project.to_owned(), path }
+        Self {
+            project: project.to_owned(),
+            path,
+        }
     }
 
     /// The absolute path of the world file.
@@ -64,21 +67,33 @@ impl WorldFile {
     /// Returns the world in the same directory with the file name of `path`, if there is one.
     pub(crate) fn sibling(&self, path: &str) -> Option<Self> {
         let path = self.path.with_file_name(Path::new(path).file_name()?);
-        (is_world(&path) && path.exists()).then(|| Self { path, project: self.project.clone() })
+        (is_world(&path) && path.exists()).then(|| Self {
+            path,
+            project: self.project.clone(),
+        })
     }
 
     /// Returns the names of the project's worlds. Blocks.
     pub(crate) fn names(&self) -> WorldNames {
         let folder = self.path.parent().and_then(|folder| fs::read_dir(folder).ok());
         let paths = folder.into_iter().flatten().flatten().map(|entry| entry.path());
-        let mut all: Vec<String> = paths.filter(|path| is_world(path)).map(|path| self.name(&path)).collect();
+        let mut all: Vec<String> = paths
+            .filter(|path| is_world(path))
+            .map(|path| self.name(&path))
+            .collect();
         all.sort();
-        WorldNames { current: self.name(&self.path), all }
+        WorldNames {
+            current: self.name(&self.path),
+            all,
+        }
     }
 
     /// Checks the world's first line and loads its scene. Blocks.
     pub(crate) fn load(&self) -> Result<Scene, WorldError> {
-        let header = self.read_header().map_err(|source| WorldError::Unreadable { path: self.path.clone(), source })?;
+        let header = self.read_header().map_err(|source| WorldError::Unreadable {
+            path: self.path.clone(),
+            source,
+        })?;
         if !is_header(&header) {
             return Err(WorldError::Header);
         }
@@ -100,7 +115,8 @@ impl WorldFile {
 }
 
 fn is_world(path: &Path) -> bool {
-    path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("wbt"))
+    path.extension()
+        .is_some_and(|extension| extension.eq_ignore_ascii_case("wbt"))
 }
 
 fn is_header(line: &str) -> bool {

@@ -75,10 +75,16 @@ impl Arguments {
     /// What can't be done, as text.
     pub(crate) fn prepare(&self) -> Result<(), String> {
         if !self.fleet.username().is_empty() || self.fleet.password().is_some() {
-            return Err("the session server's URL has a user name or a password, which nobody would be sent".to_owned());
+            return Err(
+                "the session server's URL has a user name or a password, which nobody would be sent".to_owned(),
+            );
         }
         if !self.yes && !is_localhost(&self.fleet) {
-            return Err(format!("{} is not this machine: --yes loads it with {}", self.fleet, self.summary()));
+            return Err(format!(
+                "{} is not this machine: --yes loads it with {}",
+                self.fleet,
+                self.summary()
+            ));
         }
         let clients = if self.explain { 1 } else { self.clients };
         let needed = u64::from(clients) * FILES.0 + FILES.1;
@@ -90,7 +96,9 @@ impl Arguments {
         }
         let Some(file) = &self.json else { return Ok(()) };
         let opened = std::fs::OpenOptions::new().create(true).append(true).open(file);
-        opened.map(drop).map_err(|error| format!("{} can't be written: {error}", file.display()))
+        opened
+            .map(drop)
+            .map_err(|error| format!("{} can't be written: {error}", file.display()))
     }
 
     /// A summary of the rehearsal: `200 clients within 1m, each for 10m`.
@@ -99,23 +107,45 @@ impl Arguments {
             return "one client".to_owned();
         }
         let words = |time| humantime::format_duration(time).to_string();
-        let how_long = self.soak.map(|soak| format!(", again and again for {}", words(soak))).unwrap_or_default();
-        let over = if self.over.is_zero() { "at once".to_owned() } else { format!("within {}", words(self.over)) };
-        format!("{} clients {over}, each for {}{how_long}", self.clients, words(self.stay))
+        let how_long = self
+            .soak
+            .map(|soak| format!(", again and again for {}", words(soak)))
+            .unwrap_or_default();
+        let over = if self.over.is_zero() {
+            "at once".to_owned()
+        } else {
+            format!("within {}", words(self.over))
+        };
+        format!(
+            "{} clients {over}, each for {}{how_long}",
+            self.clients,
+            words(self.stay)
+        )
     }
 }
 
 fn fleet(text: &str) -> Result<Url, String> {
     let url = Url::parse(text).map_err(|error| error.to_string())?;
     let is_usable = matches!(url.scheme(), "http" | "https") && url.has_host();
-    if is_usable { Ok(url) } else { Err("allowed is http://HOST:PORT or https://HOST".to_owned()) }
+    if is_usable {
+        Ok(url)
+    } else {
+        Err("allowed is http://HOST:PORT or https://HOST".to_owned())
+    }
 }
 
 fn time(text: &str) -> Result<Duration, String> {
     let time = humantime::parse_duration(text).map_err(|error| error.to_string())?;
-    if time <= LONGEST { Ok(time) } else { Err("allowed is up to 30d".to_owned()) }
+    if time <= LONGEST {
+        Ok(time)
+    } else {
+        Err("allowed is up to 30d".to_owned())
+    }
 }
 
 fn share(text: &str) -> Result<f64, String> {
-    text.parse().ok().filter(|share| (0.0..=1.0).contains(share)).ok_or_else(|| "allowed is 0 to 1".to_owned())
+    text.parse()
+        .ok()
+        .filter(|share| (0.0..=1.0).contains(share))
+        .ok_or_else(|| "allowed is 0 to 1".to_owned())
 }

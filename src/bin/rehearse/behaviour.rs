@@ -46,12 +46,22 @@ impl FromStr for Mix {
         let wrong = |part: &str| format!("{part:?} is no share; allowed is NAME=PERCENT of {}", names());
         let shares = text.split(',').filter(|part| !part.is_empty()).map(|part| {
             let (name, percent) = part.split_once('=').ok_or_else(|| wrong(part))?;
-            let (_, behaviour) = NAMES.iter().find(|(known, _)| *known == name).ok_or_else(|| wrong(part))?;
+            let (_, behaviour) = NAMES
+                .iter()
+                .find(|(known, _)| *known == name)
+                .ok_or_else(|| wrong(part))?;
             Ok((*behaviour, percent.parse().map_err(|_| wrong(part))?))
         });
         let mix = Self(shares.collect::<Result<_, String>>()?);
-        let sum = mix.0.iter().fold(0_u32, |sum, (_, percent)| sum.saturating_add(*percent));
-        if sum <= 100 { Ok(mix) } else { Err(format!("the shares are {sum} percent; allowed is up to 100")) }
+        let sum = mix
+            .0
+            .iter()
+            .fold(0_u32, |sum, (_, percent)| sum.saturating_add(*percent));
+        if sum <= 100 {
+            Ok(mix)
+        } else {
+            Err(format!("the shares are {sum} percent; allowed is up to 100"))
+        }
     }
 }
 
@@ -68,7 +78,10 @@ pub(crate) struct Draw {
 impl Draw {
     /// Draws from a mix.
     pub(crate) fn new(mix: Mix) -> Self {
-        Self { mix, random: SmallRng::seed_from_u64(1) }
+        Self {
+            mix,
+            random: SmallRng::seed_from_u64(1),
+        }
     }
 
     /// The behaviour of the next client.
@@ -93,8 +106,16 @@ mod tests {
         let mut draw = Draw::new("reload=20,vanish=30".parse().unwrap());
         let drawn: Vec<Behaviour> = std::iter::repeat_with(|| draw.next()).take(10_000).collect();
         let percent = |wanted| drawn.iter().filter(|one| **one == wanted).count() / 100;
-        for (behaviour, share) in [(Behaviour::Reload, 20), (Behaviour::Vanish, 30), (Behaviour::Ordinary, 50)] {
-            assert!(percent(behaviour).abs_diff(share) <= 2, "{behaviour:?}: {}", percent(behaviour));
+        for (behaviour, share) in [
+            (Behaviour::Reload, 20),
+            (Behaviour::Vanish, 30),
+            (Behaviour::Ordinary, 50),
+        ] {
+            assert!(
+                percent(behaviour).abs_diff(share) <= 2,
+                "{behaviour:?}: {}",
+                percent(behaviour)
+            );
         }
         assert_eq!(percent(Behaviour::Hasty), 0);
     }

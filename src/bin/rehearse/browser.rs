@@ -74,7 +74,15 @@ impl<'class> Browser<'class> {
             pace: Vec::new(),
             ended: asked,
         };
-        Self { arguments, board, session, behaviour, visit, visits, full: None }
+        Self {
+            arguments,
+            board,
+            session,
+            behaviour,
+            visit,
+            visits,
+            full: None,
+        }
     }
 
     /// Goes through all steps. `meet` receives the simulation server of the client.
@@ -84,7 +92,10 @@ impl<'class> Browser<'class> {
         let started = actix_rt::time::timeout(patience, self.start(meet)).await;
         let started = started.unwrap_or_else(|_| {
             let why = self.full.as_ref().map(|full| format!(": {full}")).unwrap_or_default();
-            Err(StartError::Failed(format!("no simulation within {}{why}", humantime::format_duration(patience))))
+            Err(StartError::Failed(format!(
+                "no simulation within {}{why}",
+                humantime::format_duration(patience)
+            )))
         });
         self.visit.outcome = match started {
             Ok(running) => {
@@ -97,7 +108,10 @@ impl<'class> Browser<'class> {
             Err(StartError::Failed(why)) => Outcome::Failed(why),
             Err(StartError::Left) => Outcome::Left,
         };
-        self.board.gone(matches!(self.visit.outcome, Outcome::Ran | Outcome::Unseen | Outcome::Left));
+        self.board.gone(matches!(
+            self.visit.outcome,
+            Outcome::Ran | Outcome::Unseen | Outcome::Left
+        ));
     }
 
     async fn start(&mut self, meet: impl Fn(&str)) -> Result<Running, StartError> {
@@ -144,14 +158,19 @@ impl<'class> Browser<'class> {
             Behaviour::Return => Some(Box::pin(WayBack::find(&mut lease, &server, &webots)).await?),
             _ => None,
         };
-        Ok(Running { lease, stream, way_back })
+        Ok(Running {
+            lease,
+            stream,
+            way_back,
+        })
     }
 
     /// Waits until the fleet is available and requests a simulation server; retries if other clients were faster.
     async fn find_server(&mut self) -> Result<String, StartError> {
         let mut pause = FIRST_PAUSE;
         loop {
-            self.full.get_or_insert_with(|| "no simulation server was available".to_owned());
+            self.full
+                .get_or_insert_with(|| "no simulation server was available".to_owned());
             self.session.until_available().await?;
             match self.session.simulation_server(&self.arguments.world).await {
                 Ok(server) => {
@@ -170,7 +189,9 @@ impl<'class> Browser<'class> {
     /// The next text of the simulation server; an error with any of the prefixes is a refusal.
     async fn hear_of_start(&self, lease: &mut Connection) -> Result<String, StartError> {
         let text = lease.receive().await?;
-        let refusal = ["loading: Error: ", "error:", "Error: "].iter().find_map(|begin| text.strip_prefix(begin));
+        let refusal = ["loading: Error: ", "error:", "Error: "]
+            .iter()
+            .find_map(|begin| text.strip_prefix(begin));
         match refusal {
             Some(why) => Err(StartError::Refused(why.trim().to_owned())),
             None => Ok(text),
@@ -211,7 +232,11 @@ impl<'class> Browser<'class> {
             // The page is reloaded: both connections are dropped.
             drop(running);
             running = match Box::pin(way_back.go(&self.arguments.viewer)).await {
-                Ok((lease, stream)) => Running { lease, stream, way_back: None },
+                Ok((lease, stream)) => Running {
+                    lease,
+                    stream,
+                    way_back: None,
+                },
                 Err(ended) => return Outcome::BrokeOff(format!("coming back: {ended}")),
             };
             let watched = Box::pin(actix_rt::time::timeout(stay / 2, self.look_on(&mut running)));
@@ -221,7 +246,10 @@ impl<'class> Browser<'class> {
         } else if attentive < stay && self.behaviour != Behaviour::Reload {
             actix_rt::time::sleep(stay.saturating_sub(attentive)).await;
         }
-        if matches!(self.behaviour, Behaviour::Ordinary | Behaviour::Reload | Behaviour::Return | Behaviour::Sleep) {
+        if matches!(
+            self.behaviour,
+            Behaviour::Ordinary | Behaviour::Reload | Behaviour::Return | Behaviour::Sleep
+        ) {
             // The page closes both at once.
             futures_util::future::join(running.stream.close(), running.lease.close()).await;
         }

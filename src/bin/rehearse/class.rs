@@ -47,7 +47,11 @@ pub(crate) async fn play(arguments: &Arguments) -> Played {
         _ = aside => {}
         () = interruption() => interrupted = true,
     }
-    Played { visits: class.visits.take(), peaks: class.servers.peaks(), interrupted }
+    Played {
+        visits: class.visits.take(),
+        peaks: class.servers.peaks(),
+        interrupted,
+    }
 }
 
 /// The state that all clients share.

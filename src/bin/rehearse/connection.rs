@@ -53,7 +53,10 @@ pub(crate) struct Deadline {
 impl Deadline {
     /// A deadline after this time from now.
     pub(crate) fn within(limit: Duration) -> Self {
-        Self { end: Instant::now() + limit, limit }
+        Self {
+            end: Instant::now() + limit,
+            limit,
+        }
     }
 }
 
@@ -62,7 +65,11 @@ impl Deadline {
 /// # Errors
 /// When the text is such an error.
 pub(crate) fn unless_error(text: String) -> Result<String, Ended> {
-    if text.starts_with("error:") { Err(Ended::Fault(text)) } else { Ok(text) }
+    if text.starts_with("error:") {
+        Err(Ended::Fault(text))
+    } else {
+        Ok(text)
+    }
 }
 
 /// An update of the scene; only its time is parsed.
@@ -96,11 +103,14 @@ impl Connection {
     }
 
     async fn open_for(url: &str, largest: usize) -> Result<Self, Ended> {
-        let config = WebSocketConfig::default().max_message_size(Some(largest)).max_frame_size(Some(largest));
+        let config = WebSocketConfig::default()
+            .max_message_size(Some(largest))
+            .max_frame_size(Some(largest));
         let failed = |why: String| Ended::Unreachable(url.to_owned(), why);
         let connecting = connect_async_tls_with_config(url, Some(config), true, encryption().map(Connector::Rustls));
-        let connected =
-            actix_rt::time::timeout(CONNECT, connecting).await.map_err(|_| failed("too slow".to_owned()))?;
+        let connected = actix_rt::time::timeout(CONNECT, connecting)
+            .await
+            .map_err(|_| failed("too slow".to_owned()))?;
         let (socket, _) = connected.map_err(|error| failed(error.to_string()))?;
         Ok(Self { socket })
     }
@@ -145,7 +155,9 @@ impl Connection {
         if Instant::now() >= deadline.end {
             return Err(late);
         }
-        tokio::time::timeout_at(deadline.end.into(), self.receive()).await.unwrap_or(Err(late))
+        tokio::time::timeout_at(deadline.end.into(), self.receive())
+            .await
+            .unwrap_or(Err(late))
     }
 
     /// Closes the connection as a page does when its user leaves, with a short timeout.

@@ -66,17 +66,50 @@ impl StepLog {
         let (mut lease, webots) = self.start(arguments, session).await?;
         let address = format!("{}/", webots.trim_end_matches('/'));
         let opened = Connection::open_scene(&address).await;
-        let came = opened.as_ref().map_or_else(ToString::to_string, |_| "a WebSocket".to_owned());
+        let came = opened
+            .as_ref()
+            .map_or_else(ToString::to_string, |_| "a WebSocket".to_owned());
         self.note("stream", "Webots takes a WebSocket at `/`", &came, opened.is_ok());
         let mut stream = opened.map_err(|_| StepError)?;
         self.see_the_scene(arguments, &mut stream).await?;
-        self.command(arguments, &mut stream, "pause", "pause", "`paused by client`", "paused by client").await?;
+        self.command(
+            arguments,
+            &mut stream,
+            "pause",
+            "pause",
+            "`paused by client`",
+            "paused by client",
+        )
+        .await?;
         self.run(arguments, &mut stream).await?;
         self.hear_heartbeats(arguments, &mut lease).await?;
-        self.command(arguments, &mut stream, "pause again", "pause", "`paused by client`", "paused by client").await?;
-        self.command(arguments, &mut stream, "step", "step", "an update, then `paused by client`", "paused by client")
-            .await?;
-        self.command(arguments, &mut stream, "reset", "reset", "`reset finished`", "reset finished").await?;
+        self.command(
+            arguments,
+            &mut stream,
+            "pause again",
+            "pause",
+            "`paused by client`",
+            "paused by client",
+        )
+        .await?;
+        self.command(
+            arguments,
+            &mut stream,
+            "step",
+            "step",
+            "an update, then `paused by client`",
+            "paused by client",
+        )
+        .await?;
+        self.command(
+            arguments,
+            &mut stream,
+            "reset",
+            "reset",
+            "`reset finished`",
+            "reset finished",
+        )
+        .await?;
         stream.close().await;
         lease.close().await;
         self.see_it_gone(&address).await;
@@ -99,7 +132,12 @@ impl StepLog {
             Err(_) => "`0` all the time".to_owned(),
         };
         let agrees = matches!(available, Ok(Ok(())));
-        self.note("a free server", "`1` before the patience ends: some server can take a client", &came, agrees);
+        self.note(
+            "a free server",
+            "`1` before the patience ends: some server can take a client",
+            &came,
+            agrees,
+        );
         if agrees { Ok(()) } else { Err(StepError) }
     }
 
@@ -107,20 +145,53 @@ impl StepLog {
     async fn start(&mut self, arguments: &Arguments, session: &Session) -> Result<(Connection, String), StepError> {
         let server = session.simulation_server(&arguments.world).await;
         let came = excerpt(server.as_ref().map_or_else(Clone::clone, Clone::clone).as_str());
-        self.note("simulation server", "`ws://HOST:PORT` or `wss://HOST/PORT`", &came, server.is_ok());
+        self.note(
+            "simulation server",
+            "`ws://HOST:PORT` or `wss://HOST/PORT`",
+            &came,
+            server.is_ok(),
+        );
         let server = server.map_err(|_| StepError)?;
         let opened = Connection::open(&format!("{server}/client")).await;
-        let came = opened.as_ref().map_or_else(ToString::to_string, |_| "a WebSocket".to_owned());
+        let came = opened
+            .as_ref()
+            .map_or_else(ToString::to_string, |_| "a WebSocket".to_owned());
         self.note("client", "a WebSocket at `/client`", &came, opened.is_ok());
         let mut lease = opened.map_err(|_| StepError)?;
-        let Start { texts, unknown, limit, end } = follow(&mut lease, arguments).await;
-        let came = if unknown.is_empty() { format!("{texts} texts, all known") } else { unknown.join(" ") };
-        self.note("progress", "only texts that Webots' page knows", &came, unknown.is_empty());
+        let Start {
+            texts,
+            unknown,
+            limit,
+            end,
+        } = follow(&mut lease, arguments).await;
+        let came = if unknown.is_empty() {
+            format!("{texts} texts, all known")
+        } else {
+            unknown.join(" ")
+        };
+        self.note(
+            "progress",
+            "only texts that Webots' page knows",
+            &came,
+            unknown.is_empty(),
+        );
         let is_limit = limit.as_ref().is_some_and(|limit| limit.parse::<u64>().is_ok());
         let came = limit.unwrap_or_else(|| "none".to_owned());
-        self.note("time limit", "`shutdownTimeout: SECONDS` before Webots is ready", &came, is_limit);
-        let url = end.strip_prefix("webots:").filter(|url| url.starts_with("ws") && !url.ends_with('/'));
-        self.note("Webots is ready", "`webots:ws...`, without a slash at the end", &excerpt(&end), url.is_some());
+        self.note(
+            "time limit",
+            "`shutdownTimeout: SECONDS` before Webots is ready",
+            &came,
+            is_limit,
+        );
+        let url = end
+            .strip_prefix("webots:")
+            .filter(|url| url.starts_with("ws") && !url.ends_with('/'));
+        self.note(
+            "Webots is ready",
+            "`webots:ws...`, without a slash at the end",
+            &excerpt(&end),
+            url.is_some(),
+        );
         url.map(|url| (lease, url.to_owned())).ok_or(StepError)
     }
 
@@ -151,7 +222,10 @@ impl StepLog {
         let known = ["`world:`", "`model:`", "`application/json:`", "`scene load completed`"];
         let agrees =
             ended.is_none() && order.iter().take(known.len()).eq(known.iter()) && order.len() == known.len() + 1;
-        let failed = ended.as_ref().map(|ended| format!(", then {}", over(ended))).unwrap_or_default();
+        let failed = ended
+            .as_ref()
+            .map(|ended| format!(", then {}", over(ended)))
+            .unwrap_or_default();
         self.note("scene", expected, &format!("{}{failed}", order.join(", ")), agrees);
         let is_model = model.contains("<Scene") && model.contains("<Viewpoint");
         let came = format!("{} bytes: {}", model.len(), excerpt(&model));
@@ -177,20 +251,32 @@ impl StepLog {
             match &came {
                 Ok(text) if text.starts_with("application/json:") => updates += 1,
                 Ok(text) if text == answer => {}
-                Ok(text) if ["visibility:", "stdout:", "stderr:"].iter().any(|one| text.starts_with(one)) => {}
+                Ok(text)
+                    if ["visibility:", "stdout:", "stderr:"]
+                        .iter()
+                        .any(|one| text.starts_with(one)) => {}
                 Ok(text) => add(&mut others, text),
                 Err(_) => {}
             }
         }
-        let before = if others.is_empty() { String::new() } else { format!("{}, then ", others.join(", ")) };
-        let before = if updates == 0 { before } else { format!("{updates} updates, {before}") };
+        let before = if others.is_empty() {
+            String::new()
+        } else {
+            format!("{}, then ", others.join(", "))
+        };
+        let before = if updates == 0 {
+            before
+        } else {
+            format!("{updates} updates, {before}")
+        };
         let agrees = came.is_ok() && others.is_empty() && (command != "step" || updates == 1);
         self.note(name, expected, &format!("{before}{}", told(&came)), agrees);
         came.map(drop).map_err(|_| StepError)
     }
 
     async fn run(&mut self, arguments: &Arguments, stream: &mut Connection) -> Result<(), StepError> {
-        self.command(arguments, stream, "run", "real-time:-1", "`real-time`", "real-time").await?;
+        self.command(arguments, stream, "run", "real-time:-1", "`real-time`", "real-time")
+            .await?;
         let mut updates: Vec<(Instant, f64)> = Vec::new();
         let mut deadline = limit(ANSWER, arguments);
         while let Ok(text) = stream.receive_by(deadline).await {
@@ -207,7 +293,12 @@ impl StepLog {
         let (per_second, factor) = rates(&updates).unwrap_or_default();
         let came = format!("{per_second:.0} in a second");
         let agrees = grows && factor > 0.0 && per_second < 90.0;
-        self.note("updates", "with growing `time`, at most some 60 in a second", &came, agrees);
+        self.note(
+            "updates",
+            "with growing `time`, at most some 60 in a second",
+            &came,
+            agrees,
+        );
         let came = format!("{factor:.2} of real time");
         self.note("pace", "0.9 of real time or more", &came, (0.9..1.2).contains(&factor));
         if updates.is_empty() { Err(StepError) } else { Ok(()) }
@@ -227,7 +318,11 @@ impl StepLog {
             Err(ended) => over(ended),
         };
         self.note("signs of life", "`.` on `/client` every 5 s", &came, last.is_ok());
-        if matches!(last, Ok(_) | Err(Ended::Late(_))) { Ok(()) } else { Err(StepError) }
+        if matches!(last, Ok(_) | Err(Ended::Late(_))) {
+            Ok(())
+        } else {
+            Err(StepError)
+        }
     }
 
     async fn see_it_gone(&mut self, address: &str) {
@@ -239,7 +334,11 @@ impl StepLog {
             is_gone = opened.is_ok_and(|opened| opened.is_err());
             actix_rt::time::sleep(Duration::from_millis(100)).await;
         }
-        let came = if is_gone { "nobody there" } else { "Webots still answers" };
+        let came = if is_gone {
+            "nobody there"
+        } else {
+            "Webots still answers"
+        };
         self.note("leave", "Webots has ended once its client has left", came, is_gone);
     }
 }
@@ -247,7 +346,12 @@ impl StepLog {
 /// Starts the world, and reads texts until Webots is ready, or its start fails.
 async fn follow(lease: &mut Connection, arguments: &Arguments) -> Start {
     let deadline = Deadline::within(arguments.patience);
-    let mut start = Start { texts: 0, unknown: Vec::new(), limit: None, end: String::new() };
+    let mut start = Start {
+        texts: 0,
+        unknown: Vec::new(),
+        limit: None,
+        end: String::new(),
+    };
     let wish = serde_json::json!({"start": {"url": arguments.world}}).to_string();
     let mut heard = lease.say(&wish).await.map(|()| String::new());
     loop {
@@ -268,7 +372,10 @@ async fn follow(lease: &mut Connection, arguments: &Arguments) -> Start {
         if let Some(limit) = text.strip_prefix("shutdownTimeout:") {
             start.limit = Some(limit.trim().to_owned());
         }
-        if ["webots:", "error:", "loading: Error:"].iter().any(|end| text.starts_with(end)) {
+        if ["webots:", "error:", "loading: Error:"]
+            .iter()
+            .any(|end| text.starts_with(end))
+        {
             text.clone_into(&mut start.end);
             return start;
         }
@@ -295,10 +402,14 @@ mod tests {
     #[test]
     fn updates_are_measured_from_the_first_one() {
         let began = Instant::now();
-        let late =
-            (400_u32..=3000).step_by(40).map(|ms| (began + Duration::from_millis(ms.into()), f64::from(ms - 400)));
+        let late = (400_u32..=3000)
+            .step_by(40)
+            .map(|ms| (began + Duration::from_millis(ms.into()), f64::from(ms - 400)));
         let (per_second, factor) = rates(&late.collect::<Vec<_>>()).unwrap();
-        assert!((per_second - 25.0).abs() < 0.1 && (factor - 1.0).abs() < 0.01, "{per_second} {factor}");
+        assert!(
+            (per_second - 25.0).abs() < 0.1 && (factor - 1.0).abs() < 0.01,
+            "{per_second} {factor}"
+        );
         assert_eq!((rates(&[]), rates(&[(began, 1.0)])), (None, None));
     }
 }

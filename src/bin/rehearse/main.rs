@@ -49,8 +49,13 @@ fn main() -> ExitCode {
     }
     // Only the first call can set it, and this is the first.
     rustls::crypto::ring::default_provider().install_default().ok();
-    let ended = actix_rt::System::new()
-        .block_on(async { if arguments.explain { explain(&arguments).await } else { rehearse(&arguments).await } });
+    let ended = actix_rt::System::new().block_on(async {
+        if arguments.explain {
+            explain(&arguments).await
+        } else {
+            rehearse(&arguments).await
+        }
+    });
     ExitCode::from(ended.unwrap_or_else(|why| {
         eprintln!("error: {}", words::line(&why));
         NOT_AS_EXPECTED
@@ -81,7 +86,11 @@ async fn explain(arguments: &Arguments) -> Result<u8, String> {
 /// When the fleet does not answer at all, or the JSON file can't be written.
 async fn rehearse(arguments: &Arguments) -> Result<u8, String> {
     session::Session::new(&arguments.fleet).answers().await?;
-    let Played { visits, peaks, interrupted } = class::play(arguments).await;
+    let Played {
+        visits,
+        peaks,
+        interrupted,
+    } = class::play(arguments).await;
     let mut report = report::Report::new(arguments, &visits, &peaks);
     if interrupted {
         report.interrupt();
@@ -89,7 +98,13 @@ async fn rehearse(arguments: &Arguments) -> Result<u8, String> {
     // The reader may have closed the pipe.
     writeln!(std::io::stdout(), "{}", table::text(&report)).ok();
     if let Some(file) = &arguments.json {
-        report.write(&visits, file).map_err(|error| format!("{} can't be written: {error}", file.display()))?;
+        report
+            .write(&visits, file)
+            .map_err(|error| format!("{} can't be written: {error}", file.display()))?;
     }
-    Ok(if interrupted { INTERRUPTED } else { code(report.is_as_expected()) })
+    Ok(if interrupted {
+        INTERRUPTED
+    } else {
+        code(report.is_as_expected())
+    })
 }

@@ -21,7 +21,10 @@ pub(crate) fn factors_of(visit: &Visit) -> impl Iterator<Item = f64> {
 /// The factors of all these seconds; `None` if there are none.
 pub(crate) fn factors(values: impl Iterator<Item = f64>) -> Option<RealTimeFactors> {
     let values = sorted(values);
-    Some(RealTimeFactors { p5: quantile(&values, 0.05)?, median: quantile(&values, 0.5)? })
+    Some(RealTimeFactors {
+        p5: quantile(&values, 0.05)?,
+        median: quantile(&values, 0.5)?,
+    })
 }
 
 /// Sorts from the lowest to the highest.
@@ -33,7 +36,12 @@ pub(crate) fn sorted(values: impl Iterator<Item = f64>) -> Vec<f64> {
 
 /// The value that a share of the sorted ones does not exceed (nearest rank).
 pub(crate) fn quantile(sorted: &[f64], share: f64) -> Option<f64> {
-    #[expect(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a rank")]
+    #[expect(
+        clippy::cast_precision_loss,
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "a rank"
+    )]
     let rank = (share * sorted.len() as f64).ceil() as usize;
     sorted.get(rank.saturating_sub(1)).copied()
 }

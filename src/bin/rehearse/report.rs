@@ -110,8 +110,10 @@ impl Report {
         let servers: Vec<Server> = peaks
             .iter()
             .map(|(address, peak)| {
-                let here: Vec<&Visit> =
-                    visits.iter().filter(|visit| visit.server.as_ref() == Some(address) && visit.has_run()).collect();
+                let here: Vec<&Visit> = visits
+                    .iter()
+                    .filter(|visit| visit.server.as_ref() == Some(address) && visit.has_run())
+                    .collect();
                 server(address, *peak, &here)
             })
             .collect();
@@ -145,7 +147,13 @@ impl Report {
     /// # Errors
     /// When the file can't be written.
     pub(crate) fn write(&self, visits: &[Visit], file: &Path) -> std::io::Result<()> {
-        let visits = visits.iter().map(|visit| OneVisit { visit, real_time: factors(factors_of(visit)) }).collect();
+        let visits = visits
+            .iter()
+            .map(|visit| OneVisit {
+                visit,
+                real_time: factors(factors_of(visit)),
+            })
+            .collect();
         let text = serde_json::to_string_pretty(&File { report: self, visits })?;
         std::fs::write(file, text + "\n")
     }
@@ -175,7 +183,11 @@ fn seats(visits: &[Visit], real_time: f64) -> Seats {
 /// The reason that a client received, without its simulation's output, and with the simulation server unless the reason
 /// already names it.
 fn reason(why: &str, visit: &Visit) -> String {
-    let why = why.split(" Its last output:").next().unwrap_or(why).trim_end_matches('.');
+    let why = why
+        .split(" Its last output:")
+        .next()
+        .unwrap_or(why)
+        .trim_end_matches('.');
     let server = visit.server.as_deref().filter(|server| !why.contains(server));
     server.map_or(why.to_owned(), |server| format!("{why} at {server}"))
 }
@@ -189,9 +201,19 @@ fn times(visits: &[Visit]) -> Vec<Row> {
         ("all", |steps| steps.until_running),
     ];
     let row = |(step, pick): (&'static str, Pick)| {
-        let times = sorted(visits.iter().filter(|visit| visit.has_run()).filter_map(|visit| pick(&visit.steps)));
+        let times = sorted(
+            visits
+                .iter()
+                .filter(|visit| visit.has_run())
+                .filter_map(|visit| pick(&visit.steps)),
+        );
         let at = |share| quantile(&times, share);
-        Some(Row { step, median: at(0.5)?, p95: at(0.95)?, worst: *times.last()? })
+        Some(Row {
+            step,
+            median: at(0.5)?,
+            p95: at(0.95)?,
+            worst: *times.last()?,
+        })
     };
     steps.into_iter().filter_map(row).collect()
 }
@@ -212,7 +234,10 @@ fn began(visit: &Visit) -> f64 {
 }
 
 fn most_at_once(here: &[&Visit]) -> u32 {
-    let mut changes: Vec<(f64, i32)> = here.iter().flat_map(|visit| [(began(visit), 1), (visit.ended, -1)]).collect();
+    let mut changes: Vec<(f64, i32)> = here
+        .iter()
+        .flat_map(|visit| [(began(visit), 1), (visit.ended, -1)])
+        .collect();
     changes.sort_by(|one, other| one.0.total_cmp(&other.0).then(one.1.cmp(&other.1)));
     let mut now = 0_i32;
     let most = changes.into_iter().map(|(_, change)| {
@@ -232,7 +257,9 @@ fn verdict(seats: &Seats) -> String {
         (fit, all) => format!("{fit} of {all} fit"),
     };
     let reasons = [("got none", &seats.refused), ("broke off", &seats.broke_off)];
-    let reasons = reasons.into_iter().flat_map(|(what, all)| all.iter().map(move |(why, number)| (number, what, why)));
+    let reasons = reasons
+        .into_iter()
+        .flat_map(|(what, all)| all.iter().map(move |(why, number)| (number, what, why)));
     if let Some((number, what, why)) = reasons.max_by_key(|(number, ..)| **number) {
         sentence = format!("{sentence}; {number} {what}: {why}");
     }
@@ -248,10 +275,16 @@ mod tests {
 
     fn visit(client: u32, server: &str, asked: f64, outcome: Outcome, factors: &[f64]) -> Visit {
         let ran = matches!(outcome, Outcome::Ran | Outcome::BrokeOff(_) | Outcome::Unseen).then_some(1.0);
-        let pace = (0_u32..)
-            .zip(factors)
-            .map(|(second, factor)| Pace { at: asked + 3.0 + f64::from(second), factor: *factor });
-        let steps = Steps { waiting: ran, checkout: ran, launch: ran, until_running: ran.map(|step| 3.0 * step) };
+        let pace = (0_u32..).zip(factors).map(|(second, factor)| Pace {
+            at: asked + 3.0 + f64::from(second),
+            factor: *factor,
+        });
+        let steps = Steps {
+            waiting: ran,
+            checkout: ran,
+            launch: ran,
+            until_running: ran.map(|step| 3.0 * step),
+        };
         let server = Some(server.to_owned());
         Visit {
             client,
@@ -266,9 +299,17 @@ mod tests {
     }
 
     fn report(more: &[&str], visits: &[Visit]) -> Report {
-        let fixed = ["rehearse", "http://localhost:1999", "--world", "https://github.com/a/b/blob/m/worlds/w.wbt"];
+        let fixed = [
+            "rehearse",
+            "http://localhost:1999",
+            "--world",
+            "https://github.com/a/b/blob/m/worlds/w.wbt",
+        ];
         let arguments = Arguments::parse_from(fixed.iter().chain(more));
-        let peaks = BTreeMap::from([("gpu-1:2000".to_owned(), Some(60.0)), ("gpu-2:2000".to_owned(), Some(99.0))]);
+        let peaks = BTreeMap::from([
+            ("gpu-1:2000".to_owned(), Some(60.0)),
+            ("gpu-2:2000".to_owned(), Some(99.0)),
+        ]);
         Report::new(&arguments, visits, &peaks)
     }
 
@@ -279,7 +320,13 @@ mod tests {
             visit(0, "gpu-1:2000", 0.0, Outcome::Ran, &[0.1, 1.0, 1.0]),
             visit(1, "gpu-1:2000", 1.0, Outcome::Ran, &[1.0, 1.0]),
             visit(2, "gpu-2:2000", 2.0, Outcome::Ran, &[1.0, 0.5, 0.5]),
-            visit(3, "gpu-2:2000", 3.0, Outcome::BrokeOff("Webots was killed".to_owned()), &[1.0, 1.0]),
+            visit(
+                3,
+                "gpu-2:2000",
+                3.0,
+                Outcome::BrokeOff("Webots was killed".to_owned()),
+                &[1.0, 1.0],
+            ),
             visit(4, "gpu-2:2000", 4.0, full.clone(), &[]),
             visit(5, "gpu-2:2000", 5.0, full, &[]),
             visit(6, "gpu-2:2000", 6.0, Outcome::Left, &[]),
@@ -290,12 +337,18 @@ mod tests {
         let seats = &of_two.seats;
         assert_eq!((seats.asked, seats.given, seats.fit), (9, 6, 2));
         assert_eq!((seats.unseen, seats.unmeasured, seats.left), (1, 1, 1));
-        assert_eq!(seats.refused, BTreeMap::from([("Error: full at gpu-2:2000".to_owned(), 2)]));
+        assert_eq!(
+            seats.refused,
+            BTreeMap::from([("Error: full at gpu-2:2000".to_owned(), 2)])
+        );
         assert_eq!(seats.broke_off.values().sum::<u32>(), 1);
         assert!(of_two.is_as_expected() && !report(&["--expect", "3"], &visits).is_as_expected());
         assert_eq!(of_two.verdict, "2 of 6 fit; 2 got none: Error: full at gpu-2:2000.");
-        let servers: Vec<_> =
-            of_two.servers.iter().map(|server| (server.seats, server.most_at_once, server.peak_load)).collect();
+        let servers: Vec<_> = of_two
+            .servers
+            .iter()
+            .map(|server| (server.seats, server.most_at_once, server.peak_load))
+            .collect();
         assert_eq!(servers, [(4, 2, Some(60.0)), (2, 2, Some(99.0))]);
         assert!(report(&["--real-time", "0.4"], &visits).is_as_expected());
         let short = report(&[], &visits[8..]);
@@ -321,13 +374,23 @@ mod tests {
 
     #[test]
     fn the_most_frequent_reason_is_told() {
-        let (full, killed) = (Outcome::Refused("full".to_owned()), Outcome::BrokeOff("Webots was killed.".to_owned()));
+        let (full, killed) = (
+            Outcome::Refused("full".to_owned()),
+            Outcome::BrokeOff("Webots was killed.".to_owned()),
+        );
         let all = |outcomes: &[&Outcome]| {
-            let visits =
-                (0..).zip(outcomes).map(|(client, one)| visit(client, "gpu-1:2000", 0.0, (*one).clone(), &[1.0; 2]));
+            let visits = (0..)
+                .zip(outcomes)
+                .map(|(client, one)| visit(client, "gpu-1:2000", 0.0, (*one).clone(), &[1.0; 2]));
             report(&[], &visits.collect::<Vec<_>>()).verdict
         };
-        assert_eq!(all(&[&killed, &full, &killed]), "None fits; 2 broke off: Webots was killed at gpu-1:2000.");
-        assert_eq!(all(&[&Outcome::Ran, &full, &full, &killed]), "1 of 4 fit; 2 got none: full at gpu-1:2000.");
+        assert_eq!(
+            all(&[&killed, &full, &killed]),
+            "None fits; 2 broke off: Webots was killed at gpu-1:2000."
+        );
+        assert_eq!(
+            all(&[&Outcome::Ran, &full, &full, &killed]),
+            "1 of 4 fit; 2 got none: full at gpu-1:2000."
+        );
     }
 }

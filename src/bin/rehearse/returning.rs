@@ -23,7 +23,11 @@ impl WayBack {
         let deadline = Deadline::within(STEP);
         loop {
             if let Some(token) = lease.receive_by(deadline).await?.strip_prefix("resume: ") {
-                return Ok(Self { server: server.to_owned(), webots: webots.to_owned(), token: token.to_owned() });
+                return Ok(Self {
+                    server: server.to_owned(),
+                    webots: webots.to_owned(),
+                    token: token.to_owned(),
+                });
             }
         }
     }
@@ -36,7 +40,9 @@ impl WayBack {
     pub(crate) async fn go(self, viewer: &str) -> Result<(Connection, Connection), Ended> {
         let deadline = Deadline::within(STEP);
         let mut lease = Connection::open(&format!("{}/client", self.server)).await?;
-        lease.say(&serde_json::json!({ "resume": self.token }).to_string()).await?;
+        lease
+            .say(&serde_json::json!({ "resume": self.token }).to_string())
+            .await?;
         loop {
             let text = lease.receive_by(deadline).await?;
             if let Some(why) = text.strip_prefix("loading: Error: ") {
@@ -51,7 +57,10 @@ impl WayBack {
         stream.say(&format!("{viewer};broadcast")).await?;
         let mut first = None;
         loop {
-            match (first, simulated_time(&unless_error(stream.receive_by(deadline).await?)?)) {
+            match (
+                first,
+                simulated_time(&unless_error(stream.receive_by(deadline).await?)?),
+            ) {
                 (Some(first), Some(time)) if time > first => return Ok((lease, stream)),
                 (None, Some(time)) => first = Some(time),
                 _ => {}

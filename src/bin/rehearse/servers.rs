@@ -33,7 +33,10 @@ impl Servers {
     async fn ask(&self, http: &awc::Client, server: &str) {
         let answer = get(http, &format!("{}/load", to_http(server))).await;
         // A server that is too busy to answer keeps its last load.
-        let load = answer.ok().and_then(|text| text.trim().parse::<f64>().ok()).filter(|load| load.is_finite());
+        let load = answer
+            .ok()
+            .and_then(|text| text.trim().parse::<f64>().ok())
+            .filter(|load| load.is_finite());
         if let (Some(load), Some(peak)) = (load, self.0.borrow_mut().get_mut(server)) {
             *peak = Some(peak.map_or(load, |peak| peak.max(load)));
         }
@@ -42,6 +45,9 @@ impl Servers {
     /// The highest load of each server, by its address, in percent; `None` if it never reported one.
     pub(crate) fn peaks(&self) -> BTreeMap<String, Option<f64>> {
         let known = self.0.borrow();
-        known.iter().filter_map(|(url, peak)| Some((url.split_once("://")?.1.to_owned(), *peak))).collect()
+        known
+            .iter()
+            .filter_map(|(url, peak)| Some((url.split_once("://")?.1.to_owned(), *peak)))
+            .collect()
     }
 }

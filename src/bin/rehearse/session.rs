@@ -29,7 +29,10 @@ pub(crate) struct Session {
 impl Session {
     /// The session server at this URL.
     pub(crate) fn new(url: &Url) -> Self {
-        Self { url: url.clone(), http: client() }
+        Self {
+            url: url.clone(),
+            http: client(),
+        }
     }
 
     /// Checks that this is a session server.
@@ -84,11 +87,19 @@ impl Session {
         let answer = get(&self.http, url.as_str()).await?;
         let answer = line(answer.trim());
         let is_one = answer.starts_with("ws://") || answer.starts_with("wss://");
-        if is_one { Ok(answer.trim_end_matches('/').to_owned()) } else { Err(answer) }
+        if is_one {
+            Ok(answer.trim_end_matches('/').to_owned())
+        } else {
+            Err(answer)
+        }
     }
 
     fn base(&self) -> String {
-        self.url.as_str().trim_end_matches('/').trim_end_matches("/session").to_owned()
+        self.url
+            .as_str()
+            .trim_end_matches('/')
+            .trim_end_matches("/session")
+            .to_owned()
     }
 }
 
@@ -117,7 +128,11 @@ pub(crate) async fn get(http: &Client, url: &str) -> Result<String, String> {
         format!("{url} can't be reached: {why}")
     };
     let mut answer = http.get(url).send().await.map_err(unreachable)?;
-    let body = answer.body().limit(LONGEST_ANSWER).await.map_err(|error| format!("{url} can't be read: {error}"))?;
+    let body = answer
+        .body()
+        .limit(LONGEST_ANSWER)
+        .await
+        .map_err(|error| format!("{url} can't be read: {error}"))?;
     Ok(String::from_utf8_lossy(&body).into_owned())
 }
 

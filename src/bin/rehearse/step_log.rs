@@ -24,7 +24,12 @@ impl StepLog {
         print(&format!("World: {}\n", arguments.world));
         print("| step | at | took | expected | came | |\n|---|---|---|---|---|---|");
         let now = Instant::now();
-        Self { began: now, last: now, steps: 0, differing: Vec::new() }
+        Self {
+            began: now,
+            last: now,
+            steps: 0,
+            differing: Vec::new(),
+        }
     }
 
     /// Prints the result of a step, and begins the next.
@@ -37,7 +42,9 @@ impl StepLog {
         }
         let verdict = if agrees { "ok" } else { "**differs**" };
         let came = line(came).replace('|', "\\|");
-        print(&format!("| {name} | {at:.2} s | {took:.2} s | {expected} | {came} | {verdict} |"));
+        print(&format!(
+            "| {name} | {at:.2} s | {took:.2} s | {expected} | {came} | {verdict} |"
+        ));
     }
 
     /// Prints which steps differ. Returns whether none does.

@@ -8,7 +8,10 @@ use crate::report::Report;
 
 /// All tables, and the verdict below them.
 pub(crate) fn text(report: &Report) -> String {
-    let mut parts = vec![format!("Rehearsal of {}: {}\n{}", report.fleet, report.played, report.world)];
+    let mut parts = vec![format!(
+        "Rehearsal of {}: {}\n{}",
+        report.fleet, report.played, report.world
+    )];
     parts.push(seats(report));
     if !report.times.is_empty() {
         parts.push(times(report));
@@ -18,7 +21,11 @@ pub(crate) fn text(report: &Report) -> String {
     }
     let mut verdict = report.verdict.clone();
     if let Some(expected) = report.expected {
-        let met = if report.is_as_expected() { "as expected" } else { "NOT as expected" };
+        let met = if report.is_as_expected() {
+            "as expected"
+        } else {
+            "NOT as expected"
+        };
         verdict = format!("{verdict} {expected} had to: {met}.");
     }
     parts.push(verdict);
@@ -66,9 +73,18 @@ fn times(report: &Report) -> String {
 }
 
 fn servers(report: &Report) -> String {
-    let mut table = Table::new(&["Simulation server", "seats", "at once", "peak load", "real time, 5 %", "median"]);
+    let mut table = Table::new(&[
+        "Simulation server",
+        "seats",
+        "at once",
+        "peak load",
+        "real time, 5 %",
+        "median",
+    ]);
     for server in &report.servers {
-        let load = server.peak_load.map_or_else(|| "-".to_owned(), |load| format!("{load:.0} %"));
+        let load = server
+            .peak_load
+            .map_or_else(|| "-".to_owned(), |load| format!("{load:.0} %"));
         let [p5, median] = pace(server.pace);
         table.add(vec![
             server.address.clone(),
@@ -88,7 +104,10 @@ fn servers(report: &Report) -> String {
 }
 
 fn pace(factors: Option<RealTimeFactors>) -> [String; 2] {
-    factors.map_or_else(|| ["-".to_owned(), "-".to_owned()], |all| [all.p5, all.median].map(|one| format!("{one:.2}")))
+    factors.map_or_else(
+        || ["-".to_owned(), "-".to_owned()],
+        |all| [all.p5, all.median].map(|one| format!("{one:.2}")),
+    )
 }
 
 /// A table in Markdown whose columns are aligned: texts in the first, numbers in the others.
@@ -99,7 +118,10 @@ struct Table {
 
 impl Table {
     fn new(header: &[&str]) -> Self {
-        Self { header: header.iter().map(|title| (*title).to_owned()).collect(), rows: Vec::new() }
+        Self {
+            header: header.iter().map(|title| (*title).to_owned()).collect(),
+            rows: Vec::new(),
+        }
     }
 
     fn add(&mut self, row: Vec<String>) {
@@ -110,15 +132,25 @@ impl Table {
 impl fmt::Display for Table {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         let all = || std::iter::once(&self.header).chain(&self.rows);
-        let width =
-            |column: usize| all().filter_map(|row| row.get(column)).map(|cell: &String| cell.chars().count()).max();
-        let widths: Vec<usize> = (0..self.header.len()).map(|column| width(column).unwrap_or(0)).collect();
+        let width = |column: usize| {
+            all()
+                .filter_map(|row| row.get(column))
+                .map(|cell: &String| cell.chars().count())
+                .max()
+        };
+        let widths: Vec<usize> = (0..self.header.len())
+            .map(|column| width(column).unwrap_or(0))
+            .collect();
         for (number, row) in all().enumerate() {
             if number > 0 {
                 writeln!(out)?;
             }
             for (column, (cell, width)) in row.iter().zip(&widths).enumerate() {
-                if column == 0 { write!(out, "| {cell:<width$} |")? } else { write!(out, " {cell:>width$} |")? }
+                if column == 0 {
+                    write!(out, "| {cell:<width$} |")?
+                } else {
+                    write!(out, " {cell:>width$} |")?
+                }
             }
             if number == 0 {
                 let lines: Vec<String> = widths.iter().map(|width| "-".repeat(width + 2)).collect();

@@ -13,7 +13,11 @@ pub fn optional<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Mai
         return Ok(None);
     };
     let is_plain = |mailbox: &Mailbox| AsRef::<str>::as_ref(&mailbox.email).is_ascii();
-    let mailbox = text.parse().ok().filter(is_plain).filter(|_| !text.contains(char::is_control));
+    let mailbox = text
+        .parse()
+        .ok()
+        .filter(is_plain)
+        .filter(|_| !text.contains(char::is_control));
     mailbox.map(Some).ok_or_else(|| {
         let allowed = "allowed is one NAME@HOST in ASCII, or Some Name <NAME@HOST>";
         serde::de::Error::custom(format!("{text:?} is no mail address; {allowed}"))
@@ -33,9 +37,21 @@ mod tests {
         for (text, address, name) in [
             ("admin@example.org", "admin@example.org", None),
             ("root@localhost", "root@localhost", None),
-            (" first.last+fleet@mail.example.org ", "first.last+fleet@mail.example.org", None),
-            ("Ada L\u{f6}v <ada@example.org>", "ada@example.org", Some("Ada L\u{f6}v")),
-            ("\"Lab, Robots\" <lab@example.org>", "lab@example.org", Some("Lab, Robots")),
+            (
+                " first.last+fleet@mail.example.org ",
+                "first.last+fleet@mail.example.org",
+                None,
+            ),
+            (
+                "Ada L\u{f6}v <ada@example.org>",
+                "ada@example.org",
+                Some("Ada L\u{f6}v"),
+            ),
+            (
+                "\"Lab, Robots\" <lab@example.org>",
+                "lab@example.org",
+                Some("Lab, Robots"),
+            ),
             ("<lab@example.org>", "lab@example.org", None),
         ] {
             let mailbox = read(text).unwrap().unwrap();

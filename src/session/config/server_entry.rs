@@ -22,7 +22,11 @@ pub enum ServerEntry {
 impl ServerEntry {
     /// The address of the simulation server, unless this is a name.
     pub fn server(&self) -> Option<&PublicAddress> {
-        if let Self::Server(address) = self { Some(address) } else { None }
+        if let Self::Server(address) = self {
+            Some(address)
+        } else {
+            None
+        }
     }
 
     /// The name to resolve and the port, unless this is an address.
@@ -76,7 +80,10 @@ mod tests {
         for text in ["localhost:2000", "lab.org/2000", "dns+tasks.simulation:2000"] {
             assert_eq!(String::from(read(text).unwrap()), text);
         }
-        assert_eq!(String::from(read("dns+Tasks.Simulation:02000").unwrap()), "dns+tasks.simulation:2000");
+        assert_eq!(
+            String::from(read("dns+Tasks.Simulation:02000").unwrap()),
+            "dns+tasks.simulation:2000"
+        );
     }
 
     #[test]
@@ -86,7 +93,10 @@ mod tests {
             "dns+10.0.0.7:2000 dns+[::1]:2000 dnssrv+ dnssrv+_webots._tcp.example.org dns://a.b:2000 DNS+host:2000";
         for text in names.split(' ').chain(others.split(' ')).chain(["dns+a b:2000"]) {
             let error = read(text).unwrap_err();
-            assert!(error.contains(&format!("{text:?}")) && error.contains("dns+NAME:PORT"), "{error}");
+            assert!(
+                error.contains(&format!("{text:?}")) && error.contains("dns+NAME:PORT"),
+                "{error}"
+            );
         }
     }
 }

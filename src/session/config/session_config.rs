@@ -126,13 +126,18 @@ impl SessionConfig {
 
     /// Returns the HTTP URL under which clients reach this server. With a public URL, it is that of the reverse proxy.
     pub fn http_url(&self) -> String {
-        self.public_url.as_ref().map_or_else(|| self.address().http_url(self.ssl), PublicUrl::http_door)
+        self.public_url
+            .as_ref()
+            .map_or_else(|| self.address().http_url(self.ssl), PublicUrl::http_door)
     }
 
     /// Returns the WebSocket URL under which clients reach this server.
     pub fn websocket_url(&self) -> String {
         let door = self.public_url.as_ref().map(PublicUrl::websocket_door);
-        format!("{}/session", door.unwrap_or_else(|| self.address().websocket_url(self.ssl)))
+        format!(
+            "{}/session",
+            door.unwrap_or_else(|| self.address().websocket_url(self.ssl))
+        )
     }
 
     /// Checks that only listed servers are drained.
@@ -141,7 +146,9 @@ impl SessionConfig {
         let has_names = self.simulation_servers.iter().any(|entry| entry.name().is_some());
         for address in &self.drained_servers {
             let is_listed = has_names || self.simulation_servers.contains(&ServerEntry::Server(address.clone()));
-            require(is_listed, "drainedServers", || format!("{address} is not one of simulationServers"))?;
+            require(is_listed, "drainedServers", || {
+                format!("{address} is not one of simulationServers")
+            })?;
         }
         Ok(())
     }
@@ -158,7 +165,9 @@ impl Configuration for SessionConfig {
         })?;
         let allowed = "no URL of a web server; allowed are http and https";
         if let Some(script) = &self.viewer_script {
-            require(is_web_url(script.as_str()), "viewerScript", || format!("{script} is {allowed}"))?;
+            require(is_web_url(script.as_str()), "viewerScript", || {
+                format!("{script} is {allowed}")
+            })?;
         }
         self.webhook = self.webhook.take().filter(|url| !url.reveal().is_empty());
         if let Some(webhook) = &self.webhook {

@@ -41,9 +41,13 @@ pub async fn look_up_all(names: Vec<PublicAddress>) -> Vec<(PublicAddress, Looku
 
 async fn servers(name: &PublicAddress) -> LookupResult {
     // One timeout for all attempts of the resolver, because they delay the results of the other names.
-    let addresses =
-        timeout(Duration::from_secs(2), look_up(name.host())).await.map_err(|_| "timed out".to_owned())??;
-    addresses.into_iter().map(|address| SocketAddr::new(address, name.port()).to_string().parse()).collect()
+    let addresses = timeout(Duration::from_secs(2), look_up(name.host()))
+        .await
+        .map_err(|_| "timed out".to_owned())??;
+    addresses
+        .into_iter()
+        .map(|address| SocketAddr::new(address, name.port()).to_string().parse())
+        .collect()
 }
 
 impl NameTable {
@@ -94,8 +98,19 @@ impl NameTable {
         let mut seen = BTreeSet::new();
         let mut servers = Vec::new();
         for entry in entries {
-            let found = entry.name().and_then(|name| self.0.get(name)).into_iter().flat_map(|known| &known.servers);
-            servers.extend(entry.server().into_iter().chain(found).filter(|server| seen.insert(*server)).cloned());
+            let found = entry
+                .name()
+                .and_then(|name| self.0.get(name))
+                .into_iter()
+                .flat_map(|known| &known.servers);
+            servers.extend(
+                entry
+                    .server()
+                    .into_iter()
+                    .chain(found)
+                    .filter(|server| seen.insert(*server))
+                    .cloned(),
+            );
         }
         servers
     }

@@ -136,10 +136,12 @@ impl Registry {
         let ServerTable { records, fleet, .. } = &mut self.servers;
         let accepts = |address: &PublicAddress, world| records.get(address)?.accepts(world);
         let eligible = |address: &PublicAddress| world.is_none_or(|world| accepts(address, world) == Some(true));
-        fleet.pick(Instant::now(), self.quota.take(from, true), eligible).ok_or_else(|| match world {
-            Some(world) if is_refused(records.values(), world) => PickError::NotAccepted(world.repository()),
-            _ => PickError::Unavailable,
-        })
+        fleet
+            .pick(Instant::now(), self.quota.take(from, true), eligible)
+            .ok_or_else(|| match world {
+                Some(world) if is_refused(records.values(), world) => PickError::NotAccepted(world.repository()),
+                _ => PickError::Unavailable,
+            })
     }
 
     fn status_of(&self, record: &ServerRecord) -> ServerStatus {
@@ -190,7 +192,15 @@ impl Actor for Registry {
 impl Handler<ProbeResult> for Registry {
     type Result = ();
 
-    fn handle(&mut self, ProbeResult { server, latency, answer }: ProbeResult, _: &mut Self::Context) {
+    fn handle(
+        &mut self,
+        ProbeResult {
+            server,
+            latency,
+            answer,
+        }: ProbeResult,
+        _: &mut Self::Context,
+    ) {
         self.record(&server, latency, answer);
         self.publish();
     }
@@ -210,7 +220,11 @@ impl Handler<GetStatus> for Registry {
     type Result = MessageResult<GetStatus>;
 
     fn handle(&mut self, _: GetStatus, _: &mut Self::Context) -> Self::Result {
-        let loads = self.servers.records.values().filter_map(|record| Some(record.current()?.load));
+        let loads = self
+            .servers
+            .records
+            .values()
+            .filter_map(|record| Some(record.current()?.load));
         MessageResult(Arc::new(FleetStatus {
             available: *self.available.borrow(),
             mean_load: Load::mean(loads).map(Load::percent),

@@ -38,7 +38,11 @@ pub async fn look_up(name: &str) -> Result<Vec<IpAddr>, String> {
         builder.build()?.lookup_ip(name).await
     };
     let found = found.await.map_err(|error: NetError| {
-        if error.is_no_records_found() { "DNS has no such records".to_owned() } else { error.to_string() }
+        if error.is_no_records_found() {
+            "DNS has no such records".to_owned()
+        } else {
+            error.to_string()
+        }
     })?;
     Ok(found.iter().map(|address| address.to_canonical()).collect())
 }
@@ -50,7 +54,10 @@ impl Resolve for HostResolver {
     fn lookup<'a>(&'a self, host: &'a str, port: u16) -> LocalBoxFuture<'a, Result<Vec<SocketAddr>, Box<dyn Error>>> {
         Box::pin(async move {
             let found = look_up(host.trim_matches(['[', ']'])).await?;
-            Ok(found.into_iter().map(|address| SocketAddr::new(address, port)).collect())
+            Ok(found
+                .into_iter()
+                .map(|address| SocketAddr::new(address, port))
+                .collect())
         })
     }
 }

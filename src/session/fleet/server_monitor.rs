@@ -55,8 +55,12 @@ const MAX_REASON_LENGTH: usize = 500;
 const LOAD_ONLY: Duration = Duration::from_mins(1);
 
 /// Status codes of a server that has no such page; some servers answer only that the request is invalid.
-const NO_SUCH_PAGE: [StatusCode; 4] =
-    [StatusCode::NOT_FOUND, StatusCode::BAD_REQUEST, StatusCode::METHOD_NOT_ALLOWED, StatusCode::NOT_IMPLEMENTED];
+const NO_SUCH_PAGE: [StatusCode; 4] = [
+    StatusCode::NOT_FOUND,
+    StatusCode::BAD_REQUEST,
+    StatusCode::METHOD_NOT_ALLOWED,
+    StatusCode::NOT_IMPLEMENTED,
+];
 
 /// An HTTP client that keeps one connection to the simulation server.
 fn client(interval: Duration, tls: Option<Arc<ClientConfig>>) -> awc::Client {
@@ -68,7 +72,11 @@ fn client(interval: Duration, tls: Option<Arc<ClientConfig>>) -> awc::Client {
     if let Some(config) = tls {
         connector = connector.rustls_0_23(config);
     }
-    awc::Client::builder().connector(connector).disable_timeout().disable_redirects().finish()
+    awc::Client::builder()
+        .connector(connector)
+        .disable_timeout()
+        .disable_redirects()
+        .finish()
 }
 
 /// Probes a server now, and then every `loadRefresh` until the registry stops. The slot is random: reports of all
@@ -81,7 +89,9 @@ pub async fn monitor(
 ) {
     let (interval, timeout) = (config.load_refresh, config.timing.answer);
     let (client, url) = (client(interval, tls), server.http_url(config.ssl));
-    let first = (BEGIN.elapsed() + interval.mul_f64(rand::random())).div_duration_f64(SLOT).ceil();
+    let first = (BEGIN.elapsed() + interval.mul_f64(rand::random()))
+        .div_duration_f64(SLOT)
+        .ceil();
     let mut times = interval_at((*BEGIN + SLOT.mul_f64(first)).into(), interval);
     times.set_missed_tick_behavior(MissedTickBehavior::Skip);
     // When the server was last found to have no `/status`.
@@ -90,7 +100,11 @@ pub async fn monitor(
         let begun = Instant::now();
         let answer = actix_rt::time::timeout(timeout, probe(&client, &url, &mut without_status)).await;
         let answer = answer.unwrap_or_else(|_| Err(format!("no answer within {} s", timeout.as_secs_f64())));
-        match results.try_send(ProbeResult { server: server.clone(), latency: begun.elapsed(), answer }) {
+        match results.try_send(ProbeResult {
+            server: server.clone(),
+            latency: begun.elapsed(),
+            answer,
+        }) {
             Ok(()) => {}
             Err(SendError::Full(_)) => log::warn!("{server}: a report is lost, too many are waiting"),
             // The registry has stopped, and the server with it.
@@ -139,7 +153,10 @@ async fn get(client: &awc::Client, url: &str) -> Result<Option<(Bytes, Option<us
     if !status.is_success() {
         return Err(bad_answer(format!("status {status}")));
     }
-    let length = answer.headers().get(CONTENT_LENGTH).and_then(|value| value.to_str().ok()?.parse::<usize>().ok());
+    let length = answer
+        .headers()
+        .get(CONTENT_LENGTH)
+        .and_then(|value| value.to_str().ok()?.parse::<usize>().ok());
     let bytes = answer.timeout(NEVER).body().limit(MAX_ANSWER_SIZE).await;
     Ok(Some((bytes.map_err(bad_answer)?, length)))
 }
@@ -161,11 +178,17 @@ fn no_answer(error: SendRequestError) -> String {
 fn usable(report: ServerReport) -> Result<ServerReport, String> {
     match &report.problem {
         _ if report.load.percent() > MAX_LOAD => Err(bad_answer(format!("a load of {} %", report.load))),
-        Some(problem) => Err(format!("it can start no simulation: {}", excerpt(problem, MAX_REASON_LENGTH))),
+        Some(problem) => Err(format!(
+            "it can start no simulation: {}",
+            excerpt(problem, MAX_REASON_LENGTH)
+        )),
         None => Ok(report),
     }
 }
 
 fn bad_answer(reason: impl Display) -> String {
-    format!("an answer that makes no sense: {}", excerpt(&reason.to_string(), MAX_REASON_LENGTH))
+    format!(
+        "an answer that makes no sense: {}",
+        excerpt(&reason.to_string(), MAX_REASON_LENGTH)
+    )
 }

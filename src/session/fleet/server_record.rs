@@ -89,13 +89,18 @@ impl ServerRecord {
     /// what has changed.
     pub fn succeeded(&mut self, report: Arc<ServerReport>, at: Instant, limit: f64) -> Option<ServerChange> {
         let load = report.load.percent();
-        let full = report.instances.filter(|instances| instances.present() >= instances.places);
+        let full = report
+            .instances
+            .filter(|instances| instances.present() >= instances.places);
         let (state, reason) = if self.drained {
             (ServerState::Draining, " (drained by drainedServers)".to_owned())
         } else if report.draining {
             (ServerState::Draining, " (it drains itself)".to_owned())
         } else if let Some(full) = full {
-            (ServerState::Full, format!(", {} clients in {} places", full.present(), full.places))
+            (
+                ServerState::Full,
+                format!(", {} clients in {} places", full.present(), full.places),
+            )
         } else if load >= limit {
             (ServerState::Full, format!(" of {limit:.1} %"))
         } else {
@@ -132,7 +137,12 @@ impl ServerRecord {
             return None;
         }
         self.since = timestamp(SystemTime::now());
-        let change = StateChange { at: self.since.clone(), server: self.address.to_string(), state, why: why() };
+        let change = StateChange {
+            at: self.since.clone(),
+            server: self.address.to_string(),
+            state,
+            why: why(),
+        };
         // The four events of the original.
         let event = match (before, state) {
             (_, ServerState::Down) => Some(NoticeKind::NotResponding),
@@ -178,7 +188,10 @@ pub struct FleetStatus {
 impl FleetStatus {
     /// Number of simulation servers in this state.
     pub fn count(&self, state: ServerState) -> usize {
-        self.servers.iter().filter(|server| server.record.state == state).count()
+        self.servers
+            .iter()
+            .filter(|server| server.record.state == state)
+            .count()
     }
 }
 
@@ -224,15 +237,29 @@ mod tests {
             Some(load) => record.succeeded(Arc::new(report(*load)), Instant::now(), 95.0),
             None => record.failed(String::new()),
         };
-        steps.iter().map(change).map(|change| change.and_then(|(_, event)| event)).collect()
+        steps
+            .iter()
+            .map(change)
+            .map(|change| change.and_then(|(_, event)| event))
+            .collect()
     }
 
     #[test]
     fn the_administrator_hears_of_four_events() {
         use NoticeKind::{AvailableAgain, MaximumLoad, NotResponding, WorkingAgain};
-        assert_eq!(events(&[Some(1.0), Some(2.0)]), [None, None], "a server that is well is no news");
-        assert_eq!(events(&[None, None, Some(1.0)]), [Some(NotResponding), None, Some(WorkingAgain)]);
-        assert_eq!(events(&[Some(95.0), Some(99.0), Some(94.9)]), [Some(MaximumLoad), None, Some(AvailableAgain)]);
+        assert_eq!(
+            events(&[Some(1.0), Some(2.0)]),
+            [None, None],
+            "a server that is well is no news"
+        );
+        assert_eq!(
+            events(&[None, None, Some(1.0)]),
+            [Some(NotResponding), None, Some(WorkingAgain)]
+        );
+        assert_eq!(
+            events(&[Some(95.0), Some(99.0), Some(94.9)]),
+            [Some(MaximumLoad), None, Some(AvailableAgain)]
+        );
         assert_eq!(
             events(&[None, Some(96.0), Some(1.0)]),
             [Some(NotResponding), Some(WorkingAgain), Some(AvailableAgain)]

@@ -23,19 +23,32 @@ const KEPT: usize = 50;
 impl StateHistory {
     /// No changes yet. Starts the mailers.
     pub fn new(config: &SessionConfig) -> Self {
-        Self { recent: VecDeque::new(), mailers: mail::start(config) }
+        Self {
+            recent: VecDeque::new(),
+            mailers: mail::start(config),
+        }
     }
 
     /// Adds and logs a change, and notifies the administrator of `event`. `record` is the server's record after it.
     pub fn add(&mut self, record: &ServerRecord, change: StateChange, event: Option<NoticeKind>) {
         let StateChange { at, server, state, why } = &change;
-        let level = if *state == ServerState::Down { log::Level::Warn } else { log::Level::Info };
+        let level = if *state == ServerState::Down {
+            log::Level::Warn
+        } else {
+            log::Level::Info
+        };
         log::log!(level, "{server}: {}: {why}", state.word());
         if let Some(event) = event {
             // The last known values: a server that does not answer reports no load, and one that works again no error.
             let load = record.report.as_ref().map(|report| report.load);
             let error = record.last_error.clone().filter(|_| !event.is_about_load());
-            let notice = Notice { server: server.clone(), event, load, error, at: at.clone() };
+            let notice = Notice {
+                server: server.clone(),
+                event,
+                load,
+                error,
+                at: at.clone(),
+            };
             for mailer in &self.mailers {
                 // Without a receiver the server stops.
                 mailer.send(notice.clone()).ok();

@@ -38,7 +38,12 @@ impl Channel {
     pub fn mail(config: &SessionConfig) -> Result<Self, String> {
         let relay = SmtpRelay::new(config).map_err(|key| format!("no mail is sent: {key} is not set"))?;
         let (server, transport) = (relay.server(), Transport::Smtp(Box::new(relay)));
-        Ok(Self { name: "mail", server, transport, time_limit: config.timing.mail_answer })
+        Ok(Self {
+            name: "mail",
+            server,
+            transport,
+            time_limit: config.timing.mail_answer,
+        })
     }
 
     /// To the URL of the key `webhook`, if it is set.
@@ -47,7 +52,12 @@ impl Channel {
         let url = url::Url::parse(webhook.reveal()).ok()?;
         let server = format!("{}:{}", url.host_str()?, url.port_or_known_default()?);
         let (transport, time_limit) = (Transport::Webhook(webhook), config.timing.mail_answer);
-        Some(Self { name: "webhook", server, transport, time_limit })
+        Some(Self {
+            name: "webhook",
+            server,
+            transport,
+            time_limit,
+        })
     }
 
     /// Delivers a text within `timing.mailAnswer`. Returns the server's answer.
@@ -63,7 +73,11 @@ impl Channel {
         });
         let timed_out = |_| Err(format!("no answer within {} s", self.time_limit.as_secs_f64()));
         let problem = |problem: String| format!("{}: {}", self.server, one_line(&problem));
-        delivered.await.unwrap_or_else(timed_out).map(|answer| one_line(&answer)).map_err(problem)
+        delivered
+            .await
+            .unwrap_or_else(timed_out)
+            .map(|answer| one_line(&answer))
+            .map_err(problem)
     }
 
     /// Sends a test. Returns the server's answer, as text.
@@ -86,8 +100,21 @@ async fn post(url: &Secret, text: &str) -> Result<String, String> {
         connector = connector.rustls_0_23(config);
     }
     // A redirect would send the notices to another server.
-    let client = awc::Client::builder().connector(connector).disable_timeout().disable_redirects().finish();
-    let answer = client.post(url.reveal()).send_json(&json!({ "text": text.join("\n") })).await;
-    let status = answer.map_err(|error| tls::reason(&error).unwrap_or_else(|| error.to_string()))?.status();
-    if status.is_success() { Ok(status.to_string()) } else { Err(status.to_string()) }
+    let client = awc::Client::builder()
+        .connector(connector)
+        .disable_timeout()
+        .disable_redirects()
+        .finish();
+    let answer = client
+        .post(url.reveal())
+        .send_json(&json!({ "text": text.join("\n") }))
+        .await;
+    let status = answer
+        .map_err(|error| tls::reason(&error).unwrap_or_else(|| error.to_string()))?
+        .status();
+    if status.is_success() {
+        Ok(status.to_string())
+    } else {
+        Err(status.to_string())
+    }
 }

@@ -11,7 +11,11 @@ const MAX_LETTERS: usize = 500;
 
 /// The last lines of each text: the URL of the monitor, and the session server that sends the text.
 pub fn signature(config: &SessionConfig) -> String {
-    format!("Monitor: {}/monitor\nSent by the session server {}\n", config.http_url(), config.address())
+    format!(
+        "Monitor: {}/monitor\nSent by the session server {}\n",
+        config.http_url(),
+        config.address()
+    )
 }
 
 /// The text about these notices. Its first line is the subject of a mail.
@@ -28,20 +32,36 @@ pub fn test_text(signature: &str) -> String {
 
 fn paragraph(notice: &Notice) -> String {
     let (server, event, time) = (excerpt(&notice.server, MAX_LETTERS), notice.event.words(), &notice.at);
-    let load = notice.load.map(|load| format!("  Load:       {:.1}%\n", load.percent())).unwrap_or_default();
-    let error = notice.error.as_ref().map(|error| format!("  Last error: {}\n", excerpt(error, MAX_LETTERS)));
-    format!("{server}: {event}\n  Time:       {time}\n{load}{}\n", error.unwrap_or_default())
+    let load = notice
+        .load
+        .map(|load| format!("  Load:       {:.1}%\n", load.percent()))
+        .unwrap_or_default();
+    let error = notice
+        .error
+        .as_ref()
+        .map(|error| format!("  Last error: {}\n", excerpt(error, MAX_LETTERS)));
+    format!(
+        "{server}: {event}\n  Time:       {time}\n{load}{}\n",
+        error.unwrap_or_default()
+    )
 }
 
 /// The subject: `Simulation server not responding: HOST:PORT`, or `Simulation servers: 3 not responding, 1 working again`.
 pub fn summary(entries: &[WaitingNotice]) -> String {
     use NoticeKind::{AvailableAgain, MaximumLoad, NotResponding, WorkingAgain};
     if let [WaitingNotice { notice, .. }] = entries {
-        return format!("Simulation server {}: {}", notice.event.words(), excerpt(&notice.server, MAX_LETTERS));
+        return format!(
+            "Simulation server {}: {}",
+            notice.event.words(),
+            excerpt(&notice.server, MAX_LETTERS)
+        );
     }
     let counts = [NotResponding, WorkingAgain, MaximumLoad, AvailableAgain].map(|event| {
         let count = entries.iter().filter(|entry| entry.notice.event == event).count();
         (count > 0).then(|| format!("{count} {}", event.words()))
     });
-    format!("Simulation servers: {}", counts.into_iter().flatten().collect::<Vec<_>>().join(", "))
+    format!(
+        "Simulation servers: {}",
+        counts.into_iter().flatten().collect::<Vec<_>>().join(", ")
+    )
 }

@@ -93,11 +93,18 @@ struct TopicState {
 impl Outbox {
     /// An empty outbox.
     pub fn new(timing: &Timing) -> Self {
-        Self { timing: timing.clone(), topics: BTreeMap::new(), delay: timing.mail_retry, retry_at: None }
+        Self {
+            timing: timing.clone(),
+            topics: BTreeMap::new(),
+            delay: timing.mail_retry,
+            retry_at: None,
+        }
     }
 
     fn topic(&mut self, notice: &Notice) -> &mut TopicState {
-        self.topics.entry((notice.event.is_about_load(), notice.server.clone())).or_default()
+        self.topics
+            .entry((notice.event.is_about_load(), notice.server.clone()))
+            .or_default()
     }
 
     /// Adds a notice. It replaces one about the same topic.
@@ -105,7 +112,11 @@ impl Outbox {
         let (gathered, expires) = (now + self.timing.gather, now + self.timing.mail_patience);
         let topic = self.topic(&notice);
         let gathered = topic.waiting.as_ref().map_or(gathered, |older| older.gathered);
-        topic.waiting = Some(WaitingNotice { notice, gathered, expires });
+        topic.waiting = Some(WaitingNotice {
+            notice,
+            gathered,
+            expires,
+        });
     }
 
     /// When the next e-mail is due, unless another notice is added.
@@ -118,7 +129,8 @@ impl Outbox {
     /// Removes and returns the notices that are due, sorted by topic, then by server. The caller must report the
     /// outcome by [`Self::succeeded`] or [`Self::failed`].
     pub fn take(&mut self, now: Instant) -> Vec<WaitingNotice> {
-        self.topics.retain(|_, topic| topic.waiting.is_some() || topic.held_until > Some(now));
+        self.topics
+            .retain(|_, topic| topic.waiting.is_some() || topic.held_until > Some(now));
         if self.due().is_none_or(|due| due > now) {
             return Vec::new();
         }
@@ -158,7 +170,13 @@ mod tests {
     type Mail = (u64, Vec<(u16, NoticeKind)>);
 
     fn notice(port: u16, event: NoticeKind) -> Notice {
-        Notice { server: format!("host:{port}"), event, load: None, error: None, at: String::new() }
+        Notice {
+            server: format!("host:{port}"),
+            event,
+            load: None,
+            error: None,
+            at: String::new(),
+        }
     }
 
     /// An outbox with the defaults: `gather` 10 s, `flapping` 600 s, `mailPatience` one hour.
@@ -197,26 +215,49 @@ mod tests {
         for (notices, mails) in [
             // Servers that fail together.
             (
-                vec![(0, 1, NotResponding), (3, 2, NotResponding), (9, 3, MaximumLoad), (11, 4, NotResponding)],
+                vec![
+                    (0, 1, NotResponding),
+                    (3, 2, NotResponding),
+                    (9, 3, MaximumLoad),
+                    (11, 4, NotResponding),
+                ],
                 vec![
                     (10, vec![(1, NotResponding), (2, NotResponding), (3, MaximumLoad)]),
                     (21, vec![(4, NotResponding)]),
                 ],
             ),
             // A recovery is mailed `flapping` seconds after the failure.
-            (vec![(0, 1, NotResponding), (100, 1, WorkingAgain)], vec![one(10, NotResponding), one(610, WorkingAgain)]),
-            (vec![(0, 1, MaximumLoad), (590, 1, AvailableAgain)], vec![one(10, MaximumLoad), one(610, AvailableAgain)]),
+            (
+                vec![(0, 1, NotResponding), (100, 1, WorkingAgain)],
+                vec![one(10, NotResponding), one(610, WorkingAgain)],
+            ),
+            (
+                vec![(0, 1, MaximumLoad), (590, 1, AvailableAgain)],
+                vec![one(10, MaximumLoad), one(610, AvailableAgain)],
+            ),
             // A second failure soon after the first waits.
             (
                 vec![(0, 1, NotResponding), (100, 1, WorkingAgain), (200, 1, NotResponding)],
                 vec![one(10, NotResponding), one(610, NotResponding)],
             ),
             // A failure is mailed although the same server was at maximum load before.
-            (vec![(0, 1, MaximumLoad), (60, 1, NotResponding)], vec![one(10, MaximumLoad), one(70, NotResponding)]),
+            (
+                vec![(0, 1, MaximumLoad), (60, 1, NotResponding)],
+                vec![one(10, MaximumLoad), one(70, NotResponding)],
+            ),
             // A server that flaps does not delay the others.
             (
-                vec![(0, 1, NotResponding), (20, 1, WorkingAgain), (21, 1, NotResponding), (30, 2, NotResponding)],
-                vec![one(10, NotResponding), (40, vec![(2, NotResponding)]), one(610, NotResponding)],
+                vec![
+                    (0, 1, NotResponding),
+                    (20, 1, WorkingAgain),
+                    (21, 1, NotResponding),
+                    (30, 2, NotResponding),
+                ],
+                vec![
+                    one(10, NotResponding),
+                    (40, vec![(2, NotResponding)]),
+                    one(610, NotResponding),
+                ],
             ),
         ] {
             assert_eq!(play(&notices), mails, "{notices:?}");
@@ -225,11 +266,14 @@ mod tests {
 
     #[test]
     fn a_server_that_flaps_each_second_is_one_mail_in_ten_minutes() {
-        for events in
-            [vec![NotResponding, WorkingAgain], vec![MaximumLoad, NotResponding, WorkingAgain, AvailableAgain]]
-        {
-            let notices: Vec<_> =
-                (0..1_000).zip(events.iter().cycle()).map(|(second, event)| (second, 1, *event)).collect();
+        for events in [
+            vec![NotResponding, WorkingAgain],
+            vec![MaximumLoad, NotResponding, WorkingAgain, AvailableAgain],
+        ] {
+            let notices: Vec<_> = (0..1_000)
+                .zip(events.iter().cycle())
+                .map(|(second, event)| (second, 1, *event))
+                .collect();
             let mails: Vec<u64> = play(&notices).into_iter().map(|(when, _)| when).collect();
             assert_eq!(mails, [10, 610, 1_210]);
         }

@@ -38,13 +38,26 @@ impl SmtpRelay {
         let from = config.mail_sender.clone().ok_or("mailSender")?;
         let host = config.mail_server.clone().ok_or("mailServer")?;
         let to = config.administrator.clone().ok_or("administrator")?;
-        let password = config.mail_sender_password.as_ref().map(Secret::reveal).filter(|text| !text.is_empty());
+        let password = config
+            .mail_sender_password
+            .as_ref()
+            .map(Secret::reveal)
+            .filter(|text| !text.is_empty());
         let user = config.mail_sender_user.clone().filter(|user| !user.is_empty());
         let user = user.unwrap_or_else(|| from.email.to_string());
         let login = password.map(|password| Credentials::new(user, password.to_owned()));
-        let port = config.mail_server_port.unwrap_or(if login.is_some() { 587 } else { 25 });
+        let port = config
+            .mail_server_port
+            .unwrap_or(if login.is_some() { 587 } else { 25 });
         let implicit_tls = config.mail_server_implicit_tls.unwrap_or(port == IMPLICIT_TLS_PORT);
-        Ok(Self { from, to, host, port, implicit_tls, login })
+        Ok(Self {
+            from,
+            to,
+            host,
+            port,
+            implicit_tls,
+            login,
+        })
     }
 
     /// `HOST:PORT`.
@@ -58,15 +71,25 @@ impl SmtpRelay {
     /// When the SMTP server does not take it.
     pub(super) async fn deliver(&self, text: &str) -> Result<String, String> {
         let subject = text.lines().next().unwrap_or_default();
-        let message = Message::builder().from(self.from.clone()).to(self.to.clone()).subject(subject).message_id(None);
-        let mut message =
-            message.header(ContentType::TEXT_PLAIN).body(text.to_owned()).map_err(|error| error.to_string())?;
+        let message = Message::builder()
+            .from(self.from.clone())
+            .to(self.to.clone())
+            .subject(subject)
+            .message_id(None);
+        let mut message = message
+            .header(ContentType::TEXT_PLAIN)
+            .body(text.to_owned())
+            .map_err(|error| error.to_string())?;
         // Automatic responders must not answer (RFC 3834).
         let name = HeaderName::new_from_ascii_str("Auto-Submitted");
-        message.headers_mut().insert_raw(HeaderValue::new(name, "auto-generated".to_owned()));
+        message
+            .headers_mut()
+            .insert_raw(HeaderValue::new(name, "auto-generated".to_owned()));
         // The caller sets the timeout, because lettre's covers connecting only. Each e-mail gets a new connection:
         // lettre's pool would reuse one that has timed out.
-        let answer = async { self.transport()?.send(message).await }.await.map_err(|error| reason(&error))?;
+        let answer = async { self.transport()?.send(message).await }
+            .await
+            .map_err(|error| reason(&error))?;
         Ok(answer.first_line().unwrap_or_default().to_owned())
     }
 
@@ -74,7 +97,11 @@ impl SmtpRelay {
         let mut builder = AsyncSmtpTransport::<Tokio1Executor>::builder_dangerous(self.host.as_str()).port(self.port);
         if self.login.is_some() || self.implicit_tls {
             let parameters = TlsParameters::new(self.host.clone())?;
-            builder = builder.tls(if self.implicit_tls { Tls::Wrapper(parameters) } else { Tls::Required(parameters) });
+            builder = builder.tls(if self.implicit_tls {
+                Tls::Wrapper(parameters)
+            } else {
+                Tls::Required(parameters)
+            });
         }
         if let Some(login) = &self.login {
             builder = builder.credentials(login.clone());

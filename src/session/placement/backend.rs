@@ -114,7 +114,11 @@ impl Backend {
         replicas: &mut Replicas,
     ) {
         self.ejection.report(now, report.failed_starts);
-        let report = LastReport { at: now, load: report.load.percent(), instances: report.instances };
+        let report = LastReport {
+            at: now,
+            load: report.load.percent(),
+            instances: report.instances,
+        };
         self.note_changes(report, replicas);
         self.fresh = 0;
         // Changes that the load shows by now are dropped.
@@ -126,10 +130,18 @@ impl Backend {
         // A report of only a load teaches nothing, because it does not show which part of the load is clients: such a
         // server keeps the configured cost.
         let counts = report.instances.is_some();
-        let estimate = if counts { self.fit.estimate(self.cost) } else { Estimate::default() };
+        let estimate = if counts {
+            self.fit.estimate(self.cost)
+        } else {
+            Estimate::default()
+        };
         fleet.replace(self.estimate, estimate);
         self.estimate = estimate;
-        self.cost = if counts { fleet.cost(estimate, policy.client_cost) } else { believable(policy.client_cost) };
+        self.cost = if counts {
+            fleet.cost(estimate, policy.client_cost)
+        } else {
+            believable(policy.client_cost)
+        };
     }
 
     /// Records that a client was sent here.
@@ -164,7 +176,11 @@ impl Backend {
     pub(super) fn limit(&self, policy: &PlacementPolicy) -> f64 {
         // A server with expensive clients is full earlier, because the next one would need more than the machine has.
         // A threshold above 100 means that the load never makes a server full.
-        if policy.threshold > 100.0 { policy.threshold } else { policy.threshold.min(100.0 - self.cost) }
+        if policy.threshold > 100.0 {
+            policy.threshold
+        } else {
+            policy.threshold.min(100.0 - self.cost)
+        }
     }
 
     /// The load, in percent, that is expected once it shows all clients that reserve room; `None` if the server is
@@ -177,7 +193,11 @@ impl Backend {
     /// clients that were sent to them.
     pub(super) fn current_rank(&self, policy: &PlacementPolicy) -> Option<Rank> {
         let load = self.load_with(self.in_flight.len()).filter(|_| self.has_room(policy))?;
-        Some(Rank { is_ejected: self.ejection.until.is_some(), load: load.to_bits(), last_pick: self.last_pick })
+        Some(Rank {
+            is_ejected: self.ejection.until.is_some(),
+            load: load.to_bits(),
+            last_pick: self.last_pick,
+        })
     }
 
     fn load_with(&self, in_flight: usize) -> Option<f64> {
@@ -194,13 +214,20 @@ impl Backend {
     }
 
     fn learn(&mut self, report: LastReport) {
-        let Some((before, instances)) = self.last.zip(report.instances) else { return };
+        let Some((before, instances)) = self.last.zip(report.instances) else {
+            return;
+        };
         // Clients in the queue cost nothing yet.
         let present = f64::from(instances.present().min(instances.places));
         let shown = (present - self.unseen).max(0.0);
         // While many start, it is uncertain how much of them the load shows.
         let trust = if shown < present { shown / present } else { 1.0 };
-        self.fit.learn(shown, report.load, report.at.saturating_duration_since(before.at), trust * trust);
+        self.fit.learn(
+            shown,
+            report.load,
+            report.at.saturating_duration_since(before.at),
+            trust * trust,
+        );
     }
 
     /// Compares the report with the one before: which clients arrived, which left.
@@ -209,7 +236,8 @@ impl Backend {
             // A load alone does not show arrivals: every placement that reserves room is assumed to have arrived at
             // once.
             let arrived = self.in_flight.drain(..).filter(|placed| placed.takes_room);
-            self.settling.extend(arrived.map(|Placement { at, .. }| ClientDelta { at, clients: 1.0 }));
+            self.settling
+                .extend(arrived.map(|Placement { at, .. }| ClientDelta { at, clients: 1.0 }));
             self.reserved = 0;
             return;
         };
@@ -279,9 +307,16 @@ mod tests {
 
         /// Reports a load and the numbers of clients that are present and that have arrived.
         fn report(&mut self, seconds: f64, load: f64, counts: Option<(u32, u64)>) {
-            let instances =
-                counts.map(|(running, arrivals)| Instances { running, places: 1000, arrivals, ..Instances::default() });
-            let report = ServerReport { instances, ..ServerReport::load_only(Load::try_from(load).unwrap()) };
+            let instances = counts.map(|(running, arrivals)| Instances {
+                running,
+                places: 1000,
+                arrivals,
+                ..Instances::default()
+            });
+            let report = ServerReport {
+                instances,
+                ..ServerReport::load_only(Load::try_from(load).unwrap())
+            };
             let (at, policy) = (self.at(seconds), PlacementPolicy::default());
             self.0.expire(at, &policy);
             self.0.report(at, &report, true, &policy, &mut self.2, &mut self.3);

@@ -35,7 +35,11 @@ const HIGHEST: f64 = 50.0;
 
 /// Clamps a cost to the plausible range, in percent; NaN becomes the highest.
 pub(super) fn believable(cost: f64) -> f64 {
-    if cost.is_nan() { HIGHEST } else { cost.clamp(LOWEST, HIGHEST) }
+    if cost.is_nan() {
+        HIGHEST
+    } else {
+        cost.clamp(LOWEST, HIGHEST)
+    }
 }
 
 /// Whether a load is so far above the expected one, both in percent, that other programs must be running.
@@ -73,7 +77,11 @@ impl CostFit {
     /// Nothing learned yet: a client costs `guess` percent.
     pub(super) fn new(guess: f64) -> Self {
         let guess = believable(guess);
-        Self { guess, idle_weight: BASE_TRUST, ..Self::default() }
+        Self {
+            guess,
+            idle_weight: BASE_TRUST,
+            ..Self::default()
+        }
     }
 
     /// This server's own estimate. `believed` is the cost that was assumed until now, in percent. The variance is taken
@@ -84,7 +92,10 @@ impl CostFit {
         // One start is not evidence: any load that began at the same time would be attributed to it.
         let seen = if self.seen > 1.0 { self.seen } else { 0.0 };
         // The precision is 1 / (relative + VARIETY / seen), and 0 without evidence.
-        Estimate { log: slope.ln(), precision: seen / (seen * relative + VARIETY) }
+        Estimate {
+            log: slope.ln(),
+            precision: seen / (seen * relative + VARIETY),
+        }
     }
 
     /// Counts clients that have arrived.
@@ -105,7 +116,11 @@ impl CostFit {
             return;
         }
         if clients < 0.5 {
-            let seconds = if is_foreign(load, self.idle_load) { seconds * FOREIGN_TRUST } else { seconds };
+            let seconds = if is_foreign(load, self.idle_load) {
+                seconds * FOREIGN_TRUST
+            } else {
+                seconds
+            };
             let weight = (self.idle_weight + seconds).min(IDLE_MEMORY);
             self.idle_load += (load - self.idle_load) * seconds / weight;
             self.idle_weight = weight;
@@ -129,7 +144,10 @@ impl CostFit {
     /// The base and the cost of a client, both in percent of load, and the variance of the cost.
     fn fit(&self) -> (f64, f64, f64) {
         let trust = NOISE / (self.guess * self.guess);
-        let (weight, load) = (self.weight + self.idle_weight, self.load + self.idle_weight * self.idle_load);
+        let (weight, load) = (
+            self.weight + self.idle_weight,
+            self.load + self.idle_weight * self.idle_load,
+        );
         let squares = self.clients_squared + trust;
         let products = self.clients_by_load + trust * self.guess;
         // Positive, because weight * clients_squared >= clients * clients holds before the positive terms are added to
@@ -140,7 +158,11 @@ impl CostFit {
         let (base, slope, variance) = if base < 0.0 {
             (0.0, products / squares, NOISE / squares)
         } else {
-            (base, (weight * products - self.clients * load) / determinant, NOISE * weight / determinant)
+            (
+                base,
+                (weight * products - self.clients * load) / determinant,
+                NOISE * weight / determinant,
+            )
         };
         (base, believable(slope), variance)
     }
@@ -202,18 +224,32 @@ mod tests {
 
     /// A fleet of this many servers, and its start.
     fn fleet(client_cost: f64, servers: u32) -> (LoadBalancer<u32>, Instant) {
-        let mut fleet = LoadBalancer::new(PlacementPolicy { client_cost, ..PlacementPolicy::default() });
+        let mut fleet = LoadBalancer::new(PlacementPolicy {
+            client_cost,
+            ..PlacementPolicy::default()
+        });
         (0..servers).for_each(|id| fleet.add(id));
         (fleet, Instant::now())
     }
 
     fn report(load: f64, present: u32, arrivals: u32) -> ServerReport {
-        let instances = Instances { running: present, places: 1000, arrivals: arrivals.into(), ..Instances::default() };
-        ServerReport { instances: Some(instances), ..ServerReport::load_only(Load::try_from(load).unwrap()) }
+        let instances = Instances {
+            running: present,
+            places: 1000,
+            arrivals: arrivals.into(),
+            ..Instances::default()
+        };
+        ServerReport {
+            instances: Some(instances),
+            ..ServerReport::load_only(Load::try_from(load).unwrap())
+        }
     }
 
     fn assert_near(value: Option<f64>, expected: f64, tolerance: f64) {
-        assert!(value.is_some_and(|value| (value - expected).abs() <= tolerance), "{value:?} is not {expected}");
+        assert!(
+            value.is_some_and(|value| (value - expected).abs() <= tolerance),
+            "{value:?} is not {expected}"
+        );
     }
 
     /// Reports once a second for ten minutes, while the number of clients moves between 0 and 10.
@@ -221,10 +257,19 @@ mod tests {
         for second in 0..600_u32 {
             // Each client stays long enough for the mean load to show it.
             let step = second / 20;
-            let present = if (step / 10).is_multiple_of(2) { step % 10 } else { 10 - step % 10 };
+            let present = if (step / 10).is_multiple_of(2) {
+                step % 10
+            } else {
+                10 - step % 10
+            };
             let noise = if second.is_multiple_of(2) { 1.0 } else { -1.0 };
             let load = (5.0 + cost * f64::from(present) + noise).min(100.0);
-            fleet.report(&id, start + Duration::from_secs(second.into()), &report(load, present, step + 1), true);
+            fleet.report(
+                &id,
+                start + Duration::from_secs(second.into()),
+                &report(load, present, step + 1),
+                true,
+            );
         }
     }
 
@@ -280,7 +325,12 @@ mod tests {
             arrivals += present.saturating_sub(before);
             before = *present;
             for _ in 0..*seconds {
-                fleet.report(&0, start + Duration::from_secs(second), &report(*load, *present, arrivals), true);
+                fleet.report(
+                    &0,
+                    start + Duration::from_secs(second),
+                    &report(*load, *present, arrivals),
+                    true,
+                );
                 second += 1;
             }
         }

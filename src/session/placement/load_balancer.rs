@@ -65,7 +65,9 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
     /// Adds a server, which is down until its first report. A known server is not changed.
     pub fn add(&mut self, id: Id) {
         self.picks += 1;
-        self.servers.entry(id).or_insert_with(|| Backend::new(&self.policy, self.picks));
+        self.servers
+            .entry(id)
+            .or_insert_with(|| Backend::new(&self.policy, self.picks));
     }
 
     /// Removes a server and all that was known of it.
@@ -130,7 +132,9 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
 
     /// Whether others are preferred to a server, because its last starts have failed.
     pub fn is_ejected(&self, id: &Id) -> bool {
-        self.servers.get(id).is_some_and(|server| server.ejection.until.is_some())
+        self.servers
+            .get(id)
+            .is_some_and(|server| server.ejection.until.is_some())
     }
 
     /// The load, in percent, that is expected once it shows all clients that reserve room; `None` if the server is
@@ -172,11 +176,19 @@ mod tests {
     use proptest::prelude::*;
 
     fn report(load: f64, instances: Option<Instances>) -> ServerReport {
-        ServerReport { instances, ..ServerReport::load_only(Load::try_from(load).unwrap()) }
+        ServerReport {
+            instances,
+            ..ServerReport::load_only(Load::try_from(load).unwrap())
+        }
     }
 
     fn instances(running: u32, places: u32, arrivals: u64) -> Instances {
-        Instances { running, places, arrivals, ..Instances::default() }
+        Instances {
+            running,
+            places,
+            arrivals,
+            ..Instances::default()
+        }
     }
 
     fn load_only(load: f64) -> ServerReport {
@@ -189,7 +201,10 @@ mod tests {
 
     /// Servers 0, 1, ... with these reports.
     fn fleet(client_cost: f64, now: Instant, reports: impl IntoIterator<Item = ServerReport>) -> LoadBalancer<u32> {
-        let mut fleet = LoadBalancer::new(PlacementPolicy { client_cost, ..PlacementPolicy::default() });
+        let mut fleet = LoadBalancer::new(PlacementPolicy {
+            client_cost,
+            ..PlacementPolicy::default()
+        });
         for (id, report) in (0..).zip(reports) {
             fleet.add(id);
             fleet.report(&id, now, &report, true);
@@ -238,7 +253,10 @@ mod tests {
             assert!(got.iter().all(|got| (400..600).contains(got)), "{got:?}");
             let end = now + Duration::from_secs(15);
             (0..3).for_each(|id| fleet.report(&id, end, &report(10.0 * f64::from(id + 1)), true));
-            assert_eq!((0..3).map(|id| fleet.effective_load(&id)).collect::<Vec<_>>(), [10.0, 20.0, 30.0].map(Some));
+            assert_eq!(
+                (0..3).map(|id| fleet.effective_load(&id)).collect::<Vec<_>>(),
+                [10.0, 20.0, 30.0].map(Some)
+            );
         }
     }
 
@@ -255,7 +273,14 @@ mod tests {
     #[test]
     fn servers_that_all_fail_alike_are_used_as_if_none_did() {
         let now = Instant::now();
-        let mut fleet = fleet(2.0, now, [10.0, 20.0].map(|load| ServerReport { failed_starts: 5, ..load_only(load) }));
+        let mut fleet = fleet(
+            2.0,
+            now,
+            [10.0, 20.0].map(|load| ServerReport {
+                failed_starts: 5,
+                ..load_only(load)
+            }),
+        );
         assert!(fleet.available(now));
         assert_eq!(fleet.pick(now, true, |_| true), Some(0));
         assert_eq!(fleet.pick(now, true, |id| *id == 1), Some(1));
@@ -275,7 +300,10 @@ mod tests {
         }
         let at = now + Duration::from_mins(5);
         let placed = beside.map(|mut fleet| std::iter::from_fn(|| fleet.pick(at, true, |_| true)).count());
-        assert!(placed.iter().all(|placed| (95..=115).contains(placed)), "200 places are left: {placed:?}");
+        assert!(
+            placed.iter().all(|placed| (95..=115).contains(placed)),
+            "200 places are left: {placed:?}"
+        );
     }
 
     #[test]

@@ -17,6 +17,10 @@ pub struct PlacementPolicy {
 
 impl Default for PlacementPolicy {
     fn default() -> Self {
-        Self { threshold: 95.0, client_cost: 2.0, placement_timeout: Duration::from_secs(15) }
+        Self {
+            threshold: 95.0,
+            client_cost: 2.0,
+            placement_timeout: Duration::from_secs(15),
+        }
     }
 }

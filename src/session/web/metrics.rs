@@ -5,14 +5,30 @@ use crate::shared::http::Gauge;
 
 /// The gauges of `/metrics`.
 pub fn gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> {
-    let all = [ServerState::Unknown, ServerState::Up, ServerState::Full, ServerState::Draining, ServerState::Down];
+    let all = [
+        ServerState::Unknown,
+        ServerState::Up,
+        ServerState::Full,
+        ServerState::Draining,
+        ServerState::Down,
+    ];
     let of_servers = |name, help, value: &dyn Fn(&ServerStatus) -> Option<f64>| {
         let value = |server: &ServerStatus| Some((vec![server.record.address.to_string()], value(server)?));
-        Gauge { name, help, labels: &["server"], values: status.servers.iter().filter_map(value).collect() }
+        Gauge {
+            name,
+            help,
+            labels: &["server"],
+            values: status.servers.iter().filter_map(value).collect(),
+        }
     };
     let of_names = |name, help, value: &dyn Fn(&NameStatus) -> f64| {
         let value = |one: &NameStatus| (vec![one.name.clone()], value(one));
-        Gauge { name, help, labels: &["name"], values: status.names.iter().map(value).collect() }
+        Gauge {
+            name,
+            help,
+            labels: &["name"],
+            values: status.names.iter().map(value).collect(),
+        }
     };
     vec![
         Gauge::plain(
@@ -30,14 +46,26 @@ pub fn gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> 
             name: "webots_session_servers",
             help: "Simulation servers by state",
             labels: &["state"],
-            values: all.iter().map(|state| (vec![state.word()], number(status.count(*state)))).collect(),
+            values: all
+                .iter()
+                .map(|state| (vec![state.word()], number(status.count(*state))))
+                .collect(),
         },
-        of_servers("webots_session_server_up", "1 while a simulation server gives good answers", &|server| {
-            Some(f64::from(u8::from(!matches!(server.record.state, ServerState::Down | ServerState::Unknown))))
-        }),
-        of_servers("webots_session_server_load_percent", "Load that a simulation server reported last", &|server| {
-            server.record.current().map(|report| report.load.percent())
-        }),
+        of_servers(
+            "webots_session_server_up",
+            "1 while a simulation server gives good answers",
+            &|server| {
+                Some(f64::from(u8::from(!matches!(
+                    server.record.state,
+                    ServerState::Down | ServerState::Unknown
+                ))))
+            },
+        ),
+        of_servers(
+            "webots_session_server_load_percent",
+            "Load that a simulation server reported last",
+            &|server| server.record.current().map(|report| report.load.percent()),
+        ),
         of_servers(
             "webots_session_server_effective_load_percent",
             "The same, and the clients that it can't show yet",
@@ -53,12 +81,16 @@ pub fn gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> 
             "Time in which a simulation server answered last",
             &|server| server.record.latency.map(|latency| latency.as_secs_f64()),
         ),
-        of_names("webots_session_lookup_up", "1 while a name of simulation servers can be looked up", &|name| {
-            f64::from(u8::from(name.error.is_none()))
-        }),
-        of_names("webots_session_lookup_servers", "Simulation servers that a name leads to", &|name| {
-            number(name.servers)
-        }),
+        of_names(
+            "webots_session_lookup_up",
+            "1 while a name of simulation servers can be looked up",
+            &|name| f64::from(u8::from(name.error.is_none())),
+        ),
+        of_names(
+            "webots_session_lookup_servers",
+            "Simulation servers that a name leads to",
+            &|name| number(name.servers),
+        ),
     ]
 }
 

@@ -16,8 +16,13 @@ use crate::shared::http::{ConnectionKind, FOREIGN_SCRIPTS, OWN_FILES, PageView, 
 use crate::shared::run::timestamp;
 
 /// Assets of this server's pages, besides those that both servers share.
-const ASSETS: &[Asset] =
-    &[asset!("viewer.js"), asset!("start.js"), asset!("kept.js"), asset!("lifeline.js"), asset!("session_monitor.js")];
+const ASSETS: &[Asset] = &[
+    asset!("viewer.js"),
+    asset!("start.js"),
+    asset!("kept.js"),
+    asset!("lifeline.js"),
+    asset!("session_monitor.js"),
+];
 
 /// Adds the routes to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
@@ -31,30 +36,49 @@ pub fn configure(app: &mut web::ServiceConfig) {
 async fn monitor(server: web::Data<AppState>) -> Result<HttpResponse> {
     let view = view(&server, &*server.status().await?).map_err(ErrorInternalServerError)?;
     let started = timestamp(SystemTime::now() - server.started.elapsed());
-    let page = Monitor { started, has_actions: server.admin_auth.is_some(), view };
+    let page = Monitor {
+        started,
+        has_actions: server.admin_auth.is_some(),
+        view,
+    };
     Ok(html(page.render(), OWN_FILES))
 }
 
 async fn events(request: HttpRequest, server: web::Data<AppState>) -> Result<HttpResponse> {
-    let permit = server.connections.admit(ConnectionKind::Page, server.config.trusted_proxies.peer(&request))?;
+    let permit = server
+        .connections
+        .admit(ConnectionKind::Page, server.config.trusted_proxies.peer(&request))?;
     let shown = server.clone();
     let render = move || {
         let server = shown.clone();
         async move {
             let view = view(&server, &*server.status().await.ok()?);
-            view.inspect_err(|error| log::error!("the monitor page can't be rendered: {error}")).ok()
+            view.inspect_err(|error| log::error!("the monitor page can't be rendered: {error}"))
+                .ok()
         }
     };
     Ok(server.live.listen(permit, server.phase.clone(), render))
 }
 
 fn view(server: &AppState, status: &FleetStatus) -> askama::Result<PageView> {
-    pages::view(status, server.clients(), &server.client_urls, &server.announcement.borrow())
+    pages::view(
+        status,
+        server.clients(),
+        &server.client_urls,
+        &server.announcement.borrow(),
+    )
 }
 
 async fn viewer(server: web::Data<AppState>) -> HttpResponse {
     let script = server.config.viewer_script.as_ref().map(url::Url::as_str);
-    html(Viewer { examples: &server.config.examples, script }.render(), VIEWER)
+    html(
+        Viewer {
+            examples: &server.config.examples,
+            script,
+        }
+        .render(),
+        VIEWER,
+    )
 }
 
 /// Webots' own viewer is third-party code: it runs in an embedded page with an origin of its own.

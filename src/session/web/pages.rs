@@ -87,21 +87,43 @@ pub fn view(
 ) -> Result<PageView, askama::Error> {
     let rows = status.servers.iter().map(|server| {
         let monitor = format!("{}/monitor", urls.http_url(&server.record.address));
-        let html = ServerRow { server, report: server.record.current(), monitor }.render()?;
-        Ok(TableRow { key: server.record.address.to_string(), html })
+        let html = ServerRow {
+            server,
+            report: server.record.current(),
+            monitor,
+        }
+        .render()?;
+        Ok(TableRow {
+            key: server.record.address.to_string(),
+            html,
+        })
     });
     let rows = rows.collect::<Result<Vec<TableRow>, askama::Error>>()?;
     let parts = [
         ("announcement", Announced { text: announcement }.render()?),
         ("glance", Glance::new(status, clients).render()?),
-        ("changes", Changes { changes: &status.changes }.render()?),
+        (
+            "changes",
+            Changes {
+                changes: &status.changes,
+            }
+            .render()?,
+        ),
     ];
-    Ok(PageView { parts: parts.into(), tables: [("servers", rows)].into(), sample: Vec::new() })
+    Ok(PageView {
+        parts: parts.into(),
+        tables: [("servers", rows)].into(),
+        sample: Vec::new(),
+    })
 }
 
 impl<'status> Glance<'status> {
     fn new(status: &'status FleetStatus, clients: usize) -> Self {
-        let instances: Vec<_> = status.servers.iter().filter_map(|one| one.record.current()?.instances).collect();
+        let instances: Vec<_> = status
+            .servers
+            .iter()
+            .filter_map(|one| one.record.current()?.instances)
+            .collect();
         // Numbers that another server reports may be arbitrarily large.
         let sum = |part: fn(&Instances) -> u32| instances.iter().map(|one| u64::from(part(one))).sum();
         Self {
@@ -122,7 +144,10 @@ impl ServerRow<'_> {
     }
 
     fn repositories(&self) -> Vec<String> {
-        let allowed = self.report.map(|report| report.allowed_repositories.as_slice()).unwrap_or_default();
+        let allowed = self
+            .report
+            .map(|report| report.allowed_repositories.as_slice())
+            .unwrap_or_default();
         let shown = |url: &str| one_line(url.split_once("://").map_or(url, |(_, rest)| rest));
         allowed.iter().map(|prefix| shown(prefix.as_str())).collect()
     }

@@ -30,7 +30,10 @@ const MAX_ANNOUNCEMENT: usize = 300;
 
 /// Adds all routes to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
-    app.service(routing::all(add, "/session, /monitor, /viewer, /status, /load, /metrics or /health"));
+    app.service(routing::all(
+        add,
+        "/session, /monitor, /viewer, /status, /load, /metrics or /health",
+    ));
 }
 
 fn add(app: &mut web::ServiceConfig) {
@@ -46,12 +49,19 @@ fn add(app: &mut web::ServiceConfig) {
 }
 
 fn wants_websocket(request: &HttpRequest) -> bool {
-    let upgrade = request.headers().get(header::UPGRADE).and_then(|value| value.to_str().ok());
+    let upgrade = request
+        .headers()
+        .get(header::UPGRADE)
+        .and_then(|value| value.to_str().ok());
     upgrade.is_some_and(|value| value.eq_ignore_ascii_case("websocket"))
 }
 
 async fn root(request: HttpRequest, stream: web::Payload, server: web::Data<AppState>) -> Result<HttpResponse> {
-    if wants_websocket(&request) { open_websocket(&request, stream, &server) } else { Ok(availability(server).await) }
+    if wants_websocket(&request) {
+        open_websocket(&request, stream, &server)
+    } else {
+        Ok(availability(server).await)
+    }
 }
 
 async fn session(request: HttpRequest, stream: web::Payload, server: web::Data<AppState>) -> Result<HttpResponse> {
@@ -80,7 +90,9 @@ async fn session(request: HttpRequest, stream: web::Payload, server: web::Data<A
 /// The world of a query. `webots.js` does not percent-encode it, so everything after `url=` is the world: a plus sign
 /// or an ampersand may be part of it. Other clients encode it as usual in queries; then it contains no `:`.
 fn wanted_world(query: &str) -> Option<Cow<'_, str>> {
-    let begin = query.strip_prefix("url=").or_else(|| query.split_once("&url=").map(|(_, world)| world));
+    let begin = query
+        .strip_prefix("url=")
+        .or_else(|| query.split_once("&url=").map(|(_, world)| world));
     let world = begin.filter(|world| !world.is_empty())?;
     if world.contains(':') {
         return Some(Cow::Borrowed(world));
@@ -95,16 +107,27 @@ fn open_websocket(request: &HttpRequest, stream: web::Payload, server: &web::Dat
     let server = Arc::clone(server);
     // Pages that do not request announcements would not understand them.
     let wants_announcements = request.query_string().split('&').any(|one| one == "announcements=1");
-    Ok(websocket::open(request, stream, WebClient::new(server, peer, wants_announcements, permit)))
+    Ok(websocket::open(
+        request,
+        stream,
+        WebClient::new(server, peer, wants_announcements, permit),
+    ))
 }
 
 async fn availability(server: web::Data<AppState>) -> HttpResponse {
     let available = *server.available.borrow();
-    HttpResponse::Ok().content_type("text/plain").body(if available { "1" } else { "0" })
+    HttpResponse::Ok()
+        .content_type("text/plain")
+        .body(if available { "1" } else { "0" })
 }
 
 async fn load(server: web::Data<AppState>) -> HttpResponse {
-    let load = server.status().await.ok().and_then(|status| status.mean_load).unwrap_or(-1.0);
+    let load = server
+        .status()
+        .await
+        .ok()
+        .and_then(|status| status.mean_load)
+        .unwrap_or(-1.0);
     HttpResponse::Ok().content_type("text/plain").body(load.to_string())
 }
 

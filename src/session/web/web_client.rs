@@ -35,11 +35,20 @@ type Context = WebsocketContext<WebClient>;
 impl WebClient {
     /// A client that has just connected; `permit` counts it.
     pub fn new(server: Arc<AppState>, peer: Peer, wants_announcements: bool, permit: ConnectionPermit) -> Self {
-        Self { server, peer, liveness: Liveness::default(), wants_announcements, _permit: permit }
+        Self {
+            server,
+            peer,
+            liveness: Liveness::default(),
+            wants_announcements,
+            _permit: permit,
+        }
     }
 
     fn close(code: CloseCode, ctx: &mut Context) {
-        ctx.close(Some(CloseReason { code, description: None }));
+        ctx.close(Some(CloseReason {
+            code,
+            description: None,
+        }));
         ctx.stop();
     }
 

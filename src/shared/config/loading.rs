@@ -30,7 +30,11 @@ pub trait Configuration: DeserializeOwned + Serialize {
 /// # Errors
 /// When the rule does not hold.
 pub fn require(holds: bool, key: &'static str, problem: impl FnOnce() -> String) -> Result<(), String> {
-    if holds { Ok(()) } else { Err(format!("{key}: {}", problem())) }
+    if holds {
+        Ok(())
+    } else {
+        Err(format!("{key}: {}", problem()))
+    }
 }
 
 /// A configuration that was read from a file.
@@ -49,7 +53,10 @@ pub struct LoadedConfig<C> {
 pub fn load<C: Configuration>(file: &Path) -> Result<LoadedConfig<C>, String> {
     let of_file = |line: String| format!("{}: {line}", file.display());
     let (config, warnings) = parse(file).map_err(of_file)?;
-    Ok(LoadedConfig { config, warnings: warnings.into_iter().map(of_file).collect() })
+    Ok(LoadedConfig {
+        config,
+        warnings: warnings.into_iter().map(of_file).collect(),
+    })
 }
 
 fn parse<C: Configuration>(file: &Path) -> Result<(C, Vec<String>), String> {
@@ -60,11 +67,17 @@ fn parse<C: Configuration>(file: &Path) -> Result<(C, Vec<String>), String> {
     let mut json = serde_json::Deserializer::from_str(&text);
     let mut track = serde_path_to_error::Track::new();
     let parsed = C::deserialize(serde_path_to_error::Deserializer::new(&mut json, &mut track));
-    let mut config = parsed.and_then(|config| json.end().map(|()| config)).map_err(|source| {
-        let key = one_line(&track.path().to_string());
-        let problem = one_line(&source.to_string());
-        if key == "." || key == "?" { problem } else { format!("{key}: {problem}") }
-    })?;
+    let mut config = parsed
+        .and_then(|config| json.end().map(|()| config))
+        .map_err(|source| {
+            let key = one_line(&track.path().to_string());
+            let problem = one_line(&source.to_string());
+            if key == "." || key == "?" {
+                problem
+            } else {
+                format!("{key}: {problem}")
+            }
+        })?;
     let given: serde_json::Map<String, serde_json::Value> = serde_json::from_str(&text).unwrap_or_default();
     if let Some(key) = C::REQUIRED.iter().find(|key| !given.contains_key(**key)) {
         return Err(format!("{key}: it is missing"));
@@ -99,7 +112,13 @@ mod tests {
         let again = r#""loadRefrsh": 1, "#.repeat(100);
         std::fs::write(file.path(), format!(r#"{{"loadRefresh": 1, {again} "colour": 2}}"#)).unwrap();
         let told = load::<Small>(file.path()).unwrap().warnings;
-        let expected = [r#"unknown key "colour" is ignored"#, r#"unknown key "loadRefrsh" is ignored"#];
-        assert_eq!(told, expected.map(|words| format!("{}: {words}", file.path().display())));
+        let expected = [
+            r#"unknown key "colour" is ignored"#,
+            r#"unknown key "loadRefrsh" is ignored"#,
+        ];
+        assert_eq!(
+            told,
+            expected.map(|words| format!("{}: {words}", file.path().display()))
+        );
     }
 }

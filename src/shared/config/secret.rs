@@ -27,7 +27,11 @@ pub struct Secret {
 }
 
 #[derive(Deserialize)]
-#[serde(untagged, deny_unknown_fields, expecting = "it is neither a text nor {\"file\": PATH}")]
+#[serde(
+    untagged,
+    deny_unknown_fields,
+    expecting = "it is neither a text nor {\"file\": PATH}"
+)]
 enum WireSecret {
     Text(String),
     File { file: ExpandedPath },
@@ -42,7 +46,10 @@ impl TryFrom<WireSecret> for Secret {
             WireSecret::File { file } => file,
         };
         let text = read_file(&file).map_err(|error| format!("{}: can't be read: {error}", file.display()))?;
-        Ok(Self { text: text.trim_end_matches(['\r', '\n']).to_owned(), file: Some(file) })
+        Ok(Self {
+            text: text.trim_end_matches(['\r', '\n']).to_owned(),
+            file: Some(file),
+        })
     }
 }
 

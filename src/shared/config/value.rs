@@ -29,12 +29,17 @@ impl TryFrom<String> for ExpandedPath {
         if text.is_empty() || text.contains('\0') {
             return Err(format!("{text:?} is no path; \".\" is the working folder"));
         }
-        shellexpand::full(&text).map(|path| Self(path.into_owned().into())).map_err(|error| not_set(&text, &error))
+        shellexpand::full(&text)
+            .map(|path| Self(path.into_owned().into()))
+            .map_err(|error| not_set(&text, &error))
     }
 }
 
 fn not_set(text: &str, error: &LookupError<VarError>) -> String {
-    format!("{text:?} names the environment variable {}, which is not set", error.var_name)
+    format!(
+        "{text:?} names the environment variable {}, which is not set",
+        error.var_name
+    )
 }
 
 /// Expands `$VARIABLE` in a text.
@@ -42,7 +47,9 @@ fn not_set(text: &str, error: &LookupError<VarError>) -> String {
 /// # Errors
 /// When the text names a variable that is not set.
 pub fn expand(text: &str) -> Result<String, String> {
-    shellexpand::env(text).map(Cow::into_owned).map_err(|error| not_set(text, &error))
+    shellexpand::env(text)
+        .map(Cow::into_owned)
+        .map_err(|error| not_set(text, &error))
 }
 
 /// Reads a text and expands `$VARIABLE`.
@@ -150,7 +157,10 @@ fn between<'de, D: Deserializer<'de>>(
 }
 
 fn not_allowed<E: serde::de::Error>(value: &Value, allowed: fmt::Arguments<'_>) -> E {
-    E::custom(format_args!("{} is not allowed; allowed is {allowed}", excerpt(&value.to_string(), MAX_SHOWN)))
+    E::custom(format_args!(
+        "{} is not allowed; allowed is {allowed}",
+        excerpt(&value.to_string(), MAX_SHOWN)
+    ))
 }
 
 /// Reads a list; a single value is a list of one, and `null` an empty one.

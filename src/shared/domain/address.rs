@@ -40,7 +40,11 @@ pub fn complete_host(server: &mut String, rewritten: bool) -> Result<Option<Stri
 impl PublicAddress {
     /// The address of `port` on `host`; `rewritten`: whether a reverse proxy rewrites ports.
     pub fn new(host: &str, port: u16, rewritten: bool) -> Self {
-        Self { host: host.into(), port, rewritten }
+        Self {
+            host: host.into(),
+            port,
+            rewritten,
+        }
     }
 
     /// The host in lower case, with the port of the reverse proxy if that is not the default.
@@ -71,7 +75,13 @@ impl PublicAddress {
 
 impl fmt::Display for PublicAddress {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(out, "{}{}{}", self.host, if self.rewritten { '/' } else { ':' }, self.port)
+        write!(
+            out,
+            "{}{}{}",
+            self.host,
+            if self.rewritten { '/' } else { ':' },
+            self.port
+        )
     }
 }
 
@@ -97,7 +107,10 @@ impl FromStr for PublicAddress {
             || format!("{text:?} is no address; allowed is HOST:PORT, or HOST/PORT where a web server rewrites ports");
         let (host, port, rewritten) = match text.split_once('/') {
             Some((host, port)) => (host, port, true),
-            None => text.rsplit_once(':').map(|(host, port)| (host, port, false)).ok_or_else(no_address)?,
+            None => text
+                .rsplit_once(':')
+                .map(|(host, port)| (host, port, false))
+                .ok_or_else(no_address)?,
         };
         let number = |text: &str| text.parse::<NonZeroU16>().map_err(|_| no_address());
         let name = match host.rsplit_once(':') {
@@ -106,11 +119,18 @@ impl FromStr for PublicAddress {
         };
         // Normalized, so that one server does not count as two: names in lower case (RFC 4343) and in ASCII.
         let plain = url::Host::parse(name).map_err(|_| no_address())?.to_string();
-        if !plain.chars().all(|letter| letter.is_ascii_alphanumeric() || "-._:[]".contains(letter)) {
+        if !plain
+            .chars()
+            .all(|letter| letter.is_ascii_alphanumeric() || "-._:[]".contains(letter))
+        {
             return Err(no_address());
         }
         let host = format!("{plain}{}", host.strip_prefix(name).unwrap_or_default());
-        Ok(Self { host: host.into(), port: number(port)?.get(), rewritten })
+        Ok(Self {
+            host: host.into(),
+            port: number(port)?.get(),
+            rewritten,
+        })
     }
 }
 
@@ -120,8 +140,14 @@ mod tests {
 
     #[test]
     fn both_forms_are_read_and_a_name_is_written_in_one_way() {
-        let plain =
-            ["localhost:2000", "10.0.0.7/65535", "lab.org:8443/2000", "[::1]:2000", "[::1]/2000", "[::1]:8443/2000"];
+        let plain = [
+            "localhost:2000",
+            "10.0.0.7/65535",
+            "lab.org:8443/2000",
+            "[::1]:2000",
+            "[::1]/2000",
+            "[::1]:8443/2000",
+        ];
         for (text, plain) in plain.map(|text| (text, text)).into_iter().chain([
             ("Lab.ORG:2000", "lab.org:2000"),
             ("Lab.ORG:8443/2000", "lab.org:8443/2000"),
@@ -136,9 +162,30 @@ mod tests {
 
     #[test]
     fn anything_else_is_refused_by_name() {
-        let of_a_web_server = ["host/2000/x", "http://host:1", "host:x/2000", "host:0/2000", "host:1:2/2000"];
-        let short = ["", "host", "host:", "host:0", "host:65536", "a b:1", ":2000", "h:-1", "a\"b:1", "a;b:1"];
-        for text in short.into_iter().chain(of_a_web_server).chain([":8443/2000", "host:1:2"]) {
+        let of_a_web_server = [
+            "host/2000/x",
+            "http://host:1",
+            "host:x/2000",
+            "host:0/2000",
+            "host:1:2/2000",
+        ];
+        let short = [
+            "",
+            "host",
+            "host:",
+            "host:0",
+            "host:65536",
+            "a b:1",
+            ":2000",
+            "h:-1",
+            "a\"b:1",
+            "a;b:1",
+        ];
+        for text in short
+            .into_iter()
+            .chain(of_a_web_server)
+            .chain([":8443/2000", "host:1:2"])
+        {
             let error = text.parse::<PublicAddress>().unwrap_err();
             assert!(error.contains(&format!("{text:?}")), "{error}");
         }

@@ -65,7 +65,10 @@ impl<Prefixes: AsRef<[UrlPrefix]>> AdmissionRules<Prefixes> {
             return Err(AdmissionError::NotShared(world));
         }
         if load.percent() > self.share_idle_time {
-            return Err(AdmissionError::Busy { load: load.percent(), threshold: self.share_idle_time });
+            return Err(AdmissionError::Busy {
+                load: load.percent(),
+                threshold: self.share_idle_time,
+            });
         }
         Ok(())
     }
@@ -78,7 +81,10 @@ mod tests {
     #[test]
     fn a_world_runs_by_its_repository_and_the_load() {
         let prefixes = |texts: &[&str]| {
-            texts.iter().map(|text| UrlPrefix::try_from((*text).to_owned()).unwrap()).collect::<Vec<_>>()
+            texts
+                .iter()
+                .map(|text| UrlPrefix::try_from((*text).to_owned()).unwrap())
+                .collect::<Vec<_>>()
         };
         let rules = |docker, share_idle_time| AdmissionRules {
             allowed: prefixes(&["https://github.com/lab"]),
@@ -91,9 +97,23 @@ mod tests {
             ("LAB/arm", false, 0.0, 0.0, "", "Git hosts ignore case"),
             ("lab/secret", true, 50.0, 0.0, "blocked", "blocked even where allowed"),
             ("evil/x", true, 50.0, 0.0, "blocked", "no way around by small letters"),
-            ("lab-evil/arm", false, 50.0, 0.0, "Docker", "a like beginning is no prefix"),
+            (
+                "lab-evil/arm",
+                false,
+                50.0,
+                0.0,
+                "Docker",
+                "a like beginning is no prefix",
+            ),
             ("other/x", false, 50.0, 0.0, "Docker", "others need a container"),
-            ("other/x", true, 0.0, 0.0, "not configured to share", "nothing is shared"),
+            (
+                "other/x",
+                true,
+                0.0,
+                0.0,
+                "not configured to share",
+                "nothing is shared",
+            ),
             ("other/x", true, 50.0, 50.0, "", "idle enough"),
             ("other/x", true, 50.0, 50.1, "above threshold", "too busy"),
         ];
@@ -101,7 +121,14 @@ mod tests {
             let world = ProjectUrl::parse(&format!("https://github.com/{repository}/blob/main/worlds/a.wbt")).unwrap();
             let verdict = rules(docker, share).admit(&world, Load::try_from(load).unwrap());
             let text = verdict.map_or_else(|refusal| refusal.to_string(), |()| String::new());
-            assert!(if words.is_empty() { text.is_empty() } else { text.contains(words) }, "{why}: {text:?}");
+            assert!(
+                if words.is_empty() {
+                    text.is_empty()
+                } else {
+                    text.contains(words)
+                },
+                "{why}: {text:?}"
+            );
         }
     }
 }

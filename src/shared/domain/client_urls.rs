@@ -28,7 +28,10 @@ impl PublicUrl {
     }
 
     fn websocket_url(&self, address: &PublicAddress) -> String {
-        let path = self.path.replace("{host}", address.host()).replace("{port}", &address.port().to_string());
+        let path = self
+            .path
+            .replace("{host}", address.host())
+            .replace("{port}", &address.port().to_string());
         format!("{}{path}", self.door)
     }
 }
@@ -47,7 +50,10 @@ impl TryFrom<String> for PublicUrl {
             let is_of_path = |letter: char| letter.is_ascii_alphanumeric() || "/-._".contains(letter);
             let fits = path.contains("{port}") && !path.ends_with('/') && plain.chars().all(is_of_path);
             let door = format!("{scheme}://{}", door.host());
-            (fits && matches!(scheme, "ws" | "wss")).then(|| Self { door, path: path.to_owned() })
+            (fits && matches!(scheme, "ws" | "wss")).then(|| Self {
+                door,
+                path: path.to_owned(),
+            })
         };
         parts().ok_or_else(|| {
             format!("{text:?} is not allowed; allowed is such as \"wss://fleet.example.org/{{host}}/{{port}}\"")
@@ -73,7 +79,10 @@ pub struct ClientUrls {
 impl ClientUrls {
     /// Returns the WebSocket URL of a server, without a slash at its end.
     pub fn websocket_url(&self, address: &PublicAddress) -> String {
-        self.public.as_ref().map_or_else(|| address.websocket_url(self.ssl), |public| public.websocket_url(address))
+        self.public.as_ref().map_or_else(
+            || address.websocket_url(self.ssl),
+            |public| public.websocket_url(address),
+        )
     }
 
     /// Returns the HTTP URL of a server, without a slash at its end.
@@ -99,23 +108,61 @@ mod tests {
     fn host_and_port_are_filled_in() {
         let address: PublicAddress = "10.0.1.7:2000".parse().unwrap();
         for (text, websocket, http) in [
-            ("wss://fleet.org/{host}/{port}", "wss://fleet.org/10.0.1.7/2000", "https://fleet.org/10.0.1.7/2000"),
-            ("ws://Fleet.org:8080/a/{port}", "ws://fleet.org:8080/a/2000", "http://fleet.org:8080/a/2000"),
-            ("wss://[::1]/{port}-{host}", "wss://[::1]/2000-10.0.1.7", "https://[::1]/2000-10.0.1.7"),
+            (
+                "wss://fleet.org/{host}/{port}",
+                "wss://fleet.org/10.0.1.7/2000",
+                "https://fleet.org/10.0.1.7/2000",
+            ),
+            (
+                "ws://Fleet.org:8080/a/{port}",
+                "ws://fleet.org:8080/a/2000",
+                "http://fleet.org:8080/a/2000",
+            ),
+            (
+                "wss://[::1]/{port}-{host}",
+                "wss://[::1]/2000-10.0.1.7",
+                "https://[::1]/2000-10.0.1.7",
+            ),
         ] {
-            let url = ClientUrls { ssl: false, public: Some(public(text).unwrap()) };
-            assert_eq!((url.websocket_url(&address).as_str(), url.http_url(&address).as_str()), (websocket, http));
+            let url = ClientUrls {
+                ssl: false,
+                public: Some(public(text).unwrap()),
+            };
+            assert_eq!(
+                (url.websocket_url(&address).as_str(), url.http_url(&address).as_str()),
+                (websocket, http)
+            );
         }
         let url = public("wss://fleet.org/{host}/{port}").unwrap();
-        assert_eq!((url.websocket_door(), url.http_door()), ("wss://fleet.org".into(), "https://fleet.org".into()));
+        assert_eq!(
+            (url.websocket_door(), url.http_door()),
+            ("wss://fleet.org".into(), "https://fleet.org".into())
+        );
         assert_eq!(String::from(url), "wss://fleet.org/{host}/{port}");
     }
 
     #[test]
     fn other_texts_are_refused_with_one_that_is_allowed() {
-        let paths = ["", "/", "/{host}", "/{port}/", "/{port}?a", "/{port}/{port}", "/{name}/{port}"];
-        let others = ["", "https://fleet.org/{port}", "wss://{host}/{port}", "wss://a:b@fleet.org/{port}"];
-        for text in paths.map(|path| format!("wss://fleet.org{path}")).into_iter().chain(others.map(str::to_owned)) {
+        let paths = [
+            "",
+            "/",
+            "/{host}",
+            "/{port}/",
+            "/{port}?a",
+            "/{port}/{port}",
+            "/{name}/{port}",
+        ];
+        let others = [
+            "",
+            "https://fleet.org/{port}",
+            "wss://{host}/{port}",
+            "wss://a:b@fleet.org/{port}",
+        ];
+        for text in paths
+            .map(|path| format!("wss://fleet.org{path}"))
+            .into_iter()
+            .chain(others.map(str::to_owned))
+        {
             let error = public(&text).unwrap_err();
             assert!(error.contains(r#""wss://fleet.example.org/{host}/{port}""#), "{error}");
         }

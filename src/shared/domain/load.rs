@@ -32,7 +32,11 @@ impl Load {
     /// When the body is anything else.
     pub fn parse(body: &[u8]) -> Result<Self, String> {
         let text = String::from_utf8_lossy(body);
-        Self::try_from(text.trim().parse::<f64>().map_err(|_| no_load(format_args!("{:?}", text.trim())))?)
+        Self::try_from(
+            text.trim()
+                .parse::<f64>()
+                .map_err(|_| no_load(format_args!("{:?}", text.trim())))?,
+        )
     }
 }
 
@@ -40,7 +44,11 @@ impl TryFrom<f64> for Load {
     type Error = String;
 
     fn try_from(number: f64) -> Result<Self, String> {
-        if number.is_finite() && number >= 0.0 { Ok(Self(number)) } else { Err(no_load(number)) }
+        if number.is_finite() && number >= 0.0 {
+            Ok(Self(number))
+        } else {
+            Err(no_load(number))
+        }
     }
 }
 

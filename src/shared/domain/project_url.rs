@@ -60,7 +60,10 @@ impl ProjectUrl {
             [.., folder, world] if folder == "worlds" => world,
             _ => return Err(url_error("missing worlds folder: it does not end in /worlds/NAME.wbt")),
         };
-        if !Path::new(world).extension().is_some_and(|extension| extension.eq_ignore_ascii_case("wbt")) {
+        if !Path::new(world)
+            .extension()
+            .is_some_and(|extension| extension.eq_ignore_ascii_case("wbt"))
+        {
             return Err(url_error(format!("missing world file: {world:?} is no world file")));
         }
         if inside.len() < 3 {
@@ -69,7 +72,12 @@ impl ProjectUrl {
         if inside.iter().any(|segment| segment.eq_ignore_ascii_case(".git")) {
             return Err(url_error("a folder is called .git"));
         }
-        Ok(Self { host, repository: plain_repository(segments)?, marker, inside })
+        Ok(Self {
+            host,
+            repository: plain_repository(segments)?,
+            marker,
+            inside,
+        })
     }
 
     /// Returns the same world in the repository at this URL.
@@ -78,7 +86,11 @@ impl ProjectUrl {
     /// When that is not the URL of a repository.
     pub fn in_repository(&self, url: &str) -> Result<Self, ProjectUrlError> {
         let (host, segments) = split_url(url)?;
-        Ok(Self { host, repository: plain_repository(segments)?, ..self.clone() })
+        Ok(Self {
+            host,
+            repository: plain_repository(segments)?,
+            ..self.clone()
+        })
     }
 
     /// The Git host, in lower case, with its port if that is not 443.
@@ -113,7 +125,10 @@ impl ProjectUrl {
         (1..=before_worlds.min(12))
             .filter_map(|length| {
                 let (reference, folder) = self.inside.get(..before_worlds)?.split_at_checked(length)?;
-                Some(Reading { reference: reference.join("/"), folder: folder.join("/") })
+                Some(Reading {
+                    reference: reference.join("/"),
+                    folder: folder.join("/"),
+                })
             })
             .collect()
     }
@@ -121,7 +136,13 @@ impl ProjectUrl {
 
 impl fmt::Display for ProjectUrl {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(out, "{}/{}/{}", self.repository(), self.marker.join("/"), self.inside.join("/"))
+        write!(
+            out,
+            "{}/{}/{}",
+            self.repository(),
+            self.marker.join("/"),
+            self.inside.join("/")
+        )
     }
 }
 
@@ -131,7 +152,11 @@ pub(super) fn plain_repository(mut segments: Vec<String>) -> Result<Vec<String>,
     while name.to_ascii_lowercase().ends_with(".git") {
         name.truncate(name.len() - 4);
     }
-    if name.is_empty() { Err(url_error("it names no repository")) } else { Ok(segments) }
+    if name.is_empty() {
+        Err(url_error("it names no repository"))
+    } else {
+        Ok(segments)
+    }
 }
 
 /// Splits an `https` URL into its host and its percent-decoded path segments, by the URL Standard, and refuses
@@ -150,17 +175,29 @@ pub(super) fn split_url(text: &str) -> Result<(String, Vec<String>), ProjectUrlE
     if !url.username().is_empty() || url.password().is_some() {
         return Err(url_error("it names a user"));
     }
-    let host = url.host_str().filter(|host| !host.starts_with('-')).ok_or_else(|| url_error("it names no host"))?;
+    let host = url
+        .host_str()
+        .filter(|host| !host.starts_with('-'))
+        .ok_or_else(|| url_error("it names no host"))?;
     let host = if host == "www.github.com" { "github.com" } else { host };
-    let host = url.port().map_or_else(|| host.to_owned(), |port| format!("{host}:{port}"));
+    let host = url
+        .port()
+        .map_or_else(|| host.to_owned(), |port| format!("{host}:{port}"));
     let segments = url.path().split('/').filter(|raw| !raw.is_empty()).map(decode_segment);
     Ok((host, segments.collect::<Result<_, _>>()?))
 }
 
 fn decode_segment(raw: &str) -> Result<String, ProjectUrlError> {
-    let segment = percent_decode_str(raw).decode_utf8().map_err(|_| url_error(format!("{raw:?} is no UTF-8 text")))?;
-    if segment.chars().any(|letter| letter.is_control() || letter == '/' || letter == '\\') {
-        return Err(url_error(format!("{raw:?} holds an encoded slash or control character")));
+    let segment = percent_decode_str(raw)
+        .decode_utf8()
+        .map_err(|_| url_error(format!("{raw:?} is no UTF-8 text")))?;
+    if segment
+        .chars()
+        .any(|letter| letter.is_control() || letter == '/' || letter == '\\')
+    {
+        return Err(url_error(format!(
+            "{raw:?} holds an encoded slash or control character"
+        )));
     }
     Ok(segment.into_owned())
 }
@@ -177,9 +214,9 @@ pub(super) fn split_repository(segments: &[String]) -> Result<(usize, usize), Pr
     match words.as_slice() {
         [_, _, "blob" | "tree", ..] => Ok((2, 3)),
         [_, _, "src", "branch" | "tag" | "commit", ..] => Ok((2, 4)),
-        [_, _, other, ..] => {
-            Err(url_error(format!("missing blob or tree after the repository, where {other:?} stands")))
-        }
+        [_, _, other, ..] => Err(url_error(format!(
+            "missing blob or tree after the repository, where {other:?} stands"
+        ))),
         _ => Err(url_error("it names no repository")),
     }
 }

@@ -67,14 +67,19 @@ pub struct Instances {
 /// Ignores prefixes that this version can't parse: the server that reports them enforces them itself.
 fn prefixes<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<Vec<UrlPrefix>, D::Error> {
     let texts = Vec::<String>::deserialize(deserializer)?;
-    Ok(texts.into_iter().filter_map(|text| UrlPrefix::try_from(text).ok()).collect())
+    Ok(texts
+        .into_iter()
+        .filter_map(|text| UrlPrefix::try_from(text).ok())
+        .collect())
 }
 
 impl Instances {
     /// Clients that hold a slot or wait for one.
     pub fn present(&self) -> u32 {
         // Numbers that another server reports may be arbitrarily large.
-        [self.starting, self.idle, self.running].into_iter().fold(self.queued, u32::saturating_add)
+        [self.starting, self.idle, self.running]
+            .into_iter()
+            .fold(self.queued, u32::saturating_add)
     }
 }
 
@@ -86,12 +91,19 @@ impl ServerReport {
     pub fn parse(page: &[u8]) -> serde_json::Result<Self> {
         let report: Self = serde_json::from_slice(page)?;
         let problem = report.problem.as_deref().map(one_line);
-        Ok(Self { version: one_line(&report.version), problem, ..report })
+        Ok(Self {
+            version: one_line(&report.version),
+            problem,
+            ..report
+        })
     }
 
     /// The report of a server that has only `/load`.
     pub fn load_only(load: Load) -> Self {
-        Self { load, ..Self::default() }
+        Self {
+            load,
+            ..Self::default()
+        }
     }
 
     /// Whether the server accepts this world, by this report.
@@ -138,7 +150,12 @@ mod tests {
                 "Python",
             ),
             (r#"{"load": 1, "docker": false}"#, false, false, "ours, allows nobody"),
-            (r#"{"load": 1, "docker": false, "allowedRepositories": ["https://github.com/lab"]}"#, true, false, "ours"),
+            (
+                r#"{"load": 1, "docker": false, "allowedRepositories": ["https://github.com/lab"]}"#,
+                true,
+                false,
+                "ours",
+            ),
             (
                 r#"{"load": 60, "docker": true, "shareIdleTime": 50, "allowedRepositories": ["https://github.com/lab"]}"#,
                 true,
@@ -154,7 +171,11 @@ mod tests {
         ];
         for (text, runs_lab, runs_other, why) in table {
             let status: ServerReport = serde_json::from_str(text).unwrap();
-            assert_eq!((status.accepts(&lab), status.accepts(&other)), (runs_lab, runs_other), "{why}");
+            assert_eq!(
+                (status.accepts(&lab), status.accepts(&other)),
+                (runs_lab, runs_other),
+                "{why}"
+            );
         }
     }
 }

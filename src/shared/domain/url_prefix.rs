@@ -21,7 +21,11 @@ impl UrlPrefix {
         let repository = world.repository_segments();
         self.host == world.host()
             && self.segments.len() <= repository.len()
-            && self.segments.iter().zip(repository).all(|(ours, theirs)| ours.eq_ignore_ascii_case(theirs))
+            && self
+                .segments
+                .iter()
+                .zip(repository)
+                .all(|(ours, theirs)| ours.eq_ignore_ascii_case(theirs))
     }
 
     /// Number of path segments: the longer of two prefixes is the more specific one.
@@ -31,7 +35,10 @@ impl UrlPrefix {
 
     /// The path segments of a covered world's repository that come after this prefix.
     pub fn rest_of_repository<'world>(&self, world: &'world ProjectUrl) -> &'world [String] {
-        world.repository_segments().get(self.segments.len()..).unwrap_or_default()
+        world
+            .repository_segments()
+            .get(self.segments.len()..)
+            .unwrap_or_default()
     }
 
     /// The prefix as configured.
@@ -49,7 +56,9 @@ impl TryFrom<String> for UrlPrefix {
         };
         let (host, mut segments) = split_url(&text).map_err(wrong)?;
         if text.contains(['*', '?', '#']) || split_repository(&segments).is_ok() {
-            return Err(wrong(ProjectUrlError("it names a part of a repository, or has *, ? or #".to_owned())));
+            return Err(wrong(ProjectUrlError(
+                "it names a part of a repository, or has *, ? or #".to_owned(),
+            )));
         }
         if segments.len() >= 2 {
             segments = plain_repository(segments).map_err(wrong)?;
@@ -78,13 +87,38 @@ mod tests {
             |path: &str| ProjectUrl::parse(&format!("https://github.com/{path}/blob/main/worlds/a.wbt")).unwrap();
         let table = [
             ("https://github.com/lab", "lab/x", true, "an owner"),
-            ("https://github.com/lab/", "lab/x", true, "a slash at the end changes nothing"),
+            (
+                "https://github.com/lab/",
+                "lab/x",
+                true,
+                "a slash at the end changes nothing",
+            ),
             ("https://github.com/", "lab/x", true, "a whole host"),
             ("https://GitHub.com/LAB", "lab/x", true, "Git hosts ignore case"),
-            ("https://github.com/lab", "lab-evil/x", false, "another owner with the same beginning"),
-            ("https://github.com/lab/x", "lab/xy", false, "another repository with the same beginning"),
-            ("https://github.com/lab/x.git", "lab/x", true, "git's ending changes nothing"),
-            ("https://github.com/lab/x", "lab/x.GIT.git", true, "nor does it in the world's URL"),
+            (
+                "https://github.com/lab",
+                "lab-evil/x",
+                false,
+                "another owner with the same beginning",
+            ),
+            (
+                "https://github.com/lab/x",
+                "lab/xy",
+                false,
+                "another repository with the same beginning",
+            ),
+            (
+                "https://github.com/lab/x.git",
+                "lab/x",
+                true,
+                "git's ending changes nothing",
+            ),
+            (
+                "https://github.com/lab/x",
+                "lab/x.GIT.git",
+                true,
+                "nor does it in the world's URL",
+            ),
             ("https://gitlab.com/lab", "lab/x", false, "another host"),
             ("https://github.com:444/lab", "lab/x", false, "another port"),
         ];
@@ -95,7 +129,13 @@ mod tests {
 
     #[test]
     fn a_part_of_a_repository_is_no_prefix() {
-        for part in ["blob/main", "tree/main/p", "-/tree/main", "src/branch/main", "src/tag/v1"] {
+        for part in [
+            "blob/main",
+            "tree/main/p",
+            "-/tree/main",
+            "src/branch/main",
+            "src/tag/v1",
+        ] {
             let error = UrlPrefix::try_from(format!("https://forge.org/lab/x/{part}")).unwrap_err();
             assert!(error.contains("it names a part of a repository"), "{error}");
         }

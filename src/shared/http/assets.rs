@@ -39,5 +39,7 @@ pub fn answer(request: &HttpRequest, assets: &[Asset]) -> HttpResponse {
         return HttpResponse::NotFound().body("Error: there is no such file.");
     };
     let extension = name.rsplit('.').next().unwrap_or_default();
-    HttpResponse::Ok().content_type(file_extension_to_mime(extension)).body(*text)
+    HttpResponse::Ok()
+        .content_type(file_extension_to_mime(extension))
+        .body(*text)
 }

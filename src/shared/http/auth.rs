@@ -36,7 +36,10 @@ impl BasicAuth {
     /// Creates an authenticator for this password.
     pub fn new(password: Secret) -> Self {
         // Thirty passwords at once, and twelve a minute.
-        Self { password, attempts: AddressQuota::new(30, 12) }
+        Self {
+            password,
+            attempts: AddressQuota::new(30, 12),
+        }
     }
 
     /// Checks the password of a request, in constant time. Right passwords count as attempts too, so that a client over
@@ -47,7 +50,10 @@ impl BasicAuth {
     pub fn check(&self, request: &HttpRequest, peer: Peer) -> Result<(), AuthError> {
         let given = password_of(request).ok_or(AuthError::NoPassword)?;
         // Proxies that don't report client addresses share one quota.
-        if !self.attempts.take(Some(peer.rate_limit_key().unwrap_or(Ipv6Addr::UNSPECIFIED.into())), false) {
+        if !self.attempts.take(
+            Some(peer.rate_limit_key().unwrap_or(Ipv6Addr::UNSPECIFIED.into())),
+            false,
+        ) {
             return Err(AuthError::TooMany);
         }
         if given.as_bytes().ct_eq(self.password.reveal().as_bytes()).into() {
@@ -69,7 +75,12 @@ pub fn refuse_action(auth: Option<&BasicAuth>, request: &HttpRequest, peer: Peer
 
 /// Whether a page of another site has sent a request. Browsers send the page's `Origin`; other programs send none.
 fn is_cross_site(request: &HttpRequest) -> bool {
-    let header = |name| request.headers().get(name).map(|value| value.to_str().unwrap_or_default());
+    let header = |name| {
+        request
+            .headers()
+            .get(name)
+            .map(|value| value.to_str().unwrap_or_default())
+    };
     let host = header(header::HOST).unwrap_or_default();
     header(header::ORIGIN).is_some_and(|origin| {
         let of_page = origin.split_once("://").map_or(origin, |(_, authority)| authority);
@@ -87,7 +98,12 @@ pub fn require_administrator(auth: Option<&BasicAuth>, request: &HttpRequest, pe
 
 /// The password of a request; the user name is ignored.
 fn password_of(request: &HttpRequest) -> Option<String> {
-    let (scheme, credentials) = request.headers().get(header::AUTHORIZATION)?.to_str().ok()?.split_once(' ')?;
+    let (scheme, credentials) = request
+        .headers()
+        .get(header::AUTHORIZATION)?
+        .to_str()
+        .ok()?
+        .split_once(' ')?;
     if !scheme.eq_ignore_ascii_case("basic") {
         return None;
     }
@@ -101,7 +117,9 @@ impl actix_web::ResponseError for AuthError {
             Self::NoPassword => HttpResponse::Unauthorized()
                 .insert_header((header::WWW_AUTHENTICATE, "Basic realm=\"administrator\""))
                 .body(self.to_string()),
-            Self::TooMany => HttpResponse::TooManyRequests().insert_header(retry_after()).body(self.to_string()),
+            Self::TooMany => HttpResponse::TooManyRequests()
+                .insert_header(retry_after())
+                .body(self.to_string()),
         }
     }
 }

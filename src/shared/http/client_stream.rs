@@ -107,7 +107,9 @@ impl ClientStream {
 
     /// Reads more from the socket. Returns the number of bytes; 0 at its end.
     fn poll_fill(&mut self, context: &mut Context<'_>) -> Poll<io::Result<usize>> {
-        let Some((tcp, _)) = &mut self.connection else { return Poll::Ready(Ok(0)) };
+        let Some((tcp, _)) = &mut self.connection else {
+            return Poll::Ready(Ok(0));
+        };
         self.unread.reserve(READ_AT_ONCE);
         poll_read_buf(Pin::new(tcp), context, &mut self.unread)
     }
@@ -139,8 +141,15 @@ fn request_length(bytes: &[u8]) -> Option<usize> {
 
 /// The length of a body, if the headers have one and it is not too large.
 fn body_length(headers: &[httparse::Header<'_>]) -> Option<usize> {
-    let header = headers.iter().find(|header| header.name.eq_ignore_ascii_case("content-length"))?;
-    std::str::from_utf8(header.value).ok()?.trim().parse().ok().filter(|length| *length <= MAX_BODY)
+    let header = headers
+        .iter()
+        .find(|header| header.name.eq_ignore_ascii_case("content-length"))?;
+    std::str::from_utf8(header.value)
+        .ok()?
+        .trim()
+        .parse()
+        .ok()
+        .filter(|length| *length <= MAX_BODY)
 }
 
 impl AsyncRead for ClientStream {
@@ -204,7 +213,13 @@ impl AsyncWrite for ClientStream {
         {
             let read_buffer = self.unread.split().freeze();
             // Without a receiver the connection closes.
-            taker.send(Upgraded { tcp, read_buffer, permit }).ok();
+            taker
+                .send(Upgraded {
+                    tcp,
+                    read_buffer,
+                    permit,
+                })
+                .ok();
             context.waker().wake_by_ref();
         }
         // A TCP connection has nothing to flush.

@@ -83,7 +83,12 @@ impl ConnectionLimiter {
     /// `None` is [`share`] of them, but at most [`MAX_CLIENTS_PER_ADDRESS`].
     pub fn new(max_tcp: usize, max_clients: usize, per_address: Option<usize>) -> Self {
         let per_address = per_address.unwrap_or_else(|| share(max_clients).min(MAX_CLIENTS_PER_ADDRESS));
-        Self { max_tcp, max_clients, per_address, open: Arc::default() }
+        Self {
+            max_tcp,
+            max_clients,
+            per_address,
+            open: Arc::default(),
+        }
     }
 
     /// Number of open connections of a kind.
@@ -123,13 +128,19 @@ impl ConnectionLimiter {
             *open.entry(key).or_default() += 1;
         }
         drop(open);
-        Ok(ConnectionPermit { kind, address, open: Arc::clone(&self.open) })
+        Ok(ConnectionPermit {
+            kind,
+            address,
+            open: Arc::clone(&self.open),
+        })
     }
 }
 
 /// The keys of the counts to which a connection contributes.
 fn keys(kind: ConnectionKind, address: Option<IpAddr>) -> impl Iterator<Item = Key> {
-    [Some((kind, None)), address.map(|address| (kind, Some(address)))].into_iter().flatten()
+    [Some((kind, None)), address.map(|address| (kind, Some(address)))]
+        .into_iter()
+        .flatten()
 }
 
 impl Drop for ConnectionPermit {
@@ -152,7 +163,9 @@ impl actix_web::ResponseError for ConnectionLimitError {
             Self::InAll => StatusCode::SERVICE_UNAVAILABLE,
             Self::FromAddress => StatusCode::TOO_MANY_REQUESTS,
         };
-        HttpResponse::build(status).insert_header(retry_after()).body(self.to_string())
+        HttpResponse::build(status)
+            .insert_header(retry_after())
+            .body(self.to_string())
     }
 }
 
@@ -178,7 +191,11 @@ impl AddressQuota {
             // Drops the addresses whose whole quota is available again.
             self.0.retain_recent();
         }
-        if self.0.len() >= MAX_ADDRESSES { when_full } else { self.0.check_key(&address).is_ok() }
+        if self.0.len() >= MAX_ADDRESSES {
+            when_full
+        } else {
+            self.0.check_key(&address).is_ok()
+        }
     }
 }
 
@@ -194,11 +211,14 @@ mod tests {
     fn one_address_leaves_something_to_others() {
         for (tcp, clients) in [(2000, 1000), (21_000, 20_000), (16, 15), (4000, 1000)] {
             let connections = ConnectionLimiter::new(tcp, clients, None);
-            for (kind, all) in
-                [(ConnectionKind::Tcp, tcp), (ConnectionKind::Client, clients), (ConnectionKind::Page, MAX_PAGES)]
-            {
-                let one: Vec<_> =
-                    std::iter::repeat_with(|| connections.admit(kind, client("203.0.113.9"))).take(all).collect();
+            for (kind, all) in [
+                (ConnectionKind::Tcp, tcp),
+                (ConnectionKind::Client, clients),
+                (ConnectionKind::Page, MAX_PAGES),
+            ] {
+                let one: Vec<_> = std::iter::repeat_with(|| connections.admit(kind, client("203.0.113.9")))
+                    .take(all)
+                    .collect();
                 let had = one.iter().filter(|one| one.is_ok()).count();
                 assert!(had <= share(all) && had > 0, "{kind:?}: {had} of {all}");
                 connections.admit(kind, client("203.0.113.10")).unwrap();
@@ -211,7 +231,11 @@ mod tests {
         let connections = ConnectionLimiter::new(9, 9, Some(1));
         let admit = |address| connections.admit(ConnectionKind::Client, client(address));
         let permit = admit("2001:db8::1").unwrap();
-        assert_eq!(admit("2001:db8::2").unwrap_err(), ConnectionLimitError::FromAddress, "the same /64");
+        assert_eq!(
+            admit("2001:db8::2").unwrap_err(),
+            ConnectionLimitError::FromAddress,
+            "the same /64"
+        );
         let _neighbour = admit("2001:db8:0:1::1").unwrap();
         assert_eq!(connections.open.lock().len(), 3);
         drop(permit);

@@ -81,7 +81,13 @@ impl LiveUpdates {
         F: Future<Output = Option<PageView>> + 'static,
     {
         let unsent = Bytes::from_static(b"retry: 2000\n\n");
-        let page = EventStream { live: self.clone(), render, unsent, last: Bytes::new(), _permit: permit };
+        let page = EventStream {
+            live: self.clone(),
+            render,
+            unsent,
+            last: Bytes::new(),
+            _permit: permit,
+        };
         HttpResponse::Ok()
             .content_type("text/event-stream")
             .insert_header((header::CACHE_CONTROL, "no-store"))
@@ -96,7 +102,10 @@ impl LiveUpdates {
         let periods = u32::try_from((1 + latest.event.len() / LARGE).min(MAX_PERIODS)).unwrap_or(1);
         if latest.at.is_none_or(|at| at.elapsed() >= PERIOD * periods) {
             if let Some(view) = render().await {
-                let event = Event { version: env!("CARGO_PKG_VERSION"), view: &view };
+                let event = Event {
+                    version: env!("CARGO_PKG_VERSION"),
+                    view: &view,
+                };
                 let event = format!("data: {}\n\n", serde_json::to_string(&event).unwrap_or_default());
                 // An unchanged event keeps its allocation, because pages compare its address.
                 if latest.event != event.as_bytes() {

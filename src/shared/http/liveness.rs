@@ -23,7 +23,11 @@ const ANSWERS: u32 = 100;
 impl Default for Liveness {
     /// Starts with a new connection.
     fn default() -> Self {
-        Self { alive: Instant::now(), asked: rand::random(), answers: 0 }
+        Self {
+            alive: Instant::now(),
+            asked: rand::random(),
+            answers: 0,
+        }
     }
 }
 

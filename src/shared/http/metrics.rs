@@ -29,7 +29,12 @@ pub struct Gauge<'text> {
 impl<'text> Gauge<'text> {
     /// A gauge without labels.
     pub fn plain(name: &'text str, help: &'text str, value: f64) -> Self {
-        Self { name, help, labels: &[], values: vec![(Vec::new(), value)] }
+        Self {
+            name,
+            help,
+            labels: &[],
+            values: vec![(Vec::new(), value)],
+        }
     }
 }
 

@@ -12,7 +12,9 @@ impl TryFrom<String> for Origin {
     type Error = String;
 
     fn try_from(text: String) -> Result<Self, String> {
-        let parsed = Url::parse(&text).ok().filter(|url| matches!(url.scheme(), "http" | "https"));
+        let parsed = Url::parse(&text)
+            .ok()
+            .filter(|url| matches!(url.scheme(), "http" | "https"));
         let origin = parsed.map_or("https://lab.org".to_owned(), |url| url.origin().ascii_serialization());
         // Browsers never send another spelling, so it would never match: it is an error.
         if text.eq_ignore_ascii_case(&origin) {

@@ -42,7 +42,9 @@ impl TrustedProxies {
     /// The client of a request.
     pub fn peer(&self, request: &HttpRequest) -> Peer {
         // Only requests in unit tests have no address.
-        let address = request.peer_addr().map_or(Ipv4Addr::UNSPECIFIED.into(), |address| address.ip());
+        let address = request
+            .peer_addr()
+            .map_or(Ipv4Addr::UNSPECIFIED.into(), |address| address.ip());
         self.resolve(address.to_canonical(), request.headers())
     }
 
@@ -54,7 +56,9 @@ impl TrustedProxies {
     /// The value of a header that a trusted proxy sets; `None` if the header is repeated, because the client may have
     /// sent one of them.
     pub fn trusted_header(&self, request: &HttpRequest, header: &str) -> Option<String> {
-        let is_trusted = request.peer_addr().is_some_and(|address| self.trusts(address.ip().to_canonical()));
+        let is_trusted = request
+            .peer_addr()
+            .is_some_and(|address| self.trusts(address.ip().to_canonical()));
         let mut lines = request.headers().get_all(header).filter(|_| is_trusted);
         match (lines.next(), lines.next()) {
             (Some(line), None) => String::from_utf8(line.as_bytes().to_vec()).ok(),
@@ -68,7 +72,10 @@ impl TrustedProxies {
             return Peer::Client(connected);
         }
         // A line that is not text is not an address.
-        let lines: Vec<&str> = headers.get_all("x-forwarded-for").map(|line| line.to_str().unwrap_or("?")).collect();
+        let lines: Vec<&str> = headers
+            .get_all("x-forwarded-for")
+            .map(|line| line.to_str().unwrap_or("?"))
+            .collect();
         if lines.is_empty() {
             return Peer::Proxy(connected);
         }
@@ -94,8 +101,14 @@ impl TrustedProxies {
 
 /// Parses an address as reverse proxies write it: some add the port.
 fn address(text: &str) -> Option<IpAddr> {
-    let bare = text.strip_prefix('[').and_then(|text| text.strip_suffix(']')).unwrap_or(text);
-    let address = bare.parse().ok().or_else(|| text.parse::<SocketAddr>().ok().map(|address| address.ip()));
+    let bare = text
+        .strip_prefix('[')
+        .and_then(|text| text.strip_suffix(']'))
+        .unwrap_or(text);
+    let address = bare
+        .parse()
+        .ok()
+        .or_else(|| text.parse::<SocketAddr>().ok().map(|address| address.ip()));
     address.as_ref().map(IpAddr::to_canonical)
 }
 
@@ -139,7 +152,9 @@ mod tests {
         for (name, value) in headers {
             map.append(HeaderName::from_static(name), HeaderValue::from_str(value).unwrap());
         }
-        TrustedProxies::try_from(trusted).unwrap().resolve(connected.parse().unwrap(), &map)
+        TrustedProxies::try_from(trusted)
+            .unwrap()
+            .resolve(connected.parse().unwrap(), &map)
     }
 
     type Headers<'a> = &'a [(&'static str, &'a str)];
@@ -148,18 +163,68 @@ mod tests {
     fn the_client_is_who_the_nearest_trusted_proxy_saw() {
         let common = "x-forwarded-for";
         let table: &[(&str, Headers<'_>, &str, &str)] = &[
-            ("203.0.113.9", &[(common, "1.1.1.1")], "203.0.113.9", "a stranger's word on itself"),
+            (
+                "203.0.113.9",
+                &[(common, "1.1.1.1")],
+                "203.0.113.9",
+                "a stranger's word on itself",
+            ),
             ("127.0.0.1", &[(common, "203.0.113.9")], "203.0.113.9", "one proxy"),
-            ("127.0.0.1", &[(common, "1.1.1.1, 203.0.113.9")], "203.0.113.9", "the client wrote one itself"),
-            ("127.0.0.1", &[(common, "1.1.1.1"), (common, "203.0.113.9")], "203.0.113.9", "the same, in two lines"),
-            ("127.0.0.1", &[(common, "203.0.113.9, 10.1.2.3")], "203.0.113.9", "two proxies"),
-            ("127.0.0.1", &[(common, "10.1.2.3")], "10.1.2.3", "a client in the proxies' network"),
-            ("127.0.0.1", &[(common, "203.0.113.9, ?, 10.1.2.3")], "10.1.2.3", "what is no address ends the chain"),
-            ("127.0.0.1", &[(common, "unknown")], "127.0.0.1", "nothing sensible is said"),
-            ("127.0.0.1", &[(common, "203.0.113.9:4711")], "203.0.113.9", "with a port"),
+            (
+                "127.0.0.1",
+                &[(common, "1.1.1.1, 203.0.113.9")],
+                "203.0.113.9",
+                "the client wrote one itself",
+            ),
+            (
+                "127.0.0.1",
+                &[(common, "1.1.1.1"), (common, "203.0.113.9")],
+                "203.0.113.9",
+                "the same, in two lines",
+            ),
+            (
+                "127.0.0.1",
+                &[(common, "203.0.113.9, 10.1.2.3")],
+                "203.0.113.9",
+                "two proxies",
+            ),
+            (
+                "127.0.0.1",
+                &[(common, "10.1.2.3")],
+                "10.1.2.3",
+                "a client in the proxies' network",
+            ),
+            (
+                "127.0.0.1",
+                &[(common, "203.0.113.9, ?, 10.1.2.3")],
+                "10.1.2.3",
+                "what is no address ends the chain",
+            ),
+            (
+                "127.0.0.1",
+                &[(common, "unknown")],
+                "127.0.0.1",
+                "nothing sensible is said",
+            ),
+            (
+                "127.0.0.1",
+                &[(common, "203.0.113.9:4711")],
+                "203.0.113.9",
+                "with a port",
+            ),
             ("::1", &[(common, "2001:db8::9")], "2001:db8::9", "IPv6"),
-            ("127.0.0.1", &[(common, "[2001:db8::9]:4711")], "2001:db8::9", "IPv6 with a port"),
-            ("127.0.0.1", &[(common, "::ffff:203.0.113.9")], "203.0.113.9", "IPv4 in IPv6"),
+            (
+                "127.0.0.1",
+                &[(common, "[2001:db8::9]:4711")],
+                "2001:db8::9",
+                "IPv6 with a port",
+            ),
+            (
+                "127.0.0.1",
+                &[(common, "::ffff:203.0.113.9")],
+                "203.0.113.9",
+                "IPv4 in IPv6",
+            ),
         ];
         for (connected, headers, client, why) in table {
             let peer = resolve(&["127.0.0.0/8", "::1", "10.0.0.0/8"], connected, headers);
@@ -169,8 +234,14 @@ mod tests {
 
     #[test]
     fn a_proxy_that_says_nothing_is_known_as_one() {
-        assert_eq!(resolve(&["127.0.0.0/8"], "127.0.0.1", &[]), Peer::Proxy("127.0.0.1".parse().unwrap()));
-        assert_eq!(resolve(&[], "127.0.0.1", &[]), Peer::Client("127.0.0.1".parse().unwrap()));
+        assert_eq!(
+            resolve(&["127.0.0.0/8"], "127.0.0.1", &[]),
+            Peer::Proxy("127.0.0.1".parse().unwrap())
+        );
+        assert_eq!(
+            resolve(&[], "127.0.0.1", &[]),
+            Peer::Client("127.0.0.1".parse().unwrap())
+        );
     }
 
     #[test]

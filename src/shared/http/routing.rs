@@ -44,12 +44,17 @@ where
 fn wrong_method(methods: &[Method]) -> HttpResponse {
     let allowed = methods.iter().map(Method::as_str).collect::<Vec<_>>().join(", ");
     let words = format!("Error: wrong method; allowed here: {allowed}.");
-    HttpResponse::MethodNotAllowed().insert_header((header::ALLOW, allowed)).body(words)
+    HttpResponse::MethodNotAllowed()
+        .insert_header((header::ALLOW, allowed))
+        .body(words)
 }
 
 /// The header `Retry-After`, in seconds. Random, so that clients that are refused together do not retry together.
 pub fn retry_after() -> (HeaderName, HeaderValue) {
-    (header::RETRY_AFTER, HeaderValue::from(rand::rng().random_range(RETRY_AFTER)))
+    (
+        header::RETRY_AFTER,
+        HeaderValue::from(rand::rng().random_range(RETRY_AFTER)),
+    )
 }
 
 /// Refuses a request that has a body, for routes that read none.
@@ -70,7 +75,9 @@ pub async fn json_body<T: DeserializeOwned + Default>(
     form: &str,
 ) -> Result<T, HttpResponse> {
     let headers = request.headers();
-    let length = headers.get(header::CONTENT_LENGTH).and_then(|length| length.to_str().ok()?.parse().ok());
+    let length = headers
+        .get(header::CONTENT_LENGTH)
+        .and_then(|length| length.to_str().ok()?.parse().ok());
     if headers.contains_key(header::TRANSFER_ENCODING) || length.is_some_and(|length: usize| length > MAX_BODY) {
         let words = format!("Error: a body has a Content-Length of at most {MAX_BODY} bytes.");
         return Err(HttpResponse::PayloadTooLarge().force_close().body(words));
@@ -81,7 +88,9 @@ pub async fn json_body<T: DeserializeOwned + Default>(
         Ok(Ok(Ok(body))) if body.is_empty() => Ok(T::default()),
         Ok(Ok(Ok(body))) => serde_json::from_slice(&body).map_err(|_| wrong()),
         Ok(_) => Err(wrong()),
-        Err(_) => Err(HttpResponse::RequestTimeout().force_close().body("Error: the body did not come in time.")),
+        Err(_) => Err(HttpResponse::RequestTimeout()
+            .force_close()
+            .body("Error: the body did not come in time.")),
     }
 }
 

@@ -81,8 +81,9 @@ where
     B: MessageBody + 'static,
 {
     let threads = available_parallelism().map_or(1, usize::from);
-    let server =
-        Server::build().workers(threads).max_concurrent_connections((options.max_connections / threads).max(1));
+    let server = Server::build()
+        .workers(threads)
+        .max_concurrent_connections((options.max_connections / threads).max(1));
     let server = server.disable_signals().shutdown_timeout(options.stop.as_secs());
     let stops = server.graceful_shutdown_signal();
     let server = server.listen("http", port, move || {

@@ -36,7 +36,10 @@ pub struct FrameReader {
 
 impl Default for FrameReader {
     fn default() -> Self {
-        Self { codec: Codec::new().max_size(MAX_MESSAGE), unread: BytesMut::new() }
+        Self {
+            codec: Codec::new().max_size(MAX_MESSAGE),
+            unread: BytesMut::new(),
+        }
     }
 }
 
@@ -108,7 +111,11 @@ fn complete(frame: Frame, partial: &mut BytesMut) -> Result<Option<Message>, Pro
 
 fn join(partial: &mut BytesMut, piece: &[u8]) -> Result<(), ProtocolError> {
     partial.extend_from_slice(piece);
-    if partial.len() > MAX_MESSAGE { Err(ProtocolError::Overflow) } else { Ok(()) }
+    if partial.len() > MAX_MESSAGE {
+        Err(ProtocolError::Overflow)
+    } else {
+        Ok(())
+    }
 }
 
 fn text_message(text: Bytes) -> Message {

@@ -5,7 +5,9 @@ use nix::sys::resource::{Resource, getrlimit, setrlimit};
 /// Raises the limit of open files to `wanted`, or as close as the system allows. A higher limit stays. Returns the
 /// limit.
 pub fn raise_open_files(wanted: u64) -> u64 {
-    let Ok((now, most)) = getrlimit(Resource::RLIMIT_NOFILE) else { return 1024 };
+    let Ok((now, most)) = getrlimit(Resource::RLIMIT_NOFILE) else {
+        return 1024;
+    };
     let limit = now.max(wanted.min(most));
     setrlimit(Resource::RLIMIT_NOFILE, limit, most).map_or(now, |()| limit)
 }

@@ -65,8 +65,15 @@ mod tests {
         let this = concat!(module_path!(), "::a_task_that_panics_again_and_again_ends_the_server");
         let this = this.split_once("::").unwrap().1;
         let mut again = tokio::process::Command::new(std::env::current_exe().unwrap());
-        let ended = again.args(["--exact", this]).env("PANICS", "").kill_on_drop(true).output();
-        let ended = actix_rt::time::timeout(Duration::from_secs(20), ended).await.unwrap().unwrap();
+        let ended = again
+            .args(["--exact", this])
+            .env("PANICS", "")
+            .kill_on_drop(true)
+            .output();
+        let ended = actix_rt::time::timeout(Duration::from_secs(20), ended)
+            .await
+            .unwrap()
+            .unwrap();
         assert_eq!(ended.status.code(), Some(1));
     }
 }

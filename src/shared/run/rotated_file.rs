@@ -31,7 +31,13 @@ impl RotatedFile {
         }
         let file = File::options().create(true).append(true).open(path)?;
         let size = file.metadata()?.len();
-        Ok(Self { path: path.to_owned(), max_size, heading, file, size })
+        Ok(Self {
+            path: path.to_owned(),
+            max_size,
+            heading,
+            file,
+            size,
+        })
     }
 
     fn rotate(&mut self) -> io::Result<()> {
@@ -44,7 +50,9 @@ impl RotatedFile {
 
     /// Appends all bytes or none: a truncated line would corrupt the next one.
     fn add(&mut self, bytes: &[u8]) -> io::Result<()> {
-        self.file.write_all(bytes).inspect_err(|_| drop(self.file.set_len(self.size)))?;
+        self.file
+            .write_all(bytes)
+            .inspect_err(|_| drop(self.file.set_len(self.size)))?;
         self.size += bytes.len() as u64;
         Ok(())
     }

@@ -7,7 +7,10 @@ use sd_notify::NotifyState;
 
 /// Reports that the server listens on `port` and its actors run.
 pub fn ready(port: u16) {
-    send(&[NotifyState::Ready, NotifyState::Status(&format!("listens on port {port}"))]);
+    send(&[
+        NotifyState::Ready,
+        NotifyState::Status(&format!("listens on port {port}")),
+    ]);
 }
 
 /// Reports that the server stops in an orderly way, and why.

@@ -39,10 +39,13 @@ impl Signals {
     /// Waits for the next signal.
     pub async fn next(&mut self) -> ServerCommand {
         poll_fn(|context| {
-            let received = self.0.iter_mut().find_map(|(signal, command)| match signal.poll_recv(context) {
-                Poll::Ready(_) => Some(*command),
-                Poll::Pending => None,
-            });
+            let received = self
+                .0
+                .iter_mut()
+                .find_map(|(signal, command)| match signal.poll_recv(context) {
+                    Poll::Ready(_) => Some(*command),
+                    Poll::Pending => None,
+                });
             received.map_or(Poll::Pending, Poll::Ready)
         })
         .await

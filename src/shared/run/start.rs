@@ -85,13 +85,21 @@ pub fn serve(
 /// Writes the process id to a file, and locks the file (`flock`) until the returned file is closed. The kernel closes
 /// it when the process ends for any reason.
 fn write_pid(path: &Path) -> io::Result<File> {
-    let mut file = File::options().read(true).write(true).create(true).truncate(false).open(path)?;
+    let mut file = File::options()
+        .read(true)
+        .write(true)
+        .create(true)
+        .truncate(false)
+        .open(path)?;
     match file.try_lock() {
         Ok(()) => {}
         Err(TryLockError::WouldBlock) => {
             let mut pid = String::new();
             file.read_to_string(&mut pid)?;
-            return Err(io::Error::other(format!("a server that runs holds it: process {}", pid.trim())));
+            return Err(io::Error::other(format!(
+                "a server that runs holds it: process {}",
+                pid.trim()
+            )));
         }
         Err(TryLockError::Error(error)) => return Err(error),
     }

@@ -42,19 +42,73 @@ pub enum Cause {
 /// The first match counts. git asks for a user name if a Git host answers 'not found': Git hosts don't distinguish
 /// private from missing repositories.
 const MESSAGES: &[(Cause, &[&str])] = &[
-    (Cause::Machine, &["No space left on device", "Disk quota exceeded", "Read-only file system"]),
-    (Cause::Machine, &["Input/output error", "Too many open files", "Cannot allocate memory"]),
+    (
+        Cause::Machine,
+        &[
+            "No space left on device",
+            "Disk quota exceeded",
+            "Read-only file system",
+        ],
+    ),
+    (
+        Cause::Machine,
+        &["Input/output error", "Too many open files", "Cannot allocate memory"],
+    ),
     // These hosts come from the configuration: URLs with other hosts are refused earlier.
-    (Cause::Machine, &["Could not resolve host", "Failed to connect to", "Couldn't connect to"]),
-    (Cause::Machine, &["SSL certificate", "certificate verification failed", "Resource temporarily unavailable"]),
+    (
+        Cause::Machine,
+        &["Could not resolve host", "Failed to connect to", "Couldn't connect to"],
+    ),
+    (
+        Cause::Machine,
+        &[
+            "SSL certificate",
+            "certificate verification failed",
+            "Resource temporarily unavailable",
+        ],
+    ),
     (Cause::Moved, &["returned error: 30"]),
     (Cause::TooLarge, &["invalid index-pack output"]),
-    (Cause::NoRepository, &["could not read Username", "not found", "does not appear to be a git repository"]),
+    (
+        Cause::NoRepository,
+        &[
+            "could not read Username",
+            "not found",
+            "does not appear to be a git repository",
+        ],
+    ),
     (Cause::NoRepository, &["does not exist"]),
-    (Cause::NoCommit, &["couldn't find remote ref", "not our ref", "unadvertised object", "remote did not send"]),
-    (Cause::Damaged, &["not a git repository", "bad config", "bad shallow", "bad object"]),
-    (Cause::Damaged, &["bad tree", "corrupt", "too short to be a packfile", "unresolved delta", "unable to read"]),
-    (Cause::Damaged, &["reference broken", "invalid reference", "did not send all necessary objects"]),
+    (
+        Cause::NoCommit,
+        &[
+            "couldn't find remote ref",
+            "not our ref",
+            "unadvertised object",
+            "remote did not send",
+        ],
+    ),
+    (
+        Cause::Damaged,
+        &["not a git repository", "bad config", "bad shallow", "bad object"],
+    ),
+    (
+        Cause::Damaged,
+        &[
+            "bad tree",
+            "corrupt",
+            "too short to be a packfile",
+            "unresolved delta",
+            "unable to read",
+        ],
+    ),
+    (
+        Cause::Damaged,
+        &[
+            "reference broken",
+            "invalid reference",
+            "did not send all necessary objects",
+        ],
+    ),
     // The lock of a killed git.
     (Cause::Damaged, &["File exists"]),
 ];
@@ -62,7 +116,10 @@ const MESSAGES: &[(Cause, &[&str])] = &[
 impl CheckoutError {
     /// A failure with this cause.
     pub(super) fn new(cause: Cause, message: impl Into<String>) -> Self {
-        Self { cause, message: message.into() }
+        Self {
+            cause,
+            message: message.into(),
+        }
     }
 
     /// A git command that has not ended by itself.
@@ -80,7 +137,10 @@ impl CheckoutError {
         let is_of =
             |words: &[&str]| matches!(ending, ExitReason::Code(_)) && words.iter().any(|words| said.contains(words));
         let known = MESSAGES.iter().find(|(_, words)| is_of(words));
-        Self::new(known.map_or(Cause::Other, |(cause, _)| *cause), format!("git {command} {ending}: {said}"))
+        Self::new(
+            known.map_or(Cause::Other, |(cause, _)| *cause),
+            format!("git {command} {ending}: {said}"),
+        )
     }
 
     /// The same as text for a client that requests this world.
@@ -90,14 +150,22 @@ impl CheckoutError {
             Cause::Refused => why,
             Cause::NoRepository => format!("{repository} does not exist or is not public"),
             Cause::NoCommit => {
-                let name = world.candidates().into_iter().next().map(|reading| reading.reference).unwrap_or_default();
+                let name = world
+                    .candidates()
+                    .into_iter()
+                    .next()
+                    .map(|reading| reading.reference)
+                    .unwrap_or_default();
                 format!("{repository} has no branch, tag or commit called {name:?}")
             }
             Cause::Moved => format!("{repository} has moved again and again"),
             Cause::Slow(limit) => format!("Fetching {repository} took longer than {} seconds", limit.as_secs()),
             _ => format!("{repository} can't be checked out: {why}"),
         };
-        Self { cause: self.cause, message }
+        Self {
+            cause: self.cause,
+            message,
+        }
     }
 
     /// Whether this server is the cause (its disk, network or processes), so that another server may succeed. A corrupt
@@ -126,23 +194,48 @@ mod tests {
     fn causes_are_told_apart() {
         let cause = |message: &str, ending| CheckoutError::ended("fetch", ending, message).cause;
         for (message, expected) in [
-            ("fatal: repository 'https://github.com/lab/none.git/' not found", Cause::NoRepository),
-            ("fatal: repository 'https://github.com/lab/certificates.git/' not found", Cause::NoRepository),
+            (
+                "fatal: repository 'https://github.com/lab/none.git/' not found",
+                Cause::NoRepository,
+            ),
+            (
+                "fatal: repository 'https://github.com/lab/certificates.git/' not found",
+                Cause::NoRepository,
+            ),
             (
                 "fatal: unable to access 'https://a.forge/': SSL certificate problem: self-signed certificate",
                 Cause::Machine,
             ),
-            ("fatal: could not read Username for 'https://github.com': terminal prompts disabled", Cause::NoRepository),
+            (
+                "fatal: could not read Username for 'https://github.com': terminal prompts disabled",
+                Cause::NoRepository,
+            ),
             ("fatal: remote error: upload-pack: not our ref 0123", Cause::NoCommit),
-            ("fatal: packed object 9ed5 (stored in pack-1115.pack) is corrupt", Cause::Damaged),
-            ("error: cannot lock ref 'refs/fleet/01': Unable to create '01.lock': File exists.", Cause::Damaged),
-            ("error: unable to create file a: No space left on device", Cause::Machine),
-            ("fatal: unable to access 'https://a.forge/': Could not resolve host: a.forge", Cause::Machine),
+            (
+                "fatal: packed object 9ed5 (stored in pack-1115.pack) is corrupt",
+                Cause::Damaged,
+            ),
+            (
+                "error: cannot lock ref 'refs/fleet/01': Unable to create '01.lock': File exists.",
+                Cause::Damaged,
+            ),
+            (
+                "error: unable to create file a: No space left on device",
+                Cause::Machine,
+            ),
+            (
+                "fatal: unable to access 'https://a.forge/': Could not resolve host: a.forge",
+                Cause::Machine,
+            ),
             ("fatal: fetch-pack: invalid index-pack output", Cause::TooLarge),
             ("fatal: early EOF", Cause::Other),
         ] {
             assert_eq!(cause(message, ExitReason::Code(128)), expected, "{message}");
         }
-        assert_eq!(cause("fatal: bad object", ExitReason::Signal(9)), Cause::Other, "somebody has killed it");
+        assert_eq!(
+            cause("fatal: bad object", ExitReason::Signal(9)),
+            Cause::Other,
+            "somebody has killed it"
+        );
     }
 }

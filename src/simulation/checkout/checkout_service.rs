@@ -47,7 +47,13 @@ impl CheckoutService {
         let resolver = Arc::new(CommitResolver::new(Arc::clone(&cache), Arc::clone(&config), rules));
         let (runtime, copies) = (Handle::current(), Semaphore::new(COPIES));
         let keeper = AbortOnDropHandle::new(runtime.spawn(cache.keep_within_budget()));
-        Ok(Self { resolver, config, runtime, copies, _keeps_within_budget: keeper })
+        Ok(Self {
+            resolver,
+            config,
+            runtime,
+            copies,
+            _keeps_within_budget: keeper,
+        })
     }
 
     /// Starts to check a world out into a client's directory. `progress` receives each step as text.

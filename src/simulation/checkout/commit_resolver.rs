@@ -50,7 +50,13 @@ struct Search<'job> {
 impl CommitResolver {
     /// Keeps commits in `cache`.
     pub fn new(cache: Arc<RepositoryCache>, config: Arc<SimulationConfig>, rules: AdmissionRules) -> Self {
-        Self { cache, config, rules, searches: SingleFlight::default(), redirected: Mutex::default() }
+        Self {
+            cache,
+            config,
+            rules,
+            searches: SingleFlight::default(),
+            redirected: Mutex::default(),
+        }
     }
 
     /// Waits until a world's commit is in the cache. Callers with the same world share one search.
@@ -91,12 +97,23 @@ impl CommitResolver {
             Some(commit) => vec![commit],
             None => revision::found(world, &repository.ask(&revision::search_arguments(world)).await?),
         };
-        let search = Search { resolver: self, world, repository: &repository, progress: &progress };
+        let search = Search {
+            resolver: self,
+            world,
+            repository: &repository,
+            progress: &progress,
+        };
         let mut missing = CheckoutError::new(Cause::NoCommit, "");
         for revision in revisions {
             let path = revision.path_of(&format!("worlds/{}", world.world()));
             match search.read(&revision, &path).await {
-                Ok(Some(above)) => return Ok(ResolvedCommit { repository, revision, above }),
+                Ok(Some(above)) => {
+                    return Ok(ResolvedCommit {
+                        repository,
+                        revision,
+                        above,
+                    });
+                }
                 Ok(None) => missing = refused(format!("{path} in {} does not exist", revision.name)),
                 Err(error) if error.cause == Cause::NoCommit => {}
                 Err(error) => return Err(error),
@@ -130,7 +147,12 @@ impl CommitResolver {
         path: &str,
     ) -> Result<Option<Arc<Repository>>, CheckoutError> {
         let repository = self.repository(world, COMMITS).await?;
-        let search = Search { resolver: self, world, repository: &repository, progress: &drop };
+        let search = Search {
+            resolver: self,
+            world,
+            repository: &repository,
+            progress: &drop,
+        };
         Ok(search.read(revision, path).await?.map(|_| repository))
     }
 
@@ -154,7 +176,12 @@ impl Search<'_> {
         let (repository, reference) = (self.repository, revision.reference());
         let arguments = revision.list_arguments(path);
         let mut listed = repository.read(&arguments).await;
-        if listed.is_err() && repository.read(&["rev-parse", "--quiet", "--verify", &reference]).await.is_err() {
+        if listed.is_err()
+            && repository
+                .read(&["rev-parse", "--quiet", "--verify", &reference])
+                .await
+                .is_err()
+        {
             self.fetch_commit(revision).await?;
             listed = repository.read(&arguments).await;
         }
@@ -185,7 +212,13 @@ impl Search<'_> {
 
     /// Whether a commit that is named by its hash is in a branch or tag. The history is fetched unless it is cached.
     async fn is_accepted(self, commit: &str) -> Result<bool, CheckoutError> {
-        if self.repository.ask(&revision::LIST_TIPS).await?.lines().any(|tip| tip.starts_with(commit)) {
+        if self
+            .repository
+            .ask(&revision::LIST_TIPS)
+            .await?
+            .lines()
+            .any(|tip| tip.starts_with(commit))
+        {
             return Ok(true);
         }
         let history = self.resolver.repository(self.world, HISTORY).await?;
@@ -200,10 +233,15 @@ impl Search<'_> {
     /// Fetches into a repository. `name` is for the client.
     async fn fetch(self, into: &Arc<Repository>, arguments: Vec<String>, name: &str) -> Result<(), CheckoutError> {
         let on_line = |line: String| (self.progress)(steps::fetching(name, &line));
-        into.fetch(arguments, &on_line).await.map_err(|error| match error.cause {
-            Cause::TooLarge => refused(format!("{name} is larger than {} MiB", self.resolver.config.project_size)),
-            _ => error,
-        })
+        into.fetch(arguments, &on_line)
+            .await
+            .map_err(|error| match error.cause {
+                Cause::TooLarge => refused(format!(
+                    "{name} is larger than {} MiB",
+                    self.resolver.config.project_size
+                )),
+                _ => error,
+            })
     }
 }
 
@@ -212,6 +250,13 @@ async fn is_reachable(history: &Repository, commit: &str) -> Result<bool, Checko
     if history.read(&["cat-file", "-e", commit]).await.is_err() {
         return Ok(false);
     }
-    let branches = ["for-each-ref", "--count=1", "--contains", commit, "refs/heads", "refs/tags"];
+    let branches = [
+        "for-each-ref",
+        "--count=1",
+        "--contains",
+        commit,
+        "refs/heads",
+        "refs/tags",
+    ];
     Ok(!history.read(&branches).await?.is_empty())
 }

@@ -20,8 +20,13 @@ pub async fn blocking<T: Send + 'static>(work: impl FnOnce() -> io::Result<T> + 
 /// Removes what a killed git has left: locks that would make every later fetch fail, and incomplete packs.
 pub fn remove_leftovers(repository: &Path) {
     let is_unfinished = |name: &[u8]| name.starts_with(b"tmp_") || name.starts_with(b".tmp-");
-    let packs = fs::read_dir(repository.join("objects/pack")).into_iter().flatten().flatten();
-    let unfinished = packs.filter(|pack| is_unfinished(pack.file_name().as_encoded_bytes())).map(|pack| pack.path());
+    let packs = fs::read_dir(repository.join("objects/pack"))
+        .into_iter()
+        .flatten()
+        .flatten();
+    let unfinished = packs
+        .filter(|pack| is_unfinished(pack.file_name().as_encoded_bytes()))
+        .map(|pack| pack.path());
     for path in unfinished.chain(["shallow.lock", "config.lock"].map(|name| repository.join(name))) {
         // If one can't be removed, the fetch fails.
         fs::remove_file(path).ok();
@@ -37,7 +42,10 @@ pub async fn outgrown(folders: Vec<(PathBuf, u64)>) {
             let mut size = DiskUsage::new(measure, *most);
             !size.add_folder(folder) || size.total > *most
         };
-        if blocking(move || Ok(looked_at.iter().any(is_beyond))).await.is_ok_and(|is_one| is_one) {
+        if blocking(move || Ok(looked_at.iter().any(is_beyond)))
+            .await
+            .is_ok_and(|is_one| is_one)
+        {
             return;
         }
     }

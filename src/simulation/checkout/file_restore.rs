@@ -27,7 +27,9 @@ pub fn controller(revision: &Revision, file: &str) -> Option<String> {
 /// # Errors
 /// When git or the disk fails.
 pub async fn restore(repository: &Repository, project: &Project, path: &str) -> Result<bool, CheckoutError> {
-    let scratch = tempfile::Builder::new().prefix("restored-").tempdir_in(project.instance.path())?;
+    let scratch = tempfile::Builder::new()
+        .prefix("restored-")
+        .tempdir_in(project.instance.path())?;
     let files = scratch.path().join("files");
     std::fs::create_dir(&files)?;
     let paths = [path.as_bytes(), b"\0"].concat();

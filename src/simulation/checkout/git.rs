@@ -52,7 +52,11 @@ impl Git {
         let silence = stall_timeout(&config).as_secs().max(1);
         let silence = format!("[http]\n\tlowSpeedLimit = 1\n\tlowSpeedTime = {silence}\n");
         let settings = (run.join("gitconfig"), include.unwrap_or_default() + SETTINGS + &silence);
-        Self { settings, mark: run.to_owned(), config }
+        Self {
+            settings,
+            mark: run.to_owned(),
+            config,
+        }
     }
 
     /// Writes the file of settings, unless it exists.
@@ -77,9 +81,15 @@ impl Git {
     ) -> Run {
         let folder = [OsStr::new(GIT_DIR), repository.as_os_str()].join(OsStr::new(""));
         let settings = settings.iter().flat_map(|setting| ["-c".into(), setting.into()]);
-        let words = ["git".into(), "--literal-pathspecs".into()].into_iter().chain(settings).chain([folder]);
-        let mut run =
-            Run::new(words.chain(arguments.iter().map(OsString::from)), &self.mark, self.config.timing.checkout);
+        let words = ["git".into(), "--literal-pathspecs".into()]
+            .into_iter()
+            .chain(settings)
+            .chain([folder]);
+        let mut run = Run::new(
+            words.chain(arguments.iter().map(OsString::from)),
+            &self.mark,
+            self.config.timing.checkout,
+        );
         run.spec.environment = vec![
             ("GIT_CONFIG_GLOBAL".into(), self.settings.0.clone().into()),
             ("GIT_ALLOW_PROTOCOL".into(), protocol.into()),
@@ -101,7 +111,11 @@ impl Git {
     /// When git can't be started, fails, or takes too long.
     pub async fn run(&self, mut run: Run, mut progress: impl FnMut(&str)) -> Result<Vec<u8>, CheckoutError> {
         let words = run.spec.command.iter().map(|word| word.to_string_lossy());
-        let command = words.skip_while(|word| !word.starts_with(GIT_DIR)).nth(1).unwrap_or_default().into_owned();
+        let command = words
+            .skip_while(|word| !word.starts_with(GIT_DIR))
+            .nth(1)
+            .unwrap_or_default()
+            .into_owned();
         run.niceness = if HEAVY.contains(&command.as_str()) { NICENESS } else { 0 };
         self.write_settings()?;
         let mut cause = String::new();
@@ -112,8 +126,14 @@ impl Git {
             }
         };
         match run.run(on_line).await {
-            Ok(Ran { ending: ExitReason::Code(0), answer }) => Ok(answer),
-            Ok(Ran { ending: ExitReason::NotStarted, .. }) => Err(CheckoutError::new(Cause::Machine, cause)),
+            Ok(Ran {
+                ending: ExitReason::Code(0),
+                answer,
+            }) => Ok(answer),
+            Ok(Ran {
+                ending: ExitReason::NotStarted,
+                ..
+            }) => Err(CheckoutError::new(Cause::Machine, cause)),
             Ok(Ran { ending, .. }) => Err(CheckoutError::ended(&command, ending, &cause)),
             Err(error) => Err(CheckoutError::not_ended(&command, &error)),
         }
@@ -127,5 +147,9 @@ pub fn stall_timeout(config: &SimulationConfig) -> Duration {
 
 /// Ranks git's messages: the first fatal line names the cause, else the first error; later lines are consequences.
 fn weight(line: &str) -> u8 {
-    if line.starts_with("fatal:") { 2 } else { u8::from(line.starts_with("error:")) }
+    if line.starts_with("fatal:") {
+        2
+    } else {
+        u8::from(line.starts_with("error:"))
+    }
 }

@@ -36,7 +36,12 @@ pub struct WorldFile {
 impl Project {
     /// Identifies the project by its repository, its commit and its directory.
     pub fn identity(&self) -> String {
-        format!("{} {} {}", self.url.repository(), self.revision.commit, self.revision.folder)
+        format!(
+            "{} {} {}",
+            self.url.repository(),
+            self.revision.commit,
+            self.revision.folder
+        )
     }
 }
 
@@ -55,11 +60,18 @@ impl WorldFile {
         }
         let file = std::fs::File::open(&path).map_err(missing)?;
         let mut line = Vec::new();
-        BufReader::new(file.take(200)).read_until(b'\n', &mut line).map_err(missing)?;
+        BufReader::new(file.take(200))
+            .read_until(b'\n', &mut line)
+            .map_err(missing)?;
         let line = String::from_utf8_lossy(&line).trim().to_owned();
         match line.split_whitespace().collect::<Vec<_>>().as_slice() {
-            ["#VRML_SIM", version, "utf8", ..] => Ok(Self { version: (*version).to_owned(), path }),
-            _ => Err(format!("{name} is no world file: its first line is {line:?}, not \"#VRML_SIM R2025a utf8\"")),
+            ["#VRML_SIM", version, "utf8", ..] => Ok(Self {
+                version: (*version).to_owned(),
+                path,
+            }),
+            _ => Err(format!(
+                "{name} is no world file: its first line is {line:?}, not \"#VRML_SIM R2025a utf8\""
+            )),
         }
     }
 }

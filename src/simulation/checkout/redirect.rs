@@ -36,13 +36,17 @@ pub async fn follow(
 async fn location(repository: &Repository) -> Option<String> {
     let mut location = None;
     let on_line = |line: &str| {
-        let header = line.split_once("Recv header: ").and_then(|(_, header)| header.split_once(": "));
+        let header = line
+            .split_once("Recv header: ")
+            .and_then(|(_, header)| header.split_once(": "));
         let header = header.filter(|(name, _)| name.eq_ignore_ascii_case("location"));
         location = header.map(|(_, value)| value.to_owned()).or(location.take());
     };
     let mut call = repository.call(&["ls-remote", "--quiet", "--", REMOTE, "HEAD"]);
     let trace = ["GIT_TRACE_CURL", "GIT_TRACE_CURL_NO_DATA"];
-    call.spec.environment.extend(trace.map(|name| (name.into(), "1".into())));
+    call.spec
+        .environment
+        .extend(trace.map(|name| (name.into(), "1".into())));
     // It fails again, because redirects are off.
     repository.git.run(call, on_line).await.ok();
     location
@@ -68,8 +72,16 @@ fn target(
     // The first path that git requests.
     let repository = target.as_str().strip_suffix("/info/refs").ok_or_else(elsewhere)?;
     let moved = mirrors.moved(world, repository).ok_or_else(elsewhere)?;
-    rules.admit(&moved, Load::ZERO).map_err(|refusal| format!("to {}. {refusal}", moved.repository()))?;
-    Ok((moved, Remote { location: repository.to_owned(), protocol: "https" }))
+    rules
+        .admit(&moved, Load::ZERO)
+        .map_err(|refusal| format!("to {}. {refusal}", moved.repository()))?;
+    Ok((
+        moved,
+        Remote {
+            location: repository.to_owned(),
+            protocol: "https",
+        },
+    ))
 }
 
 #[cfg(test)]
@@ -83,14 +95,26 @@ mod tests {
     fn a_forge_is_followed_within_itself_and_where_the_lists_allow() {
         let mirrors = BTreeMap::from([
             ("https://git.lab/".to_owned(), "https://git.lab:8443/".to_owned()),
-            ("https://git.lab/one".to_owned(), "https://git.lab:8443/lab/one.git".to_owned()),
+            (
+                "https://git.lab/one".to_owned(),
+                "https://git.lab:8443/lab/one.git".to_owned(),
+            ),
         ]);
         let mirrors = Mirrors::try_from(mirrors).unwrap();
-        let prefixes =
-            |texts: &[&str]| texts.iter().map(|text| UrlPrefix::try_from((*text).to_owned()).unwrap()).collect();
+        let prefixes = |texts: &[&str]| {
+            texts
+                .iter()
+                .map(|text| UrlPrefix::try_from((*text).to_owned()).unwrap())
+                .collect()
+        };
         let allowed = prefixes(&["https://github.com/lab", "https://git.lab"]);
         let blocked = prefixes(&["https://github.com/lab/secret"]);
-        let rules = AdmissionRules { allowed, blocked, docker: false, share_idle_time: 0.0 };
+        let rules = AdmissionRules {
+            allowed,
+            blocked,
+            docker: false,
+            share_idle_time: 0.0,
+        };
         let old = "https://github.com/lab/old/blob/main/p/worlds/a.wbt";
         let mirrored = "https://git.lab/g/s/old/-/blob/main/worlds/a.wbt";
         let table = [
@@ -99,19 +123,31 @@ mod tests {
                 "https://github.com/lab/new.git/info/refs?service=git-upload-pack",
                 Ok("https://github.com/lab/new/blob/main/p/worlds/a.wbt"),
             ),
-            (old, "/lab/new/info/refs", Ok("https://github.com/lab/new/blob/main/p/worlds/a.wbt")),
+            (
+                old,
+                "/lab/new/info/refs",
+                Ok("https://github.com/lab/new/blob/main/p/worlds/a.wbt"),
+            ),
             (old, "https://github.com/lab/secret.git/info/refs", Err("blocked")),
             (old, "https://github.com/lab/Secret/info/refs", Err("blocked")),
             (old, "https://github.com/lab%2fsecret/info/refs", Err("takes no worlds")),
             (old, "https://github.com/other/new/info/refs", Err("Docker not enabled")),
-            (old, "https://github.com/lab/../other/new/info/refs", Err("Docker not enabled")),
+            (
+                old,
+                "https://github.com/lab/../other/new/info/refs",
+                Err("Docker not enabled"),
+            ),
             (old, "https://github.com/login", Err("takes no worlds")),
             (old, "https://gitlab.com/lab/new/info/refs", Err("another host")),
             (old, "http://github.com/lab/new/info/refs", Err("another host")),
             (old, "https://github.com:8443/lab/new/info/refs", Err("another host")),
             (old, "https://me@github.com/lab/new/info/refs", Err("another host")),
             (old, "https://", Err("no URL")),
-            (mirrored, "https://git.lab:8443/g/new/info/refs", Ok("https://git.lab/g/new/-/blob/main/worlds/a.wbt")),
+            (
+                mirrored,
+                "https://git.lab:8443/g/new/info/refs",
+                Ok("https://git.lab/g/new/-/blob/main/worlds/a.wbt"),
+            ),
             (
                 mirrored,
                 "https://git.lab:8443/g/s/old.git/info/refs",

@@ -47,7 +47,16 @@ impl Repository {
     pub fn new(path: PathBuf, remote: Remote, git: Arc<Git>, growth: Arc<Notify>) -> Self {
         let (lock, fetches, queries) = (Arc::default(), SingleFlight::default(), Semaphore::new(MAX_QUERIES));
         let (remote, has_grown) = (Mutex::new(remote), AtomicBool::default());
-        Self { path, remote, git, has_grown, growth, lock, queries, fetches }
+        Self {
+            path,
+            remote,
+            git,
+            has_grown,
+            growth,
+            lock,
+            queries,
+            fetches,
+        }
     }
 
     /// A git command on this repository.
@@ -58,7 +67,8 @@ impl Repository {
 
     /// A git command on this repository with only these settings, each as `name=value`, and without the remote's URL.
     pub fn configured(&self, settings: &[String], arguments: &[impl AsRef<OsStr>]) -> Run {
-        self.git.command((&self.path, self.remote.lock().protocol), settings, arguments)
+        self.git
+            .command((&self.path, self.remote.lock().protocol), settings, arguments)
     }
 
     /// Runs a command that only reads the repository. Returns its answer.
@@ -69,7 +79,9 @@ impl Repository {
         let mut call = self.call(arguments);
         // git must not fetch missing objects, as it would in a history.
         let none = [("GIT_ALLOW_PROTOCOL", "none"), ("GIT_NO_LAZY_FETCH", "1")];
-        call.spec.environment.extend(none.map(|(name, value)| (name.into(), value.into())));
+        call.spec
+            .environment
+            .extend(none.map(|(name, value)| (name.into(), value.into())));
         self.git.run(call, |_| ()).await
     }
 
@@ -100,12 +112,18 @@ impl Repository {
             };
             let mut call = this.call(&arguments);
             // A larger write ends git with SIGXFSZ, which must not leave a core dump.
-            call.limits.extend([(Resource::Core, 0), (Resource::Fsize, this.git.config.project_size << 20)]);
+            call.limits.extend([
+                (Resource::Core, 0),
+                (Resource::Fsize, this.git.config.project_size << 20),
+            ]);
             this.git.run(call, on_line).await?;
             // Packs the repository, within a timeout. Only the next fetch waits for that.
             tokio::spawn(async move {
                 let _guard = guard;
-                let call = Run { time: stall_timeout(&this.git.config), ..this.call(&["gc", "--auto", "--quiet"]) };
+                let call = Run {
+                    time: stall_timeout(&this.git.config),
+                    ..this.call(&["gc", "--auto", "--quiet"])
+                };
                 if let Err(error) = this.git.run(call, |_| ()).await {
                     log::warn!("{} can't be packed: {error}", this.path.display());
                 }

@@ -54,7 +54,11 @@ impl CacheDir {
     pub fn claim(folder: &Path) -> io::Result<Self> {
         std::fs::create_dir_all(folder)?;
         let folder = folder.canonicalize()?;
-        let lock = File::options().write(true).create(true).truncate(false).open(folder.join("lock"))?;
+        let lock = File::options()
+            .write(true)
+            .create(true)
+            .truncate(false)
+            .open(folder.join("lock"))?;
         let deadline = Instant::now() + LOCK_WAIT;
         while let Err(error) = lock.try_lock() {
             if Instant::now() > deadline {
@@ -75,7 +79,13 @@ impl RepositoryCache {
     pub fn open(dir: CacheDir, git: Arc<Git>) -> io::Result<Self> {
         let folder = dir.folder.join("git");
         std::fs::create_dir_all(&folder)?;
-        Ok(Self { folder, git, in_use: Mutex::default(), growth: Arc::default(), _dir: dir })
+        Ok(Self {
+            folder,
+            git,
+            in_use: Mutex::default(),
+            growth: Arc::default(),
+            _dir: dir,
+        })
     }
 
     /// The repository with this content of `remote`. It is in use until the returned value is dropped.
@@ -100,7 +110,9 @@ impl RepositoryCache {
         blocking(move || {
             std::fs::create_dir_all(folder)?;
             // It may not exist yet.
-            File::open(&path).and_then(|folder| folder.set_modified(SystemTime::now())).ok();
+            File::open(&path)
+                .and_then(|folder| folder.set_modified(SystemTime::now()))
+                .ok();
             Ok(())
         })
         .await?;
@@ -136,7 +148,9 @@ impl RepositoryCache {
             {
                 // New users wait for the lock, and then create the repository again.
                 let in_use = self.in_use.blocking_lock();
-                if in_use.get(&path).is_some_and(|repository| repository.strong_count() > 0)
+                if in_use
+                    .get(&path)
+                    .is_some_and(|repository| repository.strong_count() > 0)
                     || std::fs::rename(&path, &removed).is_err()
                 {
                     continue;
@@ -155,9 +169,14 @@ impl RepositoryCache {
 
 /// A readable name, made unique by a hash: `https---github-com-lab-arm-git-0123456789abcdef`.
 fn folder_name(key: &str) -> String {
-    let readable = key.chars().map(|letter| if letter.is_ascii_alphanumeric() { letter } else { '-' });
+    let readable = key
+        .chars()
+        .map(|letter| if letter.is_ascii_alphanumeric() { letter } else { '-' });
     let readable: String = readable.skip_while(|letter| *letter == '-').take(100).collect();
-    let hash = Sha256::digest(key).iter().take(8).fold(0, |hash: u64, byte| (hash << 8) | u64::from(*byte));
+    let hash = Sha256::digest(key)
+        .iter()
+        .take(8)
+        .fold(0, |hash: u64, byte| (hash << 8) | u64::from(*byte));
     format!("{readable}-{hash:016x}")
 }
 
@@ -167,8 +186,14 @@ mod tests {
 
     #[test]
     fn names_are_short_readable_unique_and_always_the_same() {
-        assert_eq!(folder_name("https://github.com/lab/arm.git"), "https---github-com-lab-arm-git-a74f228b568c06bb");
-        assert_ne!(folder_name(&format!("{}a", "x".repeat(300))), folder_name(&format!("{}b", "x".repeat(300))));
+        assert_eq!(
+            folder_name("https://github.com/lab/arm.git"),
+            "https---github-com-lab-arm-git-a74f228b568c06bb"
+        );
+        assert_ne!(
+            folder_name(&format!("{}a", "x".repeat(300))),
+            folder_name(&format!("{}b", "x".repeat(300)))
+        );
         assert!(folder_name(&"x".repeat(2000)).len() < 200);
     }
 }

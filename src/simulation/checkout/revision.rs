@@ -35,8 +35,17 @@ pub const LIST_TIPS: [&str; 6] = ["ls-remote", "--quiet", "--heads", "--tags", "
 /// a branch or tag.
 pub fn commit_of(world: &ProjectUrl, allow_any: bool) -> Option<Revision> {
     let Reading { reference, folder } = world.candidates().into_iter().next()?;
-    let trust = if allow_any { TrustSource::AnyCommit } else { TrustSource::Url };
-    is_hash(&reference).then(|| Revision { commit: reference.to_ascii_lowercase(), name: reference, folder, trust })
+    let trust = if allow_any {
+        TrustSource::AnyCommit
+    } else {
+        TrustSource::Url
+    };
+    is_hash(&reference).then(|| Revision {
+        commit: reference.to_ascii_lowercase(),
+        name: reference,
+        folder,
+        trust,
+    })
 }
 
 fn is_hash(text: &str) -> bool {
@@ -45,23 +54,37 @@ fn is_hash(text: &str) -> bool {
 
 /// Fetches all branches and tags: only their commits if the remote supports that, otherwise everything.
 pub fn fetch_history() -> Vec<String> {
-    fetch(&["--filter=tree:0", "--prune"], &["+refs/heads/*:refs/heads/*", "+refs/tags/*:refs/tags/*"])
+    fetch(
+        &["--filter=tree:0", "--prune"],
+        &["+refs/heads/*:refs/heads/*", "+refs/tags/*:refs/tags/*"],
+    )
 }
 
 /// Fetches these references with these options.
 fn fetch(options: &[&str], references: &[&str]) -> Vec<String> {
     let common = ["--no-tags", "--no-write-fetch-head", "--progress", "--", REMOTE];
-    [&["fetch"], options, &common, references].concat().into_iter().map(str::to_owned).collect()
+    [&["fetch"], options, &common, references]
+        .concat()
+        .into_iter()
+        .map(str::to_owned)
+        .collect()
 }
 
 /// Lists the branches and tags of the remote that a URL may mean.
 pub fn search_arguments(world: &ProjectUrl) -> Vec<String> {
     let names = world.candidates().into_iter().flat_map(|reading| full_names(&reading));
-    ["ls-remote", "--quiet", "--", REMOTE].map(str::to_owned).into_iter().chain(names).collect()
+    ["ls-remote", "--quiet", "--", REMOTE]
+        .map(str::to_owned)
+        .into_iter()
+        .chain(names)
+        .collect()
 }
 
 fn full_names(reading: &Reading) -> [String; 2] {
-    [format!("refs/heads/{}", reading.reference), format!("refs/tags/{}", reading.reference)]
+    [
+        format!("refs/heads/{}", reading.reference),
+        format!("refs/tags/{}", reading.reference),
+    ]
 }
 
 /// Parses the answer to [`search_arguments`]: what the remote has, the longest names first, branches before tags.
@@ -69,7 +92,11 @@ pub fn found(world: &ProjectUrl, answer: &str) -> Vec<Revision> {
     let known: Vec<(&str, &str)> = answer.lines().filter_map(|line| line.split_once('\t')).collect();
     let readings = world.candidates().into_iter().rev();
     readings
-        .flat_map(|reading| full_names(&reading).into_iter().map(move |name| (name, reading.clone())))
+        .flat_map(|reading| {
+            full_names(&reading)
+                .into_iter()
+                .map(move |name| (name, reading.clone()))
+        })
         .filter_map(|(name, reading)| {
             let (commit, _) = known.iter().find(|(_, known)| *known == name)?;
             is_hash(commit).then(|| Revision {
@@ -86,7 +113,11 @@ impl Revision {
     /// Its reference in the cached repository. A commit that only `anyCommit` allows has a separate one, so that it
     /// does not run once that key is off.
     pub fn reference(&self) -> String {
-        let kind = if self.trust == TrustSource::AnyCommit { "any" } else { "fleet" };
+        let kind = if self.trust == TrustSource::AnyCommit {
+            "any"
+        } else {
+            "fleet"
+        };
         format!("refs/{kind}/{}", self.commit)
     }
 
@@ -98,7 +129,10 @@ impl Revision {
     /// Lists an entry of the repository, and everything directly in the directories above the project's.
     pub fn list_arguments(&self, path: &str) -> Vec<String> {
         let root = (!self.folder.is_empty()).then_some(".".to_owned());
-        let above = self.folder.match_indices('/').filter_map(|(end, _)| Some(format!("{}/", self.folder.get(..end)?)));
+        let above = self
+            .folder
+            .match_indices('/')
+            .filter_map(|(end, _)| Some(format!("{}/", self.folder.get(..end)?)));
         let fixed = ["ls-tree", "-z", "--full-tree", &self.reference(), "--", path].map(str::to_owned);
         fixed.into_iter().chain(root).chain(above).collect()
     }
@@ -108,14 +142,22 @@ impl Revision {
     pub fn files_above(&self, answer: &[u8], path: &str) -> Option<Vec<u8>> {
         let is_file = |entry: &&[u8]| entry.starts_with(b"100") || entry.starts_with(b"120");
         let files = answer.split(|byte| *byte == 0).filter(is_file);
-        let mut paths: Vec<&[u8]> = files.filter_map(|entry| entry.splitn(2, |byte| *byte == b'\t').nth(1)).collect();
+        let mut paths: Vec<&[u8]> = files
+            .filter_map(|entry| entry.splitn(2, |byte| *byte == b'\t').nth(1))
+            .collect();
         let is_there = paths.contains(&path.as_bytes());
         let folder = self.folder.as_bytes();
         paths.retain(|path| match path.iter().rposition(|byte| *byte == b'/') {
             Some(end) => path.get(..=end).is_some_and(|above| folder.starts_with(above)),
             None => !folder.is_empty(),
         });
-        is_there.then(|| paths.into_iter().flat_map(|path| path.iter().chain(&[0])).copied().collect())
+        is_there.then(|| {
+            paths
+                .into_iter()
+                .flat_map(|path| path.iter().chain(&[0]))
+                .copied()
+                .collect()
+        })
     }
 
     /// The path in the repository of a file of the project.
@@ -141,7 +183,10 @@ mod tests {
         let url = world("blob/feature/arm/lab/worlds/a.wbt");
         let answer =
             format!("{A}\trefs/tags/feature\n{B}\trefs/heads/feature/arm\n{B}\trefs/heads/x/refs/heads/feature\n");
-        let found: Vec<_> = found(&url, &answer).into_iter().map(|one| (one.commit, one.name, one.folder)).collect();
+        let found: Vec<_> = found(&url, &answer)
+            .into_iter()
+            .map(|one| (one.commit, one.name, one.folder))
+            .collect();
         let expected = [(B, "feature/arm", "lab"), (A, "feature", "arm/lab")];
         assert_eq!(
             found,

@@ -40,12 +40,17 @@ impl<K: Eq + Hash, T: Clone + Send + Sync + 'static> SingleFlight<K, T> {
         let (result, mut steps) = {
             let mut jobs = self.0.lock();
             jobs.retain(|_, job| job.result.upgrade().is_some_and(|result| result.peek().is_none()));
-            let known = jobs.get(&key).and_then(|job| Some((job.result.upgrade()?, job.progress.clone())));
+            let known = jobs
+                .get(&key)
+                .and_then(|job| Some((job.result.upgrade()?, job.progress.clone())));
             known.unwrap_or_else(|| {
                 let (sender, progress) = watch::channel(String::new());
                 // Each waiter has a timeout of its own; the job ends with the last of them.
                 let result = start(sender).boxed().shared();
-                let job = result.downgrade().map(|result| Job { progress: progress.clone(), result });
+                let job = result.downgrade().map(|result| Job {
+                    progress: progress.clone(),
+                    result,
+                });
                 jobs.extend(job.map(|job| (key, job)));
                 (result, progress)
             })

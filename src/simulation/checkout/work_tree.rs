@@ -34,8 +34,17 @@ pub fn checkout_command(
 ) -> io::Result<Run> {
     let (list, reference) = (scratch.join("paths"), OsString::from(revision.reference()));
     std::fs::write(&list, paths)?;
-    let words = ["checkout", "--force", "--progress", "--pathspec-file-nul", "--pathspec-from-file"];
-    let arguments = words.map(OsString::from).into_iter().chain([list.into(), reference.clone()]);
+    let words = [
+        "checkout",
+        "--force",
+        "--progress",
+        "--pathspec-file-nul",
+        "--pathspec-from-file",
+    ];
+    let arguments = words
+        .map(OsString::from)
+        .into_iter()
+        .chain([list.into(), reference.clone()]);
     let mut call = repository.configured(settings, &arguments.collect::<Vec<_>>());
     call.limits.push((Resource::Data, LITTLE_MEMORY));
     call.spec.environment.extend([
@@ -58,17 +67,32 @@ pub async fn write(
     limit: u64,
     on_line: impl FnMut(&str),
 ) -> Result<Project, CheckoutError> {
-    let ResolvedCommit { repository, revision, above } = found;
-    let folder = if revision.folder.is_empty() { "." } else { &revision.folder };
+    let ResolvedCommit {
+        repository,
+        revision,
+        above,
+    } = found;
+    let folder = if revision.folder.is_empty() {
+        "."
+    } else {
+        &revision.folder
+    };
     let paths = [folder.as_bytes(), b"\0", above].concat();
     let (root, most) = (instance.project(), limit << 20);
-    let settings = if which("git-lfs").is_ok() { lfs_settings(&repository.remote.lock()) } else { Vec::new() };
+    let settings = if which("git-lfs").is_ok() {
+        lfs_settings(&repository.remote.lock())
+    } else {
+        Vec::new()
+    };
     let mut call = checkout_command(repository, revision, &paths, (instance.path(), &root), &settings)?;
     call.may_block = true;
     // git-lfs stores its downloads here, shared with concurrent checkouts, and copies them into the project.
     let kept = repository.path.join("lfs");
     let before = disk::room_of(&kept);
-    let growing = vec![(root.clone(), most), (kept.clone(), before.saturating_add(most.saturating_mul(2)))];
+    let growing = vec![
+        (root.clone(), most),
+        (kept.clone(), before.saturating_add(most.saturating_mul(2))),
+    ];
     let written = tokio::select! {
         written = repository.git.run(call, on_line) => written.map(|_| true),
         () = disk::outgrown(growing) => Ok(false),
@@ -82,8 +106,11 @@ pub async fn write(
         return Err(refused(format!("The project is larger than {limit} MiB")));
     }
     Ok(Project {
-        world: WorldFile::open(&root, &root.join(revision.path_of(&format!("worlds/{}", world.world()))))
-            .map_err(refused)?,
+        world: WorldFile::open(
+            &root,
+            &root.join(revision.path_of(&format!("worlds/{}", world.world()))),
+        )
+        .map_err(refused)?,
         size,
         url: world.clone(),
         revision: revision.clone(),
@@ -97,7 +124,10 @@ fn lfs_settings(remote: &Remote) -> Vec<String> {
     let location = &remote.location;
     let url = match remote.protocol {
         "file" => format!("file://{location}"),
-        _ => format!("{}.git/info/lfs", location.trim_end_matches('/').trim_end_matches(".git")),
+        _ => format!(
+            "{}.git/info/lfs",
+            location.trim_end_matches('/').trim_end_matches(".git")
+        ),
     };
     vec![
         format!("lfs.url={url}"),
@@ -122,8 +152,14 @@ mod tests {
             let location = location.to_owned();
             lfs_settings(&Remote { location, protocol })[0].clone()
         };
-        assert_eq!(first("https://github.com/l/a.git", "https"), "lfs.url=https://github.com/l/a.git/info/lfs");
-        assert_eq!(first("https://forge.org/l/a", "https"), "lfs.url=https://forge.org/l/a.git/info/lfs");
+        assert_eq!(
+            first("https://github.com/l/a.git", "https"),
+            "lfs.url=https://github.com/l/a.git/info/lfs"
+        );
+        assert_eq!(
+            first("https://forge.org/l/a", "https"),
+            "lfs.url=https://forge.org/l/a.git/info/lfs"
+        );
         assert_eq!(first("/mirror/l/a", "file"), "lfs.url=file:///mirror/l/a");
     }
 }

@@ -33,7 +33,15 @@ impl Session {
     }
 
     /// Switches the session to this connection: an earlier one is closed, and its actions are ignored.
-    pub(super) fn attach(&mut self, Connection { peer, client, mut actions }: Connection, ctx: &mut Context<Self>) {
+    pub(super) fn attach(
+        &mut self,
+        Connection {
+            peer,
+            client,
+            mut actions,
+        }: Connection,
+        ctx: &mut Context<Self>,
+    ) {
         self.peer = peer;
         if let Some(before) = self.client.replace(client) {
             before.do_send(ToClient::End(protocol::taken_over(), CloseCode::Normal));
@@ -73,7 +81,11 @@ impl Handler<Resume> for Session {
 
     fn handle(&mut self, Resume { token, connection }: Resume, ctx: &mut Self::Context) {
         if let Some(refusal) = self.refusal(token) {
-            log::info!("{}: client {} does not come back: {refusal}", self.name(), connection.peer);
+            log::info!(
+                "{}: client {} does not come back: {refusal}",
+                self.name(),
+                connection.peer
+            );
             return connection.client.do_send(ToClient::End(refusal, CloseCode::Normal));
         }
         log::info!("{}: goes on as client {}", self.name(), connection.peer);
@@ -82,7 +94,9 @@ impl Handler<Resume> for Session {
         self.show_away(None);
         self.id.into_iter().for_each(|id| self.text(protocol::session(id)));
         let passed = self.launched.map_or(0, |launched| launched.elapsed().as_secs());
-        self.text(protocol::shutdown_timeout(self.server.config.timeout.saturating_sub(passed)));
+        self.text(protocol::shutdown_timeout(
+            self.server.config.timeout.saturating_sub(passed),
+        ));
         self.texts.iter().for_each(|text| self.text(text.clone()));
         self.offer(ctx);
         if let Some(end) = self.idle_end {

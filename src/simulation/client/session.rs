@@ -182,9 +182,17 @@ impl Session {
 
     fn exited(&mut self, WebotsExit { clean, own, why }: &WebotsExit, ctx: &mut Context<Self>) {
         if *own {
-            return if self.url.is_some() { self.refer(why, ctx) } else { self.fail_own(why, ctx) };
+            return if self.url.is_some() {
+                self.refer(why, ctx)
+            } else {
+                self.fail_own(why, ctx)
+            };
         }
-        let words = if *clean { protocol::loading(why) } else { protocol::error(why) };
+        let words = if *clean {
+            protocol::loading(why)
+        } else {
+            protocol::error(why)
+        };
         self.finish(words, why, CloseCode::Normal, ctx);
     }
 }

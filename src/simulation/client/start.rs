@@ -52,7 +52,11 @@ impl Session {
             Ok(world) => world,
             Err(why) => {
                 self.count("refused");
-                return if self.server.takes_nobody() { self.refer(&why, ctx) } else { self.give_up(&why, ctx) };
+                return if self.server.takes_nobody() {
+                    self.refer(&why, ctx)
+                } else {
+                    self.give_up(&why, ctx)
+                };
             }
         };
         let id = SimulationId::next();
@@ -98,8 +102,15 @@ impl Session {
             Ok(program) => program,
             Err(why) => return self.fail_own(&why, ctx),
         };
-        let State::CheckingOut(slot) = std::mem::replace(&mut self.state, State::Over) else { return };
-        log::info!("{}: {} is for Webots {}", self.name(), project.world.path.display(), project.world.version);
+        let State::CheckingOut(slot) = std::mem::replace(&mut self.state, State::Over) else {
+            return;
+        };
+        log::info!(
+            "{}: {} is for Webots {}",
+            self.name(),
+            project.world.path.display(),
+            project.world.version
+        );
         let version = project.world.version.clone();
         slot.lease.update(|one| one.version = Some(version));
         self.text(protocol::loading("webots is starting"));

@@ -40,12 +40,22 @@ type Context = WebsocketContext<WebClient>;
 impl WebClient {
     /// A client that has just connected; `permit` counts it.
     pub fn new(server: Arc<AppState>, (peer, user): (Peer, Option<String>), permit: ConnectionPermit) -> Self {
-        Self { server, peer, user, session: None, liveness: Liveness::default(), _permit: permit }
+        Self {
+            server,
+            peer,
+            user,
+            session: None,
+            liveness: Liveness::default(),
+            _permit: permit,
+        }
     }
 
     fn finish(last_words: String, code: CloseCode, ctx: &mut Context) {
         ctx.text(last_words);
-        ctx.close(Some(CloseReason { code, description: None }));
+        ctx.close(Some(CloseReason {
+            code,
+            description: None,
+        }));
         ctx.stop();
     }
 
@@ -70,9 +80,15 @@ impl WebClient {
         let attached = session.clone();
         // The session's earlier texts come first; after a last text from the session, this actor has stopped.
         let gone = async move { attached.closed().await };
-        gone.into_actor(self).map(move |(), _, ctx| ctx.address().do_send(last)).spawn(ctx);
+        gone.into_actor(self)
+            .map(move |(), _, ctx| ctx.address().do_send(last))
+            .spawn(ctx);
         self.session = Some(session);
-        Connection { peer: self.peer, client: ctx.address().recipient(), actions }
+        Connection {
+            peer: self.peer,
+            client: ctx.address().recipient(),
+            actions,
+        }
     }
 
     /// Asks the session of a token to continue with this connection.
@@ -84,7 +100,10 @@ impl WebClient {
             log::info!("client {}: comes back to a simulation that has ended", self.peer);
             return Handler::handle(self, ended, ctx);
         };
-        session.do_send(Resume { token, connection: self.attach(ended, ctx) });
+        session.do_send(Resume {
+            token,
+            connection: self.attach(ended, ctx),
+        });
     }
 
     fn handle_request(&mut self, text: &str, ctx: &mut Context) {
@@ -93,11 +112,28 @@ impl WebClient {
             Err(wrong) => return self.reject(&wrong.to_string(), CloseCode::Normal, ctx),
         };
         match (request, &self.session) {
-            (ClientRequest { reset_controller: Some(file), .. }, Some(_)) => {
+            (
+                ClientRequest {
+                    reset_controller: Some(file),
+                    ..
+                },
+                Some(_),
+            ) => {
                 self.send(ClientAction::ResetController(file));
             }
-            (ClientRequest { reset_controller: Some(_), .. }, _) => ctx.text(protocol::nothing_to_reset()),
-            (ClientRequest { resume: Some(token), .. }, None) => self.resume(&token, ctx),
+            (
+                ClientRequest {
+                    reset_controller: Some(_),
+                    ..
+                },
+                _,
+            ) => ctx.text(protocol::nothing_to_reset()),
+            (
+                ClientRequest {
+                    resume: Some(token), ..
+                },
+                None,
+            ) => self.resume(&token, ctx),
             (ClientRequest { keep: true, .. }, Some(_)) => self.send(ClientAction::Keep),
             (ClientRequest { start: Some(start), .. }, None) => {
                 let identity = ClientIdentity::new(self.user.as_deref(), start.name.as_deref());

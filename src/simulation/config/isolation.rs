@@ -73,9 +73,14 @@ impl SandboxFolders {
     /// # Errors
     /// When a directory is the root of the system, or one that each sandbox mounts itself.
     pub fn check(&self) -> Result<(), String> {
-        for (key, paths) in [("sandbox.readable", &self.readable), ("sandbox.writable", &self.writable)] {
-            let is_of_each =
-                |path: &Path| path.canonicalize().is_ok_and(|path| OF_EACH.map(Path::new).contains(&&*path));
+        for (key, paths) in [
+            ("sandbox.readable", &self.readable),
+            ("sandbox.writable", &self.writable),
+        ] {
+            let is_of_each = |path: &Path| {
+                path.canonicalize()
+                    .is_ok_and(|path| OF_EACH.map(Path::new).contains(&&*path))
+            };
             if let Some(path) = paths.iter().find(|path| is_of_each(&path.0)) {
                 let path = path.0.display();
                 return Err(format!(
@@ -88,7 +93,11 @@ impl SandboxFolders {
 
     /// The configured paths that do not exist.
     pub fn missing(&self) -> impl Iterator<Item = &Path> {
-        self.readable.iter().chain(&self.writable).map(|path| path.0.as_path()).filter(|path| !path.exists())
+        self.readable
+            .iter()
+            .chain(&self.writable)
+            .map(|path| path.0.as_path())
+            .filter(|path| !path.exists())
     }
 }
 
@@ -112,10 +121,16 @@ impl TryFrom<String> for VariableName {
 
     fn try_from(text: String) -> Result<Self, String> {
         let name = text.strip_suffix('*').unwrap_or(&text);
-        if !name.is_empty() && name.chars().all(|letter| letter.is_ascii_alphanumeric() || letter == '_') {
+        if !name.is_empty()
+            && name
+                .chars()
+                .all(|letter| letter.is_ascii_alphanumeric() || letter == '_')
+        {
             Ok(Self(text))
         } else {
-            Err(format!("{text:?} is no name of an environment variable; allowed is NAME, or BEGINNING*"))
+            Err(format!(
+                "{text:?} is no name of an environment variable; allowed is NAME, or BEGINNING*"
+            ))
         }
     }
 }

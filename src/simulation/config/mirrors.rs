@@ -37,22 +37,43 @@ impl Remote {
 const GITHUB: &str = "https://github.com";
 
 /// Characters that must be escaped in a path segment of a URL.
-const ESCAPED: &AsciiSet =
-    &CONTROLS.add(b' ').add(b'"').add(b'#').add(b'%').add(b'<').add(b'>').add(b'?').add(b'`').add(b'{').add(b'}');
+const ESCAPED: &AsciiSet = &CONTROLS
+    .add(b' ')
+    .add(b'"')
+    .add(b'#')
+    .add(b'%')
+    .add(b'<')
+    .add(b'>')
+    .add(b'?')
+    .add(b'`')
+    .add(b'{')
+    .add(b'}');
 
 impl Mirrors {
     fn mirror(&self, world: &ProjectUrl) -> Option<&(UrlPrefix, String)> {
-        self.0.iter().filter(|(prefix, _)| prefix.covers(world)).max_by_key(|(prefix, _)| prefix.depth())
+        self.0
+            .iter()
+            .filter(|(prefix, _)| prefix.covers(world))
+            .max_by_key(|(prefix, _)| prefix.depth())
     }
 
     /// The same world in the repository that is fetched from this URL; `None` if no URL on its Git host leads to that.
     pub fn moved(&self, world: &ProjectUrl, location: &str) -> Option<ProjectUrl> {
-        let mirror = self.mirror(world).map(|(prefix, replacement)| (prefix.as_str(), replacement.as_str()));
+        let mirror = self
+            .mirror(world)
+            .map(|(prefix, replacement)| (prefix.as_str(), replacement.as_str()));
         let (prefix, base) = mirror.unwrap_or((GITHUB, GITHUB));
         let base = url::Url::parse(base).ok()?;
-        let rest = location.strip_prefix(base.as_str().trim_end_matches('/'))?.strip_prefix('/')?;
-        let moved = world.in_repository(&format!("{}/{rest}", prefix.trim_end_matches('/'))).ok()?;
-        let there = Remote { location: location.to_owned(), protocol: "https" };
+        let rest = location
+            .strip_prefix(base.as_str().trim_end_matches('/'))?
+            .strip_prefix('/')?;
+        let moved = world
+            .in_repository(&format!("{}/{rest}", prefix.trim_end_matches('/')))
+            .ok()?;
+        let there = Remote {
+            location: location.to_owned(),
+            protocol: "https",
+        };
         (self.remote(&moved)?.key() == there.key()).then_some(moved)
     }
 
@@ -60,22 +81,44 @@ impl Mirrors {
     pub fn remote(&self, world: &ProjectUrl) -> Option<Remote> {
         let Some((prefix, replacement)) = self.mirror(world) else {
             let location = format!("{GITHUB}/{}.git", escaped(world.repository_segments()));
-            return (world.host() == "github.com").then_some(Remote { location, protocol: "https" });
+            return (world.host() == "github.com").then_some(Remote {
+                location,
+                protocol: "https",
+            });
         };
         let rest = prefix.rest_of_repository(world);
         if let Some(folder) = replacement.strip_prefix("file:") {
             let folder = PathBuf::from(folder.trim_start_matches("//"));
-            let path: PathBuf = std::iter::once(folder.as_os_str()).chain(rest.iter().map(AsRef::as_ref)).collect();
-            let location = std::path::absolute(&path).unwrap_or(path).to_string_lossy().into_owned();
-            return Some(Remote { location, protocol: "file" });
+            let path: PathBuf = std::iter::once(folder.as_os_str())
+                .chain(rest.iter().map(AsRef::as_ref))
+                .collect();
+            let location = std::path::absolute(&path)
+                .unwrap_or(path)
+                .to_string_lossy()
+                .into_owned();
+            return Some(Remote {
+                location,
+                protocol: "file",
+            });
         }
-        let slash = if rest.is_empty() || replacement.ends_with('/') { "" } else { "/" };
-        Some(Remote { location: format!("{replacement}{slash}{}", escaped(rest)), protocol: "https" })
+        let slash = if rest.is_empty() || replacement.ends_with('/') {
+            ""
+        } else {
+            "/"
+        };
+        Some(Remote {
+            location: format!("{replacement}{slash}{}", escaped(rest)),
+            protocol: "https",
+        })
     }
 }
 
 fn escaped(segments: &[String]) -> String {
-    segments.iter().map(|segment| utf8_percent_encode(segment, ESCAPED).to_string()).collect::<Vec<_>>().join("/")
+    segments
+        .iter()
+        .map(|segment| utf8_percent_encode(segment, ESCAPED).to_string())
+        .collect::<Vec<_>>()
+        .join("/")
 }
 
 impl TryFrom<BTreeMap<String, String>> for Mirrors {
@@ -93,7 +136,9 @@ impl TryFrom<BTreeMap<String, String>> for Mirrors {
                 if names_something("file:") || names_something("https://") {
                     Ok((prefix, replacement))
                 } else {
-                    Err(format!("{replacement:?} is no replacement; allowed are https://... and file:FOLDER"))
+                    Err(format!(
+                        "{replacement:?} is no replacement; allowed are https://... and file:FOLDER"
+                    ))
                 }
             })
             .collect::<Result<_, _>>()
@@ -103,7 +148,11 @@ impl TryFrom<BTreeMap<String, String>> for Mirrors {
 
 impl From<Mirrors> for BTreeMap<String, String> {
     fn from(mirrors: Mirrors) -> Self {
-        mirrors.0.into_iter().map(|(prefix, replacement)| (prefix.into(), replacement)).collect()
+        mirrors
+            .0
+            .into_iter()
+            .map(|(prefix, replacement)| (prefix.into(), replacement))
+            .collect()
     }
 }
 
@@ -112,7 +161,11 @@ mod tests {
     use super::*;
 
     fn mirrors(pairs: &[(&str, &str)]) -> Result<Mirrors, String> {
-        pairs.iter().map(|(one, other)| ((*one).to_owned(), (*other).to_owned())).collect::<BTreeMap<_, _>>().try_into()
+        pairs
+            .iter()
+            .map(|(one, other)| ((*one).to_owned(), (*other).to_owned()))
+            .collect::<BTreeMap<_, _>>()
+            .try_into()
     }
 
     #[test]
@@ -124,12 +177,28 @@ mod tests {
             ("https://git.lab/", "https://git.lab/"),
         ])
         .unwrap();
-        let of = |world: &str| table.remote(&ProjectUrl::parse(world).unwrap()).map(|remote| remote.location);
+        let of = |world: &str| {
+            table
+                .remote(&ProjectUrl::parse(world).unwrap())
+                .map(|remote| remote.location)
+        };
         let some = |text: &str| Some(text.to_owned());
-        assert_eq!(of("https://github.com/x/y/blob/m/worlds/a.wbt"), some("https://mirror.lab/github/x/y"));
-        assert_eq!(of("https://github.com/lab/leg/blob/m/worlds/a.wbt"), some("/srv/lab/leg"));
-        assert_eq!(of("https://github.com/lab/arm/blob/m/worlds/a.wbt"), some("/srv/arm.git"));
-        assert_eq!(of("https://git.lab/g/s/r/-/blob/m/worlds/a.wbt"), some("https://git.lab/g/s/r"));
+        assert_eq!(
+            of("https://github.com/x/y/blob/m/worlds/a.wbt"),
+            some("https://mirror.lab/github/x/y")
+        );
+        assert_eq!(
+            of("https://github.com/lab/leg/blob/m/worlds/a.wbt"),
+            some("/srv/lab/leg")
+        );
+        assert_eq!(
+            of("https://github.com/lab/arm/blob/m/worlds/a.wbt"),
+            some("/srv/arm.git")
+        );
+        assert_eq!(
+            of("https://git.lab/g/s/r/-/blob/m/worlds/a.wbt"),
+            some("https://git.lab/g/s/r")
+        );
         assert_eq!(of("https://elsewhere.org/u/r/blob/m/worlds/a.wbt"), None);
     }
 
@@ -137,12 +206,24 @@ mod tests {
     fn without_a_mirror_github_is_cloned_from_itself() {
         let world = ProjectUrl::parse("https://github.com/u/a%20b/blob/m/worlds/a.wbt").unwrap();
         let remote = Mirrors::default().remote(&world).unwrap();
-        assert_eq!(remote, Remote { location: "https://github.com/u/a%20b.git".to_owned(), protocol: "https" });
+        assert_eq!(
+            remote,
+            Remote {
+                location: "https://github.com/u/a%20b.git".to_owned(),
+                protocol: "https"
+            }
+        );
     }
 
     #[test]
     fn a_repository_is_the_same_in_every_spelling() {
-        let key = |location: &str, protocol| Remote { location: location.to_owned(), protocol }.key();
+        let key = |location: &str, protocol| {
+            Remote {
+                location: location.to_owned(),
+                protocol,
+            }
+            .key()
+        };
         let one = key("https://github.com/lab/arm.git", "https");
         assert_eq!(one, key("https://github.com/Lab/ARM", "https"));
         assert_ne!(key("/srv/lab/arm", "file"), key("/srv/Lab/arm", "file"));
@@ -150,8 +231,17 @@ mod tests {
 
     #[test]
     fn only_https_and_folders_replace() {
-        for odd in ["ext::sh -c id", "http://mirror", "ssh://mirror", "git@mirror:x", "/srv/x"] {
-            assert!(mirrors(&[("https://github.com/", odd)]).unwrap_err().contains(odd), "{odd}");
+        for odd in [
+            "ext::sh -c id",
+            "http://mirror",
+            "ssh://mirror",
+            "git@mirror:x",
+            "/srv/x",
+        ] {
+            assert!(
+                mirrors(&[("https://github.com/", odd)]).unwrap_err().contains(odd),
+                "{odd}"
+            );
         }
     }
 }

@@ -170,7 +170,13 @@ impl SimulationConfig {
     /// Returns the files that may contain secrets: the configuration file, and those that it names.
     pub fn secret_files(&self) -> impl Iterator<Item = &Path> {
         let password = self.admin_password.as_ref().and_then(Secret::file);
-        [Some(self.file.as_path()), self.git_config.as_ref().map(|file| &*file.0), password].into_iter().flatten()
+        [
+            Some(self.file.as_path()),
+            self.git_config.as_ref().map(|file| &*file.0),
+            password,
+        ]
+        .into_iter()
+        .flatten()
     }
 
     /// Whether simulations are spread over the GPUs of the machine.
@@ -182,7 +188,11 @@ impl SimulationConfig {
     pub fn displays_of_gpus(&self) -> &[String] {
         let in_container = self.container.display == ContainerDisplay::Virtual;
         let is_virtual = if self.docker { in_container } else { self.xvfb };
-        if self.spreads() && !is_virtual { &self.displays } else { &[] }
+        if self.spreads() && !is_virtual {
+            &self.displays
+        } else {
+            &[]
+        }
     }
 
     /// The display for the window of a Webots with this GPU, or without a GPU of its own.
@@ -218,13 +228,17 @@ impl Configuration for SimulationConfig {
         self.docker = self.isolation == IsolationSetting::Container;
         let (places, editors) = (self.max_connections, if self.docker { EDITOR_PORT } else { 0 });
         let last = u32::from(self.port) + u32::from(places) + u32::from(editors);
-        require(u16::try_from(last).is_ok() && (!self.docker || places <= EDITOR_PORT), "maxConnections", || {
-            format!(
-                "{places} places above port {} leave the range of ports; with containers allowed are up to {EDITOR_PORT} \
+        require(
+            u16::try_from(last).is_ok() && (!self.docker || places <= EDITOR_PORT),
+            "maxConnections",
+            || {
+                format!(
+                    "{places} places above port {} leave the range of ports; with containers allowed are up to {EDITOR_PORT} \
                  places, and editors up to port 65535: each has the port of its Webots + {EDITOR_PORT}",
-                self.port
-            )
-        })?;
+                    self.port
+                )
+            },
+        )?;
         if matches!(self.isolation, IsolationSetting::Auto | IsolationSetting::Sandbox) {
             self.sandbox.check()?;
         } else {
@@ -233,7 +247,11 @@ impl Configuration for SimulationConfig {
                     .to_owned()
             })?;
         }
-        warnings.extend(self.sandbox.missing().map(|path| format!("sandbox: {} is not there", path.display())));
+        warnings.extend(
+            self.sandbox
+                .missing()
+                .map(|path| format!("sandbox: {} is not there", path.display())),
+        );
         require(self.timing.silence > self.timing.ping, "timing.silence", || {
             format!("{} s is not more than timing.ping", self.timing.silence.as_secs_f64())
         })?;
@@ -244,7 +262,10 @@ impl Configuration for SimulationConfig {
         }
         if self.allowed_repositories.is_empty() {
             let effect = if self.docker && self.share_idle_time > 0.0 {
-                format!("any repository runs while the load is at most {} % (shareIdleTime)", self.share_idle_time)
+                format!(
+                    "any repository runs while the load is at most {} % (shareIdleTime)",
+                    self.share_idle_time
+                )
             } else {
                 "no world will run here".to_owned()
             };

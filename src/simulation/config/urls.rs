@@ -59,11 +59,18 @@ impl SimulationConfig {
             IpAddr::V6(bind) if !self.docker && self.ports_are_public() => bind.into(),
             _ => IpAddr::V4(self.bind_of_containers()),
         };
-        if bind.is_unspecified() { Ipv4Addr::LOCALHOST.into() } else { bind }
+        if bind.is_unspecified() {
+            Ipv4Addr::LOCALHOST.into()
+        } else {
+            bind
+        }
     }
 
     fn client_urls(&self) -> ClientUrls {
-        ClientUrls { ssl: self.ssl, public: self.public_url.clone() }
+        ClientUrls {
+            ssl: self.ssl,
+            public: self.public_url.clone(),
+        }
     }
 
     fn address(&self, port: u16) -> PublicAddress {

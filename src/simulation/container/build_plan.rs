@@ -74,16 +74,24 @@ impl BuildPlan {
         let is_competition = yml.kind == ProjectKind::Competition;
         let controller = is_competition.then(|| competition(project)).transpose()?;
         let build = |text: &str, folder, more: &[&str]| {
-            let mut arguments =
-                vec![format!("PROJECT_PATH={PROJECT_PATH}"), format!("MAKE={}", u8::from(has_makefile))];
+            let mut arguments = vec![
+                format!("PROJECT_PATH={PROJECT_PATH}"),
+                format!("MAKE={}", u8::from(has_makefile)),
+            ];
             arguments.extend(more.iter().map(|argument| (*argument).to_owned()));
-            Ok::<_, String>(ImageBuild { dockerfile: Dockerfile::read(text, owner)?, folder, arguments })
+            Ok::<_, String>(ImageBuild {
+                dockerfile: Dockerfile::read(text, owner)?,
+                folder,
+                arguments,
+            })
         };
         let image = match dockerfile {
             Some(text) => build(&text, Some(""), &[])?,
             None => build(NO_DOCKERFILE, None, &[])?,
         };
-        let controller = controller.map(|text| build(&text, Some("controllers"), &PARTICIPANT)).transpose()?;
+        let controller = controller
+            .map(|text| build(&text, Some("controllers"), &PARTICIPANT))
+            .transpose()?;
         Ok(Self { yml, image, controller })
     }
 }
@@ -104,7 +112,11 @@ impl ProjectPaths {
                 participant_folder(project)
             }
         };
-        Ok(Self { world, project: mountable(root)?, edited: mountable(edited)? })
+        Ok(Self {
+            world,
+            project: mountable(root)?,
+            edited: mountable(edited)?,
+        })
     }
 }
 
@@ -129,7 +141,9 @@ fn competition(project: &Path) -> Result<String, String> {
 /// # Errors
 /// When there is none, as text for the client.
 pub fn inside(project: &Path, folder: &Path) -> Result<PathBuf, String> {
-    let found = project.canonicalize().and_then(|root| Ok((project.join(folder).canonicalize()?, root)));
+    let found = project
+        .canonicalize()
+        .and_then(|root| Ok((project.join(folder).canonicalize()?, root)));
     match found {
         Ok((found, root)) if found.starts_with(&root) && found.is_dir() => Ok(found),
         _ => Err(format!("The project has no folder {}", folder.display())),
@@ -145,7 +159,12 @@ fn open_participant(world: &Path) -> Result<(), StartError> {
     let open = || {
         let text = std::fs::read_to_string(world)?.replace("controller \"participant\"", "controller \"<extern>\"");
         let flags = OFlag::O_NOFOLLOW.bits();
-        OpenOptions::new().write(true).truncate(true).custom_flags(flags).open(world)?.write_all(text.as_bytes())
+        OpenOptions::new()
+            .write(true)
+            .truncate(true)
+            .custom_flags(flags)
+            .open(world)?
+            .write_all(text.as_bytes())
     };
     open().map_err(|error| match error.kind() {
         ErrorKind::InvalidData | ErrorKind::PermissionDenied => {
@@ -173,7 +192,12 @@ pub fn participant_folder(project: &Project) -> PathBuf {
 /// When it does not exist, as text for the client.
 fn world_in(root: &Path, project: &Project) -> Result<String, String> {
     let name = project.world.path.file_name().unwrap_or_default().to_string_lossy();
-    let path = root.join("worlds").join(&*name).canonicalize().ok().filter(|path| path.is_file());
+    let path = root
+        .join("worlds")
+        .join(&*name)
+        .canonicalize()
+        .ok()
+        .filter(|path| path.is_file());
     let path = path.ok_or_else(|| format!("The image of this project has no worlds/{name}"))?;
     let inside = path.strip_prefix(root).ok().and_then(Path::to_str).map(str::to_owned);
     inside.ok_or_else(|| "The world is behind a link that leads out of its project".to_owned())
@@ -189,7 +213,9 @@ fn mountable(folder: PathBuf) -> Result<PathBuf, String> {
         return Ok(folder);
     }
     let name = one_line(&folder.file_name().unwrap_or_default().to_string_lossy());
-    Err(format!("The path of the folder {name} of this project has a ':' or a line break, which containers can't have"))
+    Err(format!(
+        "The path of the folder {name} of this project has a ':' or a line break, which containers can't have"
+    ))
 }
 
 #[cfg(test)]
@@ -232,7 +258,12 @@ mod tests {
         );
         std::fs::write(project.path().join("Dockerfile"), "FROM mine\n").unwrap();
         let plan = read(project.path()).unwrap();
-        assert!(plan.image.dockerfile.text.starts_with("FROM mine\nLABEL webots-fleet.owner=x\nRUN "));
+        assert!(
+            plan.image
+                .dockerfile
+                .text
+                .starts_with("FROM mine\nLABEL webots-fleet.owner=x\nRUN ")
+        );
     }
 
     #[test]
@@ -244,16 +275,26 @@ mod tests {
         std::fs::remove_file(&file).unwrap();
         nix::unistd::mkfifo(&file, nix::sys::stat::Mode::S_IRWXU).unwrap();
         let wrong = read(project.path()).unwrap_err();
-        assert_eq!(wrong.to_string(), "Dockerfile of the project is no plain file of at most 256 KiB");
+        assert_eq!(
+            wrong.to_string(),
+            "Dockerfile of the project is no plain file of at most 256 KiB"
+        );
     }
 
     #[test]
     fn a_participant_is_run_from_outside() {
         let folder = tempfile::tempdir().unwrap();
         let world = folder.path().join("a.wbt");
-        std::fs::write(&world, "Robot { controller \"participant\" }\nRobot { controller \"other\" }\n").unwrap();
+        std::fs::write(
+            &world,
+            "Robot { controller \"participant\" }\nRobot { controller \"other\" }\n",
+        )
+        .unwrap();
         open_participant(&world).unwrap();
         let text = std::fs::read_to_string(world).unwrap();
-        assert_eq!(text, "Robot { controller \"<extern>\" }\nRobot { controller \"other\" }\n");
+        assert_eq!(
+            text,
+            "Robot { controller \"<extern>\" }\nRobot { controller \"other\" }\n"
+        );
     }
 }

@@ -54,17 +54,33 @@ impl BuiltImage {
         let image: Self = serde_json::from_str(json)
             .map_err(|error| format!("The configuration of the image can't be read: {error}"))?;
         match image.volumes.as_ref().and_then(|volumes| volumes.keys().next()) {
-            Some(path) => Err(format!("The image that it begins with has `VOLUME {}`: {NO_VOLUME}", one_line(path))),
+            Some(path) => Err(format!(
+                "The image that it begins with has `VOLUME {}`: {NO_VOLUME}",
+                one_line(path)
+            )),
             None => Ok(Self { name, ..image }),
         }
     }
 
     /// The entry point of its containers: the first program, which runs that of the image.
     pub fn entrypoint(&self) -> Vec<String> {
-        let home = self.env.iter().flatten().find_map(|variable| variable.strip_prefix("HOME="));
-        let user = self.user.split(':').next().filter(|user| !user.is_empty()).unwrap_or("root");
+        let home = self
+            .env
+            .iter()
+            .flatten()
+            .find_map(|variable| variable.strip_prefix("HOME="));
+        let user = self
+            .user
+            .split(':')
+            .next()
+            .filter(|user| !user.is_empty())
+            .unwrap_or("root");
         let first = ["/bin/sh", "-c", START_AT_HOME, "start-at-home", home.unwrap_or(user)];
-        first.map(str::to_owned).into_iter().chain(self.entrypoint.iter().flatten().cloned()).collect()
+        first
+            .map(str::to_owned)
+            .into_iter()
+            .chain(self.entrypoint.iter().flatten().cloned())
+            .collect()
     }
 
     /// The command of its containers if none is given.
@@ -89,7 +105,10 @@ pub async fn export(
 ) -> Result<(), StartError> {
     let name = format!("{name}-{:08x}", rand::random::<u32>());
     let create = ["create", "--name", &name, "--network", "none", &image.name, "true"];
-    docker.run(&create, SHORT_TIMEOUT).await.map_err(|error| blame(true, error))?;
+    docker
+        .run(&create, SHORT_TIMEOUT)
+        .await
+        .map_err(|error| blame(true, error))?;
     let through = project.instance.path().join("copied");
     let source = format!("{name}:{}/.", from.display());
     let words = ["cp", &source, &through.to_string_lossy()].map(str::to_owned);
@@ -127,11 +146,20 @@ mod tests {
             r#"{"User":"x\n\":7","Env":["A=b"],"Entrypoint":["/bin/sh","-c","a \\"],"Cmd":["b","\n"],"Volumes":null}"#;
         let image = BuiltImage::read("one".to_owned(), told).unwrap();
         let begin = ["/bin/sh", "-c", START_AT_HOME, "start-at-home"];
-        assert_eq!(image.entrypoint(), [&begin[..], &["x\n\"", "/bin/sh", "-c", "a \\"]].concat());
-        assert_eq!((image.name.as_str(), image.command()), ("one", vec!["b".to_owned(), "\n".to_owned()]));
+        assert_eq!(
+            image.entrypoint(),
+            [&begin[..], &["x\n\"", "/bin/sh", "-c", "a \\"]].concat()
+        );
+        assert_eq!(
+            (image.name.as_str(), image.command()),
+            ("one", vec!["b".to_owned(), "\n".to_owned()])
+        );
         let at_home = |json| BuiltImage::read(String::new(), json).unwrap().entrypoint().pop();
         assert_eq!(at_home("{}").as_deref(), Some("root"));
-        assert_eq!(at_home(r#"{"User":"x","Env":["HOME=/srv/x"]}"#).as_deref(), Some("/srv/x"));
+        assert_eq!(
+            at_home(r#"{"User":"x","Env":["HOME=/srv/x"]}"#).as_deref(),
+            Some("/srv/x")
+        );
     }
 
     #[test]

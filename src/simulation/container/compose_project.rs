@@ -150,7 +150,12 @@ impl ComposeProject {
             ContainerDisplay::Virtual => VIRTUAL_DISPLAY.map(str::to_owned).into(),
             ContainerDisplay::Machine => Vec::new(),
         };
-        [display, self.request.command.clone(), vec![format!("{PROJECT_PATH}/{}", paths.world)]].concat()
+        [
+            display,
+            self.request.command.clone(),
+            vec![format!("{PROJECT_PATH}/{}", paths.world)],
+        ]
+        .concat()
     }
 }
 
@@ -158,7 +163,9 @@ impl GpuAccess {
     /// Detects the GPUs.
     pub fn find() -> Self {
         let group = |file: std::fs::DirEntry| Some(file.metadata().ok()?.gid());
-        let groups = std::fs::read_dir(DRI).ok().map(|files| files.flatten().filter_map(group).collect());
+        let groups = std::fs::read_dir(DRI)
+            .ok()
+            .map(|files| files.flatten().filter_map(group).collect());
         let nvidia = Path::new(NVIDIA).exists() && which(NVIDIA_HOOK).is_ok();
         Self { nvidia, groups }
     }
@@ -184,15 +191,24 @@ fn protected(
         ("read_only", json!(settings.read_only)),
         ("cap_drop", json!(["ALL"])),
         ("cap_add", json!(settings.capabilities)),
-        ("security_opt", json!([format!("no-new-privileges:{}", !settings.new_privileges)])),
-        ("user", json!(format!("{}:{}", nix::unistd::getuid(), nix::unistd::getgid()))),
+        (
+            "security_opt",
+            json!([format!("no-new-privileges:{}", !settings.new_privileges)]),
+        ),
+        (
+            "user",
+            json!(format!("{}:{}", nix::unistd::getuid(), nix::unistd::getgid())),
+        ),
         ("tmpfs", json!(in_memory)),
         // The browser engine inside Webots needs it.
         ("shm_size", json!("256m")),
         ("mem_limit", json!(memory)),
         ("memswap_limit", json!(memory)),
         ("pids_limit", json!(limits.processes)),
-        ("ulimits", json!({ "nofile": { "soft": limits.open_files.min(1024), "hard": limits.open_files }, "core": 0 })),
+        (
+            "ulimits",
+            json!({ "nofile": { "soft": limits.open_files.min(1024), "hard": limits.open_files }, "core": 0 }),
+        ),
         ("logging", json!({ "driver": "none" })),
         // Reaps orphans and forwards signals.
         ("init", json!(true)),
@@ -203,7 +219,11 @@ fn protected(
     let mut environment: BTreeMap<_, _> = environment.iter().cloned().collect();
     environment.extend(ENVIRONMENT.map(|(name, value)| (name, value.to_owned())));
     // The entry points of the images of Webots and of controllers create it.
-    let home = if [WEBOTS, CONTROLLER].contains(&name) { "/tmp/home" } else { "/tmp" };
+    let home = if [WEBOTS, CONTROLLER].contains(&name) {
+        "/tmp/home"
+    } else {
+        "/tmp"
+    };
     environment.insert("HOME", home.to_owned());
     if name == WEBOTS {
         volumes.extend(settings.mounts.clone());
@@ -221,14 +241,20 @@ fn protected(
     if name == WEBOTS && settings.gpu {
         if let Some(groups) = &access.groups {
             service.insert("devices", json!(["/dev/dri:/dev/dri"]));
-            service.insert("group_add", json!(groups.iter().map(u32::to_string).collect::<Vec<_>>()));
+            service.insert(
+                "group_add",
+                json!(groups.iter().map(u32::to_string).collect::<Vec<_>>()),
+            );
         }
         if access.nvidia {
             // An image may request all GPUs by this variable.
             environment.extend(gpu.map(|gpu| ("NVIDIA_VISIBLE_DEVICES", gpu.id.clone())));
             let (key, value) = gpu.map_or(("count", json!("all")), |gpu| ("device_ids", json!([gpu.id])));
             let devices = json!({ "driver": "nvidia", key: value, "capabilities": ["gpu"] });
-            service.insert("deploy", json!({ "resources": { "reservations": { "devices": [devices] } } }));
+            service.insert(
+                "deploy",
+                json!({ "resources": { "reservations": { "devices": [devices] } } }),
+            );
             environment.insert("NVIDIA_DRIVER_CAPABILITIES", "all".to_owned());
         }
     }
@@ -245,7 +271,11 @@ pub fn container_of(project: &str, service: &str) -> String {
 type Service = BTreeMap<&'static str, Value>;
 
 /// Variables of all services: with them programs write only to writable paths, and find each other.
-const ENVIRONMENT: [(&str, &str); 3] = [("USER", "webots"), ("XDG_RUNTIME_DIR", "/tmp"), ("QT_X11_NO_MITSHM", "1")];
+const ENVIRONMENT: [(&str, &str); 3] = [
+    ("USER", "webots"),
+    ("XDG_RUNTIME_DIR", "/tmp"),
+    ("QT_X11_NO_MITSHM", "1"),
+];
 
 /// Memory limit of a container without `limits.memory`, in MiB.
 pub const DEFAULT_MEMORY: u64 = 4096;
@@ -259,22 +289,41 @@ mod tests {
     fn a_container_gets_the_chosen_gpu_and_its_display() {
         let keys = json!({ "isolation": "container", "gpus": "spread", "displays": [":0.0", ":0.1"], "display": ":7" });
         let mut config: SimulationConfig = serde_json::from_value(keys).unwrap();
-        config.container = ContainerSettings { display: ContainerDisplay::Machine, ..ContainerSettings::default() };
-        let access = GpuAccess { nvidia: true, groups: None };
-        let gpu = Gpu { index: 1, id: "GPU-b".to_owned(), ..Gpu::default() };
+        config.container = ContainerSettings {
+            display: ContainerDisplay::Machine,
+            ..ContainerSettings::default()
+        };
+        let access = GpuAccess {
+            nvidia: true,
+            groups: None,
+        };
+        let gpu = Gpu {
+            index: 1,
+            id: "GPU-b".to_owned(),
+            ..Gpu::default()
+        };
         let service = |gpu: Option<&Gpu>, name: &str| json!(protected(name, &access, gpu, &config, Vec::new(), &[]));
         let devices = |service: &Value| service["deploy"]["resources"]["reservations"]["devices"].clone();
         let one = service(Some(&gpu), "webots");
         let expected = json!([{ "driver": "nvidia", "device_ids": ["GPU-b"], "capabilities": ["gpu"] }]);
         assert_eq!(devices(&one), expected);
         assert_eq!(
-            (&one["environment"]["DISPLAY"], &one["environment"]["NVIDIA_VISIBLE_DEVICES"]),
+            (
+                &one["environment"]["DISPLAY"],
+                &one["environment"]["NVIDIA_VISIBLE_DEVICES"]
+            ),
             (&json!(":0.1"), &json!("GPU-b"))
         );
         let all = service(None, "webots");
-        assert_eq!(devices(&all), json!([{ "driver": "nvidia", "count": "all", "capabilities": ["gpu"] }]));
         assert_eq!(
-            (&all["environment"]["DISPLAY"], &all["environment"]["NVIDIA_VISIBLE_DEVICES"]),
+            devices(&all),
+            json!([{ "driver": "nvidia", "count": "all", "capabilities": ["gpu"] }])
+        );
+        assert_eq!(
+            (
+                &all["environment"]["DISPLAY"],
+                &all["environment"]["NVIDIA_VISIBLE_DEVICES"]
+            ),
             (&json!(":0.0"), &Value::Null)
         );
         assert_eq!(devices(&service(Some(&gpu), "theia")), Value::Null);

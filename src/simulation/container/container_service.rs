@@ -84,7 +84,10 @@ impl ContainerService {
         let (project, docker, size) = (&request.project, &self.docker, self.config.project_size);
         let (folder, owner) = (project.folder.clone(), self.images.owner.clone());
         let BuildPlan { yml, image, controller } = spawn_blocking(move || BuildPlan::read(&folder, &owner.0)).await??;
-        let guard = ProjectGuard { name: self.run.project(request.port), runtime: self.runtime.clone() };
+        let guard = ProjectGuard {
+            name: self.run.project(request.port),
+            runtime: self.runtime.clone(),
+        };
         join_network(docker, self.config.container.network.name()).await?;
         let is_projects = image.folder.is_some() || controller.is_some();
         let made = async |build: ImageBuild, from: &Path, to: &Path| {
@@ -108,22 +111,46 @@ impl ContainerService {
             self.images.pull(&self.config.container.editor_image, progress).await?;
         }
         let (name, config) = (guard.name.clone(), Arc::clone(&self.config));
-        let compose = ComposeProject { name, request, yml, image, controller, config };
+        let compose = ComposeProject {
+            name,
+            request,
+            yml,
+            image,
+            controller,
+            config,
+        };
         let (written, ComposeProject { yml, .. }) = spawn_blocking(move || (compose.write(), compose)).await?;
         let (options, services) = written?;
         // More concurrent runs would only be slower. The semaphore is never closed.
         let turn = self.turns.acquire().await.ok();
         progress("Creating network and containers".to_owned());
         let up = ["up", "--no-start", "--no-build"].map(str::to_owned);
-        let words = self.docker.compose.iter().map(|word| (*word).to_owned()).chain(options).chain(up);
-        let created = self.docker.follow(words.map(Into::into).collect(), CREATE_TIMEOUT, |_| ()).await;
+        let words = self
+            .docker
+            .compose
+            .iter()
+            .map(|word| (*word).to_owned())
+            .chain(options)
+            .chain(up);
+        let created = self
+            .docker
+            .follow(words.map(Into::into).collect(), CREATE_TIMEOUT, |_| ())
+            .await;
         created.map_err(|error| blame(is_projects, error))?;
         drop(turn);
         // An editor has a port of its own, which the relay of streams does not reach.
         let ide = (has_editor && self.config.ports_are_public()).then(|| "ide: enable".to_owned());
         let texts = ide.into_iter().chain(yml.project_type).collect();
         let (docker, warnings) = (self.docker.clone(), yml.warnings);
-        Ok(SimulationContainers { docker, guard, services, is_projects, texts, warnings, restart: None })
+        Ok(SimulationContainers {
+            docker,
+            guard,
+            services,
+            is_projects,
+            texts,
+            warnings,
+            restart: None,
+        })
     }
 }
 
@@ -134,7 +161,10 @@ impl ContainerService {
 pub fn check(config: &SimulationConfig) -> Result<String, String> {
     Docker::find(Path::new("/"))?;
     daemon_fault().or_else(packet_filter::missing).map_or(Ok(()), Err)?;
-    Ok(format!("it answers; worlds run in {}, or the image of their project's Dockerfile", config.container.image))
+    Ok(format!(
+        "it answers; worlds run in {}, or the image of their project's Dockerfile",
+        config.container.image
+    ))
 }
 
 /// Creates the network of all containers, unless it exists. Its name is also that of its interface, which the packet filter
@@ -142,7 +172,9 @@ pub fn check(config: &SimulationConfig) -> Result<String, String> {
 async fn join_network(docker: &Docker, name: &str) -> Result<(), DockerError> {
     // One network for all, because Docker's address pools allow only some thirty.
     let interface = format!("com.docker.network.bridge.name={name}");
-    let create = ["network", "create", "--driver", "bridge", "--opt", &interface, "--opt", ALONE, name];
+    let create = [
+        "network", "create", "--driver", "bridge", "--opt", &interface, "--opt", ALONE, name,
+    ];
     match docker.run(&create, SHORT_TIMEOUT).await {
         // Of two concurrent creations Docker refuses the second, because both name the same interface.
         Err(DockerError::Failed { message, .. })

@@ -83,10 +83,13 @@ impl Docker {
             &["docker-compose"]
         } else {
             return Err(
-                "docker compose is not there; the package docker-compose or docker-compose-plugin has it".to_owned()
+                "docker compose is not there; the package docker-compose or docker-compose-plugin has it".to_owned(),
             );
         };
-        Ok(Self { compose, mark: mark.to_owned() })
+        Ok(Self {
+            compose,
+            mark: mark.to_owned(),
+        })
     }
 
     /// Runs `docker` with these arguments, and returns its standard output.
@@ -110,14 +113,30 @@ impl Docker {
         on_line: impl FnMut(&str),
     ) -> Result<(), DockerError> {
         let spec = self.spec(command, Duration::ZERO);
-        finish(Run { spec, answer: 0, ..Run::new([""], &self.mark, limit) }, on_line).await.map(drop)
+        finish(
+            Run {
+                spec,
+                answer: 0,
+                ..Run::new([""], &self.mark, limit)
+            },
+            on_line,
+        )
+        .await
+        .map(drop)
     }
 
     /// The specification of a client program of the daemon. Dropping its process group ends only that program.
     pub fn spec(&self, command: Vec<OsString>, grace: Duration) -> SpawnSpec {
         // The classic builder prints its steps, and can build on the server's own network; BuildKit can't.
-        let environment = vec![("DOCKER_BUILDKIT".into(), "0".into()), ("COMPOSE_ANSI".into(), "never".into())];
-        SpawnSpec { environment, grace, ..SpawnSpec::new(command, &self.mark) }
+        let environment = vec![
+            ("DOCKER_BUILDKIT".into(), "0".into()),
+            ("COMPOSE_ANSI".into(), "never".into()),
+        ];
+        SpawnSpec {
+            environment,
+            grace,
+            ..SpawnSpec::new(command, &self.mark)
+        }
     }
 }
 
@@ -144,7 +163,9 @@ pub fn blocking(arguments: &[&str], limit: Duration) -> Result<String, DockerErr
 
 /// Why the daemon can't be used now, as text for clients and administrators. Blocks for five seconds at most.
 pub fn daemon_fault() -> Option<String> {
-    blocking(&["version", "--format", "{{.Server.Version}}"], ANSWER_TIMEOUT).err().map(|error| error.to_string())
+    blocking(&["version", "--format", "{{.Server.Version}}"], ANSWER_TIMEOUT)
+        .err()
+        .map(|error| error.to_string())
 }
 
 /// The directory in which Docker keeps images and containers; `None` if it does not run on this machine. Cached after
@@ -165,7 +186,10 @@ pub fn data_folder() -> Option<PathBuf> {
 
 /// The program and its subcommand.
 fn name_of(command: &[OsString]) -> String {
-    let words = command.iter().take_while(|word| !word.as_encoded_bytes().starts_with(b"-")).take(3);
+    let words = command
+        .iter()
+        .take_while(|word| !word.as_encoded_bytes().starts_with(b"-"))
+        .take(3);
     words.map(|word| word.to_string_lossy()).collect::<Vec<_>>().join(" ")
 }
 
@@ -185,14 +209,26 @@ fn has_no_daemon(reason: &str) -> bool {
 fn result(command: String, ran: Result<Ran, RunError>, reason: String) -> Result<String, DockerError> {
     let not_started = |why: String| DockerError::Unavailable(format!("Docker can't be started: {why}"));
     match ran {
-        Ok(Ran { ending: ExitReason::Code(0), answer }) => Ok(String::from_utf8_lossy(&answer).into_owned()),
-        Ok(Ran { ending: ExitReason::NotStarted, .. }) => Err(not_started(format!("there is no {command}"))),
-        Ok(_) if has_no_daemon(&reason) => {
-            Err(DockerError::Unavailable(format!("Docker does not answer on this simulation server: {reason}")))
-        }
-        Ok(_) => Err(DockerError::Failed { command, message: reason }),
+        Ok(Ran {
+            ending: ExitReason::Code(0),
+            answer,
+        }) => Ok(String::from_utf8_lossy(&answer).into_owned()),
+        Ok(Ran {
+            ending: ExitReason::NotStarted,
+            ..
+        }) => Err(not_started(format!("there is no {command}"))),
+        Ok(_) if has_no_daemon(&reason) => Err(DockerError::Unavailable(format!(
+            "Docker does not answer on this simulation server: {reason}"
+        ))),
+        Ok(_) => Err(DockerError::Failed {
+            command,
+            message: reason,
+        }),
         Err(RunError::Slow(limit)) => Err(DockerError::Slow { command, limit }),
-        Err(error @ RunError::TooLong) => Err(DockerError::Failed { command, message: error.to_string() }),
+        Err(error @ RunError::TooLong) => Err(DockerError::Failed {
+            command,
+            message: error.to_string(),
+        }),
         Err(error) => Err(not_started(error.to_string())),
     }
 }
@@ -246,7 +282,10 @@ mod tests {
         let failure = |command: &str, printed: &str| {
             let mut reason = String::new();
             printed.lines().for_each(|line| note(&mut reason, line));
-            let ran = Ran { ending: ExitReason::Code(1), answer: Vec::new() };
+            let ran = Ran {
+                ending: ExitReason::Code(1),
+                answer: Vec::new(),
+            };
             result(command.to_owned(), Ok(ran), reason).unwrap_err()
         };
         let words = "Couldn't connect to Docker daemon at unix:///x - is it running?\n\nIf it's elsewhere, say so.\n";
@@ -257,15 +296,19 @@ mod tests {
             "Error response from daemon: port is already allocated\nError: failed to start containers: one, two\n";
         let error = failure("docker start one", words);
         assert!(
-            error.to_string().ends_with("failed: Error response from daemon: port is already allocated"),
+            error
+                .to_string()
+                .ends_with("failed: Error response from daemon: port is already allocated"),
             "{error}"
         );
     }
 
     #[test]
     fn a_failure_of_a_projects_image_is_the_projects_fault() {
-        let failed =
-            |message: &str| DockerError::Failed { command: "docker cp".to_owned(), message: message.to_owned() };
+        let failed = |message: &str| DockerError::Failed {
+            command: "docker cp".to_owned(),
+            message: message.to_owned(),
+        };
         let is_own = |error| matches!(blame(true, error), StartError::Server(_));
         assert!(!is_own(failed("mknod /x: operation not permitted")));
         assert!(!is_own(failed("no space left on device: no such file")));

@@ -41,7 +41,10 @@ impl Dockerfile {
     /// When it makes the daemon fetch something, which would use the machine's own network; when it has a volume; or when
     /// it is ambiguous. As text for the client, with the line.
     pub fn read(text: &str, owner: &str) -> Result<Self, String> {
-        let mut found = Self { text: String::new(), bases: Vec::new() };
+        let mut found = Self {
+            text: String::new(),
+            bases: Vec::new(),
+        };
         let (mut instruction, mut first) = (String::new(), 1);
         for (number, line) in (1..).zip(text.trim_start_matches('\u{feff}').lines()) {
             found.text.push_str(line);
@@ -63,11 +66,17 @@ impl Dockerfile {
             // Some versions of Docker continue such a line, others don't.
             let is_unclear = continued.map_or(words.ends_with('\\'), |before| before.ends_with('\\'));
             if is_unclear || line.contains('\r') {
-                return Err(wrong(number, line, "a line ends with one backslash or none, and a line break"));
+                return Err(wrong(
+                    number,
+                    line,
+                    "a line ends with one backslash or none, and a line break",
+                ));
             }
             instruction.push_str(continued.unwrap_or(line));
             if continued.is_none() {
-                found.take(&instruction, owner).map_err(|why| wrong(first, &instruction, why))?;
+                found
+                    .take(&instruction, owner)
+                    .map_err(|why| wrong(first, &instruction, why))?;
                 instruction.clear();
             }
         }
@@ -82,7 +91,9 @@ impl Dockerfile {
 
     /// Checks an instruction, and labels a stage that begins with it.
     fn take(&mut self, instruction: &str, owner: &str) -> Result<(), &'static str> {
-        let mut words = instruction.split_whitespace().skip_while(|word| word.eq_ignore_ascii_case("ONBUILD"));
+        let mut words = instruction
+            .split_whitespace()
+            .skip_while(|word| word.eq_ignore_ascii_case("ONBUILD"));
         let keyword = words.next().unwrap_or_default().to_uppercase();
         let mut words: Vec<&str> = words.skip_while(|word| word.starts_with("--")).collect();
         match keyword.as_str() {
@@ -141,10 +152,16 @@ mod tests {
     #[test]
     fn what_the_daemon_would_fetch_or_keep_is_refused_with_its_line() {
         let told = labelled("FROM a\n# VOLUME /x\n\nRUN b \\\n c\nADD \\\n http://a /x\n").unwrap_err();
-        assert!(told.contains("line 6, `ADD") && told.contains("`: ADD may copy files of the project only"), "{told}");
+        assert!(
+            told.contains("line 6, `ADD") && told.contains("`: ADD may copy files of the project only"),
+            "{told}"
+        );
         let hidden = "FROM debian\nRUN <<'#x'\ny \\\n#x\nADD http://169.254.169.254/latest/ /leak\n";
         let told = labelled(hidden).unwrap_err();
-        assert!(told.contains("line 2, `RUN <<'#x'`: RUN, ADD and COPY can't have `<<`"), "{told}");
+        assert!(
+            told.contains("line 2, `RUN <<'#x'`: RUN, ADD and COPY can't have `<<`"),
+            "{told}"
+        );
         for line in [
             "COPY <<a <<b /x",
             "ADD --chown=1 <<-a /x",

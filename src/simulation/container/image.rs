@@ -47,7 +47,13 @@ impl Images {
     /// The images of this owner.
     pub fn new(docker: Docker, owner: ResourceOwner, config: Arc<SimulationConfig>) -> Self {
         let builds = Semaphore::new(config.container.builds);
-        Self { docker, owner, config, builds, jobs: SingleFlight::default() }
+        Self {
+            docker,
+            owner,
+            config,
+            builds,
+            jobs: SingleFlight::default(),
+        }
     }
 
     /// Pulls a configured image unless it exists. Returns its id, which differs from those of later images of the same
@@ -80,7 +86,12 @@ impl Images {
         let webots = build_plan::image_of(&self.config.container.image, &project.world.version);
         build.arguments.push(format!("WEBOTS_DEFAULT_IMAGE={webots}"));
         let mut parts = [vec![build.dockerfile.text.clone()], build.arguments.clone()].concat();
-        parts.extend(build.folder.into_iter().flat_map(|folder| [project.identity(), folder.to_owned()]));
+        parts.extend(
+            build
+                .folder
+                .into_iter()
+                .flat_map(|folder| [project.identity(), folder.to_owned()]),
+        );
         // An image's name stays the same when the image is updated, so its id is part of the key. A base that is not
         // here yet has no id: the build fetches it.
         for base in &build.dockerfile.bases {
@@ -123,8 +134,16 @@ impl Images {
         sender: watch::Sender<String>,
     ) -> Result<(), StartError> {
         // A build without steps of a project takes seconds.
-        let _permit = if build.folder.is_some() { Some(self.permit(&sender).await?) } else { None };
-        let ImageBuild { dockerfile, folder, arguments } = build;
+        let _permit = if build.folder.is_some() {
+            Some(self.permit(&sender).await?)
+        } else {
+            None
+        };
+        let ImageBuild {
+            dockerfile,
+            folder,
+            arguments,
+        } = build;
         let (instance, root) = (project.instance.path().to_owned(), project.folder.clone());
         let prepare = move || {
             let file = instance.join(format!("Dockerfile{}", folder.unwrap_or_default()));
@@ -138,10 +157,24 @@ impl Images {
         let (file, context) = spawn_blocking(prepare).await??;
         let memory = format!("{}m", self.config.limits.memory.unwrap_or(DEFAULT_MEMORY));
         let network = self.config.container.network.name();
-        let limited = ["docker", "build", "--force-rm", "--memory", &memory, "--memory-swap", &memory];
+        let limited = [
+            "docker",
+            "build",
+            "--force-rm",
+            "--memory",
+            &memory,
+            "--memory-swap",
+            &memory,
+        ];
         let options = ["--network", network, "--tag", name, "--file"];
-        let words = limited.into_iter().chain(options).map(OsString::from).chain([file.into()]);
-        let arguments = arguments.into_iter().flat_map(|argument| ["--build-arg".into(), argument.into()]);
+        let words = limited
+            .into_iter()
+            .chain(options)
+            .map(OsString::from)
+            .chain([file.into()]);
+        let arguments = arguments
+            .into_iter()
+            .flat_map(|argument| ["--build-arg".into(), argument.into()]);
         let words = words.chain(arguments).chain([context.into()]);
         let mut step = String::new();
         let on_line = |line: &str| {
@@ -150,7 +183,10 @@ impl Images {
                 sender.send(text).ok();
             }
         };
-        let done = self.docker.follow(words.collect(), self.config.timing.build, on_line).await;
+        let done = self
+            .docker
+            .follow(words.collect(), self.config.timing.build, on_line)
+            .await;
         done.map_err(|error| not_built(&step, error))
     }
 
@@ -161,14 +197,26 @@ impl Images {
         }
         sender.send("waiting for images of others to be built".to_owned()).ok();
         let limit = self.config.timing.build;
-        let why = || format!("Images of others were being built for {} s (timing.build)", limit.as_secs());
-        let permit = actix_rt::time::timeout(limit, self.builds.acquire()).await.ok().and_then(Result::ok);
+        let why = || {
+            format!(
+                "Images of others were being built for {} s (timing.build)",
+                limit.as_secs()
+            )
+        };
+        let permit = actix_rt::time::timeout(limit, self.builds.acquire())
+            .await
+            .ok()
+            .and_then(Result::ok);
         permit.ok_or_else(|| StartError::Server(why()))
     }
 
     /// What Docker reports about an image in this format; `None` if it does not exist.
     async fn inspect(&self, image: &str, format: &str) -> Result<Option<String>, StartError> {
-        match self.docker.run(&["image", "inspect", "--format", format, image], SHORT_TIMEOUT).await {
+        match self
+            .docker
+            .run(&["image", "inspect", "--format", format, image], SHORT_TIMEOUT)
+            .await
+        {
             Ok(found) => Ok(Some(found.trim().to_owned())),
             Err(DockerError::Failed { .. }) => Ok(None),
             Err(error) => Err(error.into()),
@@ -183,9 +231,15 @@ impl Images {
             let room = || data_folder().and_then(|folder| DiskRoom::of(&folder).ok());
             let room = spawn_blocking(room).await.ok().flatten();
             let is_full = room.is_some_and(|room| room.shortage(reserve).is_some());
-            let hours = if is_full { MIN_AGE } else { 24 * self.config.container.images_age };
+            let hours = if is_full {
+                MIN_AGE
+            } else {
+                24 * self.config.container.images_age
+            };
             let (mine, old) = (format!("label={LABEL}={}", self.owner.0), format!("until={hours}h"));
-            let prune = ["image", "prune", "--all", "--force", "--filter", &mine, "--filter", &old];
+            let prune = [
+                "image", "prune", "--all", "--force", "--filter", &mine, "--filter", &old,
+            ];
             let pruned = self.docker.run(&prune, SHORT_TIMEOUT).await;
             actix_rt::time::sleep(if pruned.is_ok() { PRUNE_INTERVAL } else { RETRY_INTERVAL }).await;
         }
@@ -197,7 +251,11 @@ fn scaled(line: &str) -> Option<String> {
     let (numbers, instruction) = line.strip_prefix("Step ")?.split_once(" : ")?;
     let (step, of) = numbers.split_once('/')?;
     let (step, of): (u64, u64) = (step.parse().ok()?, of.parse().ok()?);
-    let step = if of > STEPS { (step.saturating_mul(STEPS) / of).max(1) } else { step };
+    let step = if of > STEPS {
+        (step.saturating_mul(STEPS) / of).max(1)
+    } else {
+        step
+    };
     Some(format!("Step {step}/{} : {instruction}", of.min(STEPS)))
 }
 
@@ -211,15 +269,18 @@ fn not_pulled(image: &str, error: DockerError) -> StartError {
 
 /// Why an image was not built in this step. Only a `FROM` step can fail because of a missing image.
 fn not_built(step: &str, error: DockerError) -> StartError {
-    let base = step.split_once(" : FROM ").and_then(|(_, image)| image.split(' ').next());
+    let base = step
+        .split_once(" : FROM ")
+        .and_then(|(_, image)| image.split(' ').next());
     match (base, error) {
         (Some(image), DockerError::Failed { message, .. }) if is_unknown(&message) => no_image(image),
         (_, DockerError::Failed { message, .. }) if !is_disk_full(&message) => {
             StartError::Project(format!("The image of this project can't be built: {message} ({step})"))
         }
-        (_, DockerError::Slow { limit, .. }) => {
-            StartError::Project(format!("Its image was not ready within {} seconds (timing.build)", limit.as_secs()))
-        }
+        (_, DockerError::Slow { limit, .. }) => StartError::Project(format!(
+            "Its image was not ready within {} seconds (timing.build)",
+            limit.as_secs()
+        )),
         (_, error) => error.into(),
     }
 }
@@ -233,8 +294,13 @@ fn no_image(image: &str) -> StartError {
 
 /// Whether a registry reports that there is no such image, or Docker that its name is invalid.
 fn is_unknown(message: &str) -> bool {
-    let words =
-        ["not found", "pull access denied", "manifest unknown", "repository does not exist", "invalid reference"];
+    let words = [
+        "not found",
+        "pull access denied",
+        "manifest unknown",
+        "repository does not exist",
+        "invalid reference",
+    ];
     words.iter().any(|words| message.contains(words))
 }
 
@@ -243,13 +309,18 @@ mod tests {
     use super::*;
 
     fn failed(message: &str) -> DockerError {
-        DockerError::Failed { command: "docker build".to_owned(), message: message.to_owned() }
+        DockerError::Failed {
+            command: "docker build".to_owned(),
+            message: message.to_owned(),
+        }
     }
 
     #[test]
     fn a_missing_image_is_reported_only_where_a_stage_begins() {
-        let told =
-            not_built("Step 1/4 : FROM cyberbotics/webots.cloud:R1-ubuntu22.04 AS a", failed("manifest unknown"));
+        let told = not_built(
+            "Step 1/4 : FROM cyberbotics/webots.cloud:R1-ubuntu22.04 AS a",
+            failed("manifest unknown"),
+        );
         let told = told.to_string();
         assert!(
             told.starts_with("There is no image cyberbotics/webots.cloud:R1-ubuntu22.04 for this version"),
@@ -268,8 +339,14 @@ mod tests {
     fn a_failing_registry_is_blamed_on_whoever_named_it() {
         let limited = || failed("toomanyrequests: You have reached your pull rate limit");
         assert!(matches!(not_pulled("a", limited()), StartError::Server(_)));
-        assert!(matches!(not_built("Step 1/4 : FROM a", limited()), StartError::Project(_)));
-        assert!(matches!(not_pulled("a", failed("invalid reference format")), StartError::Project(_)));
+        assert!(matches!(
+            not_built("Step 1/4 : FROM a", limited()),
+            StartError::Project(_)
+        ));
+        assert!(matches!(
+            not_pulled("a", failed("invalid reference format")),
+            StartError::Project(_)
+        ));
         let full = failed("failed to register layer: write /x: no space left on device");
         assert!(matches!(not_built("Step 1/4 : FROM a", full), StartError::Server(_)));
     }

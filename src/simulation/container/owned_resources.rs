@@ -92,7 +92,9 @@ impl Drop for ProjectGuard {
 /// The SHA-256 of a text, in hexadecimal digits.
 pub fn digest(text: &[u8]) -> String {
     let digest = Sha256::digest(text);
-    digest.iter().fold(String::new(), |text, byte| format!("{text}{byte:02x}"))
+    digest
+        .iter()
+        .fold(String::new(), |text, byte| format!("{text}{byte:02x}"))
 }
 
 /// Removes all containers of an owner. The next start removes what is left. Blocks.
@@ -102,7 +104,17 @@ pub fn sweep_all(owner: &ResourceOwner) {
 
 /// Removes the containers whose names begin like this. Blocks.
 fn sweep(prefix: &str) -> Result<(), DockerError> {
-    let list = blocking(&["ps", "--all", "--filter", "name=webots-fleet-", "--format", "{{.Names}}"], SHORT_TIMEOUT)?;
+    let list = blocking(
+        &[
+            "ps",
+            "--all",
+            "--filter",
+            "name=webots-fleet-",
+            "--format",
+            "{{.Names}}",
+        ],
+        SHORT_TIMEOUT,
+    )?;
     let names: Vec<&str> = list.lines().filter(|name| name.starts_with(prefix)).collect();
     if !names.is_empty() {
         blocking(&[&REMOVE, names.as_slice()].concat(), SHORT_TIMEOUT)?;
@@ -116,11 +128,19 @@ mod tests {
 
     #[test]
     fn the_names_of_projects_tell_whose_they_are_and_suit_compose() {
-        let (ours, theirs) =
-            (ResourceOwner::of(Path::new("/var/cache/a")), ResourceOwner::of(Path::new("/var/cache/b")));
+        let (ours, theirs) = (
+            ResourceOwner::of(Path::new("/var/cache/a")),
+            ResourceOwner::of(Path::new("/var/cache/b")),
+        );
         let name = ours.project(2001);
-        assert!(name.starts_with(&ours.prefix()) && !name.starts_with(&theirs.prefix()), "{name}");
-        assert!(name.chars().all(|letter| letter.is_ascii_lowercase() || letter.is_ascii_digit() || letter == '-'));
+        assert!(
+            name.starts_with(&ours.prefix()) && !name.starts_with(&theirs.prefix()),
+            "{name}"
+        );
+        assert!(
+            name.chars()
+                .all(|letter| letter.is_ascii_lowercase() || letter.is_ascii_digit() || letter == '-')
+        );
         assert_ne!(name, ours.project(2001));
         assert_eq!((ours.port_of(&name), theirs.port_of(&name)), (Some(2001), None));
     }

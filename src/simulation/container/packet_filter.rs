@@ -11,7 +11,12 @@ const TABLE: &str = "webots_fleet";
 /// The table that keeps others from the streams that this server relays.
 const STREAMS: &str = "webots_streams";
 /// Checks the unit that loads it.
-const UNIT: &[&str] = &["systemctl", "is-active", "--quiet", "webots-fleet-packet-filter.service"];
+const UNIT: &[&str] = &[
+    "systemctl",
+    "is-active",
+    "--quiet",
+    "webots-fleet-packet-filter.service",
+];
 /// Timeout of the `nft` or `systemctl` call.
 const TIMEOUT: Duration = Duration::from_secs(5);
 
@@ -43,7 +48,10 @@ fn list(table: &str) -> Result<(), String> {
 /// Whether a program exits with code 0, or why not.
 fn succeeds(command: &[&str]) -> Result<(), String> {
     let why = match Run::new(command, Path::new("/"), TIMEOUT).blocking(drop) {
-        Ok(Ran { ending: ExitReason::Code(0), .. }) => return Ok(()),
+        Ok(Ran {
+            ending: ExitReason::Code(0),
+            ..
+        }) => return Ok(()),
         Ok(_) => "says no".to_owned(),
         Err(error) => error.to_string(),
     };

@@ -59,7 +59,8 @@ impl SimulationContainers {
     /// The process that starts Webots' container, prints its output, and exits with its exit code.
     pub fn spawn_spec(&self, grace: Duration) -> SpawnSpec {
         let webots = self.container(WEBOTS);
-        self.docker.spec(["docker", "start", "--attach", &webots].map(Into::into).to_vec(), grace)
+        self.docker
+            .spec(["docker", "start", "--attach", &webots].map(Into::into).to_vec(), grace)
     }
 
     /// Starts the other services. That must happen before Webots is started, so that no symlink of a world's program
@@ -68,10 +69,17 @@ impl SimulationContainers {
     /// # Errors
     /// When Docker fails, with the project or this server as the cause.
     pub async fn start_others(&mut self) -> Result<(), StartError> {
-        let others = self.services.iter().filter(|service| **service != WEBOTS).map(|service| self.container(service));
+        let others = self
+            .services
+            .iter()
+            .filter(|service| **service != WEBOTS)
+            .map(|service| self.container(service));
         let words: Vec<String> = std::iter::once("start".to_owned()).chain(others).collect();
         if words.len() > 1 {
-            self.docker.run(&words, SHORT_TIMEOUT).await.map_err(|error| blame(self.is_projects, error))?;
+            self.docker
+                .run(&words, SHORT_TIMEOUT)
+                .await
+                .map_err(|error| blame(self.is_projects, error))?;
         }
         if self.services.contains(&CONTROLLER) {
             let (docker, controller, request) =
@@ -80,7 +88,10 @@ impl SimulationContainers {
             let restarts = async move {
                 loop {
                     requested.notified().await;
-                    if let Err(error) = docker.run(&["restart", "--time", "0", &controller], SHORT_TIMEOUT).await {
+                    if let Err(error) = docker
+                        .run(&["restart", "--time", "0", &controller], SHORT_TIMEOUT)
+                        .await
+                    {
                         log::warn!("a participant's controller is not started anew: {error}");
                     }
                     actix_rt::time::sleep(RESTART_INTERVAL).await;
@@ -101,7 +112,11 @@ impl SimulationContainers {
         let ExitReason::Code(code) = ended else { return None };
         let webots = self.container(WEBOTS);
         let format = "{{.State.OOMKilled}} {{.State.Status}} {{.State.ExitCode}}";
-        let state = match self.docker.run(&["inspect", "--format", format, &webots], SHORT_TIMEOUT).await {
+        let state = match self
+            .docker
+            .run(&["inspect", "--format", format, &webots], SHORT_TIMEOUT)
+            .await
+        {
             Ok(state) => state,
             Err(DockerError::Failed { .. }) => return None,
             Err(_) => return Some(Cause::Docker),

@@ -14,7 +14,9 @@ pub fn measure(owner: &ResourceOwner, roots: &BTreeMap<u16, i32>) -> Usages {
     let printed = blocking(&["stats", "--no-stream", "--format", format], SHORT_TIMEOUT);
     let mut all = Usages::new();
     for (name, cpu, memory) in printed.unwrap_or_default().lines().filter_map(columns) {
-        let Some(root) = owner.port_of(name).and_then(|port| roots.get(&port)) else { continue };
+        let Some(root) = owner.port_of(name).and_then(|port| roots.get(&port)) else {
+            continue;
+        };
         let sum = all.entry(*root).or_default();
         sum.cpu = Some(sum.cpu.unwrap_or_default() + cpu);
         sum.memory += memory;
@@ -26,15 +28,25 @@ pub fn measure(owner: &ResourceOwner, roots: &BTreeMap<u16, i32>) -> Usages {
 fn columns(line: &str) -> Option<(&str, f64, u64)> {
     let (name, rest) = line.split_once('\t')?;
     let (cpu, memory) = rest.split_once('\t')?;
-    Some((name, cpu.trim_end_matches('%').parse().ok()?, bytes(memory.split_once(" / ")?.0)?))
+    Some((
+        name,
+        cpu.trim_end_matches('%').parse().ok()?,
+        bytes(memory.split_once(" / ")?.0)?,
+    ))
 }
 
 /// An amount such as `12.3MiB`.
 fn bytes(amount: &str) -> Option<u64> {
     let (number, unit) = amount.split_at(amount.find(|letter: char| letter.is_ascii_alphabetic())?);
-    let shift = ["B", "KiB", "MiB", "GiB", "TiB"].iter().position(|known| *known == unit)?;
+    let shift = ["B", "KiB", "MiB", "GiB", "TiB"]
+        .iter()
+        .position(|known| *known == unit)?;
     let bytes = number.parse::<f64>().ok()? * f64::from(1_u32 << 10).powi(i32::try_from(shift).ok()?);
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "what a machine has fits")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "what a machine has fits"
+    )]
     Some(bytes as u64)
 }
 

@@ -59,7 +59,10 @@ impl WebotsYml {
         match NAMES.iter().find_map(|name| text_of(&project.join(name)).transpose()) {
             None => Self::default(),
             Some(Ok(text)) => Self::parse(&text),
-            Some(Err(warning)) => Self { warnings: vec![warning], ..Self::default() },
+            Some(Err(warning)) => Self {
+                warnings: vec![warning],
+                ..Self::default()
+            },
         }
     }
 
@@ -67,14 +70,25 @@ impl WebotsYml {
     pub fn parse(text: &str) -> Self {
         let text = text.trim_start_matches('\u{feff}');
         let mut found = Self::default();
-        if let Some(value) = text.lines().filter_map(|line| line.strip_prefix("dockerCompose:")).next_back() {
+        if let Some(value) = text
+            .lines()
+            .filter_map(|line| line.strip_prefix("dockerCompose:"))
+            .next_back()
+        {
             match request(value) {
                 Some((kind, folder)) => (found.kind, found.folder) = (kind, folder),
                 None => found.warnings.push(warning(value)),
             }
         }
-        let line = text.lines().map(str::trim).find(|line| line.starts_with("type:")).unwrap_or_default();
-        let line: String = line.chars().filter(|letter| *letter != ' ' && !letter.is_control()).collect();
+        let line = text
+            .lines()
+            .map(str::trim)
+            .find(|line| line.starts_with("type:"))
+            .unwrap_or_default();
+        let line: String = line
+            .chars()
+            .filter(|letter| *letter != ' ' && !letter.is_control())
+            .collect();
         found.project_type = (1..=MAX_LENGTH).contains(&line.len()).then(|| line + "\n");
         found
     }
@@ -97,9 +111,13 @@ pub fn text_of(path: &Path) -> Result<Option<String>, String> {
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
         Ok(about) if about.is_file() && about.len() <= MAX_SIZE => {
             let text = std::fs::read_to_string(path);
-            text.map(Some).map_err(|error| format!("{name} of the project can't be read: {error}"))
+            text.map(Some)
+                .map_err(|error| format!("{name} of the project can't be read: {error}"))
         }
-        _ => Err(format!("{name} of the project is no plain file of at most {} KiB", MAX_SIZE / 1024)),
+        _ => Err(format!(
+            "{name} of the project is no plain file of at most {} KiB",
+            MAX_SIZE / 1024
+        )),
     }
 }
 
@@ -118,7 +136,10 @@ fn request(value: &str) -> Option<(ProjectKind, String)> {
         _ => return None,
     };
     let folder = folder.trim();
-    let from_root = folder.trim_start_matches("../").trim_start_matches('/').strip_prefix(ABOVE_PROJECT);
+    let from_root = folder
+        .trim_start_matches("../")
+        .trim_start_matches('/')
+        .strip_prefix(ABOVE_PROJECT);
     let folder = from_root.unwrap_or(folder);
     let is_plain = |letter: char| letter.is_alphanumeric() || " _-+./".contains(letter);
     let is_allowed = folder.len() <= MAX_LENGTH
@@ -163,16 +184,34 @@ mod tests {
                 "publish: true\ntype: demo\ndockerCompose:theia:webots-project/controllers/",
                 editor("webots-project/controllers/"),
             ),
-            ("publish: true\ndockerCompose:theia:webots-project/a b\n", editor("webots-project/a b")),
-            ("dockerCompose:theia:webots-project/\r\npublish: true\r\n", editor("webots-project/")),
-            ("dockerCompose: theia:webots-project/x # ours\n", editor("webots-project/x")),
-            ("dockerCompose: \"theia:webots-project/x\"\n", editor("webots-project/x")),
-            ("dockerCompose: 'theia-python:webots-project/x'\n", editor("webots-project/x")),
+            (
+                "publish: true\ndockerCompose:theia:webots-project/a b\n",
+                editor("webots-project/a b"),
+            ),
+            (
+                "dockerCompose:theia:webots-project/\r\npublish: true\r\n",
+                editor("webots-project/"),
+            ),
+            (
+                "dockerCompose: theia:webots-project/x # ours\n",
+                editor("webots-project/x"),
+            ),
+            (
+                "dockerCompose: \"theia:webots-project/x\"\n",
+                editor("webots-project/x"),
+            ),
+            (
+                "dockerCompose: 'theia-python:webots-project/x'\n",
+                editor("webots-project/x"),
+            ),
             (
                 "dockerCompose: theia:webots-project/x\ndockerCompose: theia:webots-project/y\n",
                 editor("webots-project/y"),
             ),
-            ("\u{feff}dockerCompose:theia:webots-project/x", editor("webots-project/x")),
+            (
+                "\u{feff}dockerCompose:theia:webots-project/x",
+                editor("webots-project/x"),
+            ),
             ("#dockerCompose:theia:webots-project/x\n", NOTHING),
             ("docker:\n  dockerCompose:theia:webots-project/x\n", NOTHING),
             (
@@ -184,7 +223,10 @@ mod tests {
                 "type: competition\ndockerCompose: competition:../../../usr/local/webots-project/controllers/participant/\n",
                 competition("webots-project/controllers/participant/"),
             ),
-            ("dockerCompose:theia:/usr/local/webots-project/x", editor("webots-project/x")),
+            (
+                "dockerCompose:theia:/usr/local/webots-project/x",
+                editor("webots-project/x"),
+            ),
         ] {
             let found = WebotsYml::parse(text);
             assert_eq!((found.kind, found.folder.as_str()), expected, "{text:?}");
@@ -237,10 +279,15 @@ mod tests {
 
     #[test]
     fn a_folder_lies_in_the_project() {
-        for (folder, inside) in
-            [("webots-project/controllers//edit/", "controllers/edit"), ("webots-project/", ""), ("webots-project", "")]
-        {
-            let found = WebotsYml { folder: folder.to_owned(), ..WebotsYml::default() };
+        for (folder, inside) in [
+            ("webots-project/controllers//edit/", "controllers/edit"),
+            ("webots-project/", ""),
+            ("webots-project", ""),
+        ] {
+            let found = WebotsYml {
+                folder: folder.to_owned(),
+                ..WebotsYml::default()
+            };
             assert_eq!(found.folder_in_project(), PathBuf::from(inside), "{folder}");
         }
     }
@@ -260,9 +307,17 @@ mod tests {
         let file = project.join("webots.yml");
         let warned = || {
             let found = told();
-            assert!(found.warnings[0].contains("webots.yml of the project"), "{:?}", found.warnings);
+            assert!(
+                found.warnings[0].contains("webots.yml of the project"),
+                "{:?}",
+                found.warnings
+            );
             assert_eq!(found.project_type, None);
-            if file.is_dir() { std::fs::remove_dir(&file).unwrap() } else { std::fs::remove_file(&file).unwrap() }
+            if file.is_dir() {
+                std::fs::remove_dir(&file).unwrap()
+            } else {
+                std::fs::remove_file(&file).unwrap()
+            }
         };
         nix::unistd::mkfifo(&file, nix::sys::stat::Mode::S_IRWXU).unwrap();
         warned();

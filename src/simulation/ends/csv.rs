@@ -34,7 +34,10 @@ fn line(level: &str, ended: &Ended) -> String {
         simulation.port.map(|port| port.to_string()).unwrap_or_default(),
         level.to_owned(),
         taken.memory.map(|bytes| bytes.to_string()).unwrap_or_default(),
-        taken.time.map(|time| format!("{:.1}", time.as_secs_f64())).unwrap_or_default(),
+        taken
+            .time
+            .map(|time| format!("{:.1}", time.as_secs_f64()))
+            .unwrap_or_default(),
         ended.how.reason.label().to_owned(),
         simulation.identity.user.clone().unwrap_or_default(),
         simulation.identity.label.clone().unwrap_or_default(),
@@ -45,8 +48,16 @@ fn line(level: &str, ended: &Ended) -> String {
 /// A quoted field. An apostrophe is prepended if a spreadsheet would read the text as a formula.
 fn field(text: &str) -> String {
     let formula = text.starts_with(['=', '+', '-', '@', '\t', '\r', '\n']);
-    let text = if formula { format!("'{}", one_line(text)) } else { one_line(text) };
-    if text.contains([',', '"']) { format!("\"{}\"", text.replace('"', "\"\"")) } else { text }
+    let text = if formula {
+        format!("'{}", one_line(text))
+    } else {
+        one_line(text)
+    };
+    if text.contains([',', '"']) {
+        format!("\"{}\"", text.replace('"', "\"\""))
+    } else {
+        text
+    }
 }
 
 #[cfg(test)]

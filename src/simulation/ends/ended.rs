@@ -53,13 +53,19 @@ impl EndReason {
 
     /// Its name.
     pub fn label(self) -> &'static str {
-        Self::ALL.iter().find(|(reason, _)| *reason == self).map_or("", |(_, label)| label)
+        Self::ALL
+            .iter()
+            .find(|(reason, _)| *reason == self)
+            .map_or("", |(_, label)| label)
     }
 
     /// Whether an administrator may have to find its cause, so that its events are kept even without output. A failed
     /// checkout does not count.
     pub fn is_abnormal(self) -> bool {
-        matches!(self, Self::NoWebots | Self::Crashed | Self::Hung | Self::Limit | Self::Fault)
+        matches!(
+            self,
+            Self::NoWebots | Self::Crashed | Self::Hung | Self::Limit | Self::Fault
+        )
     }
 }
 

@@ -49,8 +49,14 @@ impl Ends {
             counter.with_label_values(&[label]);
         }
         let (writer, jobs) = channel();
-        std::thread::Builder::new().name("ends".to_owned()).spawn(move || write_all(&logs, &level, &jobs))?;
-        Ok(Self { counter, latest: Arc::default(), writer })
+        std::thread::Builder::new()
+            .name("ends".to_owned())
+            .spawn(move || write_all(&logs, &level, &jobs))?;
+        Ok(Self {
+            counter,
+            latest: Arc::default(),
+            writer,
+        })
     }
 
     /// Records an end.

@@ -69,7 +69,9 @@ pub(super) fn prune(logs: &Path) {
 fn files(folder: &Path) -> Vec<(SystemTime, PathBuf)> {
     let entries = fs::read_dir(folder).into_iter().flatten().flatten();
     let about = entries.filter_map(|entry| Some((entry.metadata().ok()?, entry.path())));
-    about.filter_map(|(about, path)| Some((about.is_file().then(|| about.modified().ok())??, path))).collect()
+    about
+        .filter_map(|(about, path)| Some((about.is_file().then(|| about.modified().ok())??, path)))
+        .collect()
 }
 
 /// The last whole lines of a file, of at most this many bytes.
@@ -84,7 +86,11 @@ pub fn last_lines(file: &Path, most: u64) -> io::Result<String> {
     file.take(most).read_to_end(&mut bytes)?;
     let text = String::from_utf8_lossy(&bytes);
     // A text that was cut begins in the middle of a line.
-    let whole = if skipped > 0 { text.split_once('\n').map_or("", |(_, rest)| rest) } else { &text };
+    let whole = if skipped > 0 {
+        text.split_once('\n').map_or("", |(_, rest)| rest)
+    } else {
+        &text
+    };
     Ok(whole.to_owned())
 }
 
@@ -101,7 +107,11 @@ mod tests {
         let world = ProjectUrl::parse("https://github.com/lab/arm/blob/main/worlds/arm.wbt").unwrap();
         let mut simulation = Simulation::new(SimulationId::next(), &world, ClientIdentity::default());
         simulation.log = Some(logs.join(FOLDER_OF_RUNNING).join(format!("{}.log", simulation.id)));
-        let how = End { reason, why: String::new(), taken: Taken::default() };
+        let how = End {
+            reason,
+            why: String::new(),
+            taken: Taken::default(),
+        };
         Ended {
             simulation,
             client: Peer::Proxy(std::net::Ipv4Addr::LOCALHOST.into()),
@@ -137,7 +147,12 @@ mod tests {
         assert_eq!(files(&kept).len(), 100);
         let long_ago = SystemTime::now().checked_sub(AGE + Duration::from_mins(1)).unwrap();
         for (_, file) in files(&kept).into_iter().take(70) {
-            File::options().write(true).open(file).unwrap().set_modified(long_ago).unwrap();
+            File::options()
+                .write(true)
+                .open(file)
+                .unwrap()
+                .set_modified(long_ago)
+                .unwrap();
         }
         prune(folder.path());
         assert_eq!(files(&kept).len(), 30);

@@ -39,7 +39,10 @@ impl Cgroups {
     pub fn delegated() -> Option<Self> {
         let folder = own_folder()?;
         let divided = Self::divide(&folder).inspect_err(|error| {
-            log::info!("simulations get no control groups: {} can't be divided: {error}", folder.display());
+            log::info!(
+                "simulations get no control groups: {} can't be divided: {error}",
+                folder.display()
+            );
         });
         divided.ok()?;
         log::info!("each simulation gets a control group below {}", folder.display());
@@ -59,7 +62,9 @@ impl Cgroups {
 
     /// The kernel's names of the controllers that simulations' groups would have if the server started now.
     pub fn controllers() -> Vec<&'static str> {
-        own_folder().and_then(|folder| offered(&folder).ok()).unwrap_or_default()
+        own_folder()
+            .and_then(|folder| offered(&folder).ok())
+            .unwrap_or_default()
     }
 
     /// Creates a group with these limits for a simulation; `None` if that fails: the simulation then runs without one.
@@ -68,10 +73,16 @@ impl Cgroups {
         let made = made.inspect_err(|error| log::warn!("no control group can be made: {error}"));
         let cgroup = Cgroup(made.ok()?.keep());
         // A simulation that runs out of memory is killed as a whole.
-        let mut settings =
-            vec![("pids.max", (limits.processes + RUNNERS).to_string()), ("memory.oom.group", "1".to_owned())];
+        let mut settings = vec![
+            ("pids.max", (limits.processes + RUNNERS).to_string()),
+            ("memory.oom.group", "1".to_owned()),
+        ];
         settings.extend(limits.memory.map(|memory| ("memory.max", (memory << 20).to_string())));
-        settings.extend(limits.cores.map(|cores| ("cpu.max", format!("{} {PERIOD}", cores * PERIOD))));
+        settings.extend(
+            limits
+                .cores
+                .map(|cores| ("cpu.max", format!("{} {PERIOD}", cores * PERIOD))),
+        );
         for (file, value) in settings {
             let file = cgroup.0.join(file);
             // Without the controller, there is no such file.
@@ -89,7 +100,10 @@ impl Cgroup {
     /// The prefix of a command that runs it in this group.
     pub fn joining(&self) -> Vec<OsString> {
         let words = ["/bin/sh", "-c", "echo 0 >\"$0\" && exec \"$@\""].map(OsString::from);
-        words.into_iter().chain(std::iter::once(self.0.join("cgroup.procs").into())).collect()
+        words
+            .into_iter()
+            .chain(std::iter::once(self.0.join("cgroup.procs").into()))
+            .collect()
     }
 
     /// Kills all processes inside. Returns whether the kernel had killed one because of the memory limit, and the
@@ -99,7 +113,10 @@ impl Cgroup {
         let events = std::fs::read_to_string(self.0.join("memory.events")).unwrap_or_default();
         let kills = events.lines().find_map(|line| line.strip_prefix("oom_kill "));
         // `memory.peak` exists since Linux 5.19.
-        let taken = Taken { memory: number_in(&self.0.join("memory.peak")), time: cgroup_time(&self.0) };
+        let taken = Taken {
+            memory: number_in(&self.0.join("memory.peak")),
+            time: cgroup_time(&self.0),
+        };
         (kills.is_some_and(|count| count.trim() != "0"), taken)
     }
 }
@@ -151,9 +168,14 @@ fn offered(folder: &Path) -> io::Result<Vec<&'static str>> {
 fn own_folder() -> Option<PathBuf> {
     let me = Process::myself().ok()?;
     let mounts = me.mountinfo().ok()?;
-    let mount = mounts.into_iter().find(|mount| mount.fs_type == "cgroup2" && mount.root == "/")?;
+    let mount = mounts
+        .into_iter()
+        .find(|mount| mount.fs_type == "cgroup2" && mount.root == "/")?;
     let group = me.cgroups().ok()?.into_iter().find(|group| group.hierarchy == 0)?;
-    let below = Path::new(&group.pathname).strip_prefix("/").ok().filter(|path| !path.as_os_str().is_empty())?;
+    let below = Path::new(&group.pathname)
+        .strip_prefix("/")
+        .ok()
+        .filter(|path| !path.as_os_str().is_empty())?;
     let folder = mount.mount_point.join(below);
     let inside = std::fs::read_to_string(folder.join("cgroup.procs")).ok()?;
     let is_alone = inside.lines().eq(std::iter::once(me.pid().to_string().as_str()));

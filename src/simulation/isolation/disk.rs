@@ -61,7 +61,13 @@ impl Disk {
     /// The disk with this directory, of which `reserve` MiB must stay free.
     pub fn new(folder: PathBuf, reserve: u64) -> Self {
         let room = DiskRoom::of(&folder).unwrap_or_default();
-        Self { folder, reserve, room, lost: 0, relieved: None }
+        Self {
+            folder,
+            reserve,
+            room,
+            lost: 0,
+            relieved: None,
+        }
     }
 
     /// Reads the free room; it stays as it was if the file system does not answer. Returns how much a simulation must
@@ -108,7 +114,17 @@ impl DiskUse {
     pub fn new(root: i32, folder: PathBuf, first: u64, limit: u64) -> Self {
         let allowed = first.saturating_add(limit << 20);
         let counted = Instant::now();
-        Self { root, folder, first, allowed, taken: first, hides: false, lost: 0, counted, end: None }
+        Self {
+            root,
+            folder,
+            first,
+            allowed,
+            taken: first,
+            hides: false,
+            lost: 0,
+            counted,
+            end: None,
+        }
     }
 
     /// Whether it may have exceeded its limit since the last count: the disk has lost as much room since then as it may
@@ -146,7 +162,10 @@ impl DiskUse {
             }
             match nameless_files(process) {
                 Some(files) => {
-                    files.iter().filter(|file| Some(file.dev()) == device).for_each(|file| size.add_nameless(file));
+                    files
+                        .iter()
+                        .filter(|file| Some(file.dev()) == device)
+                        .for_each(|file| size.add_nameless(file));
                 }
                 // The outermost program of a sandbox hides its files, and writes nothing.
                 None => self.hides |= process != self.root,
@@ -157,7 +176,11 @@ impl DiskUse {
     /// Its growth in bytes, if its end would free room; the maximum if it hides its open files: it is ended first.
     pub fn growth(&self) -> Option<u64> {
         let grown = self.taken.saturating_sub(self.first);
-        if self.hides { Some(u64::MAX) } else { Some(grown).filter(|grown| *grown >= LEAST_GROWTH) }
+        if self.hides {
+            Some(u64::MAX)
+        } else {
+            Some(grown).filter(|grown| *grown >= LEAST_GROWTH)
+        }
     }
 
     /// Ends it for the reserve, because it has grown most: by `growth` bytes.
@@ -166,7 +189,9 @@ impl DiskUse {
             u64::MAX => "hides which files it has open".to_owned(),
             bytes => format!("has written most there, {} MiB", bytes >> 20),
         };
-        self.end(format!("The disk of this simulation server is almost full (diskReserve), and the simulation {what}"));
+        self.end(format!(
+            "The disk of this simulation server is almost full (diskReserve), and the simulation {what}"
+        ));
     }
 
     fn end(&mut self, why: String) {

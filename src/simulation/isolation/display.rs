@@ -56,7 +56,9 @@ impl Display {
     /// # Errors
     /// When there is no Xvfb, or the file can't be written.
     pub fn new_virtual(instance: &Path) -> io::Result<Self> {
-        let xvfb = which("Xvfb").map_err(|error| io::Error::other(format!("no Xvfb: {error}")))?.canonicalize()?;
+        let xvfb = which("Xvfb")
+            .map_err(|error| io::Error::other(format!("no Xvfb: {error}")))?
+            .canonicalize()?;
         let authority = instance.join("Xauthority");
         let cookie: [u8; 16] = rand::random();
         let mut entry = EVERY_HOST.to_be_bytes().to_vec();
@@ -65,7 +67,13 @@ impl Display {
             entry.extend(u16::try_from(field.len()).unwrap_or_default().to_be_bytes());
             entry.extend(field);
         }
-        File::options().create(true).truncate(true).write(true).mode(0o600).open(&authority)?.write_all(&entry)?;
+        File::options()
+            .create(true)
+            .truncate(true)
+            .write(true)
+            .mode(0o600)
+            .open(&authority)?
+            .write_all(&entry)?;
         Ok(Self::Virtual { xvfb, authority })
     }
 
@@ -80,10 +88,15 @@ impl Display {
     /// The command that precedes a program to start its virtual display. In a sandbox Xvfb has no abstract socket, and
     /// a number that no display of the machine should have; outside, it finds a free number by its abstract socket.
     pub fn launcher(&self, in_sandbox: bool) -> Vec<OsString> {
-        let Self::Virtual { xvfb, authority } = self else { return Vec::new() };
+        let Self::Virtual { xvfb, authority } = self else {
+            return Vec::new();
+        };
         let words = ["/bin/sh", "-c", LAUNCHER].map(OsString::from);
         let options = if in_sandbox { ":99 -nolisten local" } else { "" };
-        words.into_iter().chain([xvfb.into(), authority.into(), options.into()]).collect()
+        words
+            .into_iter()
+            .chain([xvfb.into(), authority.into(), options.into()])
+            .collect()
     }
 
     /// Creates the directory of its socket in the sandbox's `/tmp`, because Xvfb of an ordinary user does not.

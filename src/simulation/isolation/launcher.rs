@@ -56,15 +56,19 @@ impl Launcher {
         // Before a sandbox is tried, because its processes may still be in this server's group afterwards.
         let controllers = Cgroups::controllers();
         let wants_sandbox = matches!(config.isolation, IsolationSetting::Sandbox | IsolationSetting::Auto);
-        let (level, mut sandbox, shortcoming) =
-            match (config.isolation, wants_sandbox.then(|| Sandbox::new(config)).transpose()) {
-                (IsolationSetting::Sandbox, Err(why)) => {
-                    return Err(format!("isolation is \"sandbox\", but {why}; \"none\" runs worlds without it"));
-                }
-                (_, Err(why)) => (IsolationSetting::None, None, Some(why)),
-                (_, Ok(Some(sandbox))) => (IsolationSetting::Sandbox, Some(sandbox), None),
-                (level, Ok(None)) => (level, None, None),
-            };
+        let (level, mut sandbox, shortcoming) = match (
+            config.isolation,
+            wants_sandbox.then(|| Sandbox::new(config)).transpose(),
+        ) {
+            (IsolationSetting::Sandbox, Err(why)) => {
+                return Err(format!(
+                    "isolation is \"sandbox\", but {why}; \"none\" runs worlds without it"
+                ));
+            }
+            (_, Err(why)) => (IsolationSetting::None, None, Some(why)),
+            (_, Ok(Some(sandbox))) => (IsolationSetting::Sandbox, Some(sandbox), None),
+            (level, Ok(None)) => (level, None, None),
+        };
         let wanted = config.sandbox.network;
         let why_shared = match &mut sandbox {
             Some(_) if wanted == SandboxNetwork::Shared => None,
@@ -95,14 +99,20 @@ impl Launcher {
     /// # Errors
     /// As for [`Self::new`].
     pub fn start(config: &SimulationConfig) -> Result<Self, String> {
-        let cgroups = (config.isolation != IsolationSetting::Container).then(Cgroups::delegated).flatten();
+        let cgroups = (config.isolation != IsolationSetting::Container)
+            .then(Cgroups::delegated)
+            .flatten();
         let mut launcher = Self::new(config)?;
         match &launcher.shortcoming {
             Some(why) => log::warn!("worlds' programs may do whatever this user may (isolation: none): {why}"),
             None => log::info!("isolation: {}", launcher.level),
         }
         if let Some(network) = launcher.network_in_words() {
-            let level = if launcher.why_shared.is_some() { log::Level::Warn } else { log::Level::Info };
+            let level = if launcher.why_shared.is_some() {
+                log::Level::Warn
+            } else {
+                log::Level::Info
+            };
             log::log!(level, "network of simulations: {network}");
         }
         for line in launcher.unenforced_limits() {
@@ -123,9 +133,10 @@ impl Launcher {
             );
         }
         let (controllers, limits) = (&self.controllers, &self.limits);
-        for (key, controller, is_set) in
-            [("limits.memory", "memory", limits.memory.is_some()), ("limits.cores", "cpu", limits.cores.is_some())]
-        {
+        for (key, controller, is_set) in [
+            ("limits.memory", "memory", limits.memory.is_some()),
+            ("limits.cores", "cpu", limits.cores.is_some()),
+        ] {
             // Docker enforces them for containers.
             if is_set && self.level != IsolationSetting::Container && !controllers.contains(&controller) {
                 lines.push(format!(
@@ -146,7 +157,11 @@ impl Launcher {
     pub fn network(&self) -> Option<SandboxNetwork> {
         match self.own_network() {
             None => (self.level != IsolationSetting::Container).then_some(SandboxNetwork::Shared),
-            Some(network) => Some(if network.closed { SandboxNetwork::Closed } else { SandboxNetwork::Own }),
+            Some(network) => Some(if network.closed {
+                SandboxNetwork::Closed
+            } else {
+                SandboxNetwork::Own
+            }),
         }
     }
 
@@ -213,14 +228,27 @@ impl Launcher {
         command.extend(self.limited());
         command.extend(display.launcher(self.sandbox.is_some()));
         command.append(&mut spec.command);
-        Ok((SpawnSpec { command, environment, inherits: false, ..spec }, cgroup))
+        Ok((
+            SpawnSpec {
+                command,
+                environment,
+                inherits: false,
+                ..spec
+            },
+            cgroup,
+        ))
     }
 
     /// The variables of the server's own environment that a simulation gets.
     fn inherited(&self) -> Vec<(OsString, OsString)> {
-        let needed = NEEDED.split_whitespace().filter_map(|name| VariableName::try_from(name.to_owned()).ok());
+        let needed = NEEDED
+            .split_whitespace()
+            .filter_map(|name| VariableName::try_from(name.to_owned()).ok());
         let names: Vec<VariableName> = needed.chain(self.variables.iter().cloned()).collect();
-        let is_named = |name: &OsString| name.to_str().is_some_and(|name| names.iter().any(|one| one.covers(name)));
+        let is_named = |name: &OsString| {
+            name.to_str()
+                .is_some_and(|name| names.iter().any(|one| one.covers(name)))
+        };
         std::env::vars_os().filter(|(name, _)| is_named(name)).collect()
     }
 
@@ -233,10 +261,15 @@ impl Launcher {
         // The kernel counts all processes of a user, but in a user namespace only those inside, one of which is
         // bubblewrap.
         if self.sandbox.is_some() && !nix::unistd::getuid().is_root() && counts_by_namespace() {
-            words.push(format!("--nproc={}", at_most(Resource::RLIMIT_NPROC, self.limits.processes + 1)));
+            words.push(format!(
+                "--nproc={}",
+                at_most(Resource::RLIMIT_NPROC, self.limits.processes + 1)
+            ));
         }
         words.push("--".to_owned());
-        std::iter::once(self.prlimit.clone().into()).chain(words.into_iter().map(OsString::from)).collect()
+        std::iter::once(self.prlimit.clone().into())
+            .chain(words.into_iter().map(OsString::from))
+            .collect()
     }
 }
 

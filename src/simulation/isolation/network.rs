@@ -64,14 +64,30 @@ impl OwnNetwork {
         };
         let pasta = which("pasta").map_err(|_| missing("pasta", "passt"))?;
         let closed = config.sandbox.network == SandboxNetwork::Closed;
-        let nft = which("nft").ok().or_else(|| Some(PathBuf::from(NFT)).filter(|nft| nft.is_file()));
+        let nft = which("nft")
+            .ok()
+            .or_else(|| Some(PathBuf::from(NFT)).filter(|nft| nft.is_file()));
         if closed && nft.is_none() {
             return Err(missing("nft", "nftables"));
         }
         // If the machine has no IPv4 route, pasta makes networks without IPv4, and forwards nothing from 127.0.0.1.
-        let loopback = if has_route(INTERNET) { Ipv4Addr::LOCALHOST.into() } else { Ipv6Addr::LOCALHOST.into() };
-        let forwarded = if config.ports_are_public() { config.bind } else { loopback };
-        Ok(Self { pasta, nft, closed, loopback, forwarded })
+        let loopback = if has_route(INTERNET) {
+            Ipv4Addr::LOCALHOST.into()
+        } else {
+            Ipv6Addr::LOCALHOST.into()
+        };
+        let forwarded = if config.ports_are_public() {
+            config.bind
+        } else {
+            loopback
+        };
+        Ok(Self {
+            pasta,
+            nft,
+            closed,
+            loopback,
+            forwarded,
+        })
     }
 
     /// Drops the packet filter, if the configuration allows that. Returns whether there was one.
@@ -81,7 +97,11 @@ impl OwnNetwork {
 
     /// The address at which this server reaches the forwarded port of each simulation.
     pub fn reached(&self) -> IpAddr {
-        if self.forwarded.is_unspecified() { self.loopback } else { self.forwarded }
+        if self.forwarded.is_unspecified() {
+            self.loopback
+        } else {
+            self.forwarded
+        }
     }
 
     /// The prefix of a command that runs it in a network of its own, into which this port is forwarded. Writes the
@@ -93,11 +113,28 @@ impl OwnNetwork {
         let mut command: Vec<OsString> = ["setpriv", "--pdeathsig", "KILL", "--"].map(Into::into).into();
         command.push(self.pasta.clone().into());
         // By default pasta maps its gateway to the machine's loopback, and forwards ports in both directions.
-        let fixed = ["--config-net", "--no-map-gw", "-u", "none", "-T", "none", "-U", "none", "-t"];
+        let fixed = [
+            "--config-net",
+            "--no-map-gw",
+            "-u",
+            "none",
+            "-T",
+            "none",
+            "-U",
+            "none",
+            "-t",
+        ];
         command.extend(fixed.map(Into::into));
         // A port without an address is forwarded from all addresses, IPv4 and IPv6.
         let is_any = self.forwarded == Ipv6Addr::UNSPECIFIED;
-        command.push(if is_any { port.to_string() } else { format!("{}/{port}", self.forwarded) }.into());
+        command.push(
+            if is_any {
+                port.to_string()
+            } else {
+                format!("{}/{port}", self.forwarded)
+            }
+            .into(),
+        );
         // pasta prints a warning about a version of IP without a route.
         if self.loopback.is_ipv4() && !has_route(INTERNET_6) {
             command.push("--ipv4-only".into());
@@ -115,7 +152,14 @@ impl OwnNetwork {
         let (mut loader, mut rules) = (Path::new("sh"), PathBuf::new());
         if let Some(nft) = &self.nft {
             (loader, rules) = (nft, instance.join("network.nft"));
-            std::fs::write(&rules, if self.closed { include_str!("closed.nft") } else { include_str!("own.nft") })?;
+            std::fs::write(
+                &rules,
+                if self.closed {
+                    include_str!("closed.nft")
+                } else {
+                    include_str!("own.nft")
+                },
+            )?;
         }
         command.extend([BEGIN.into(), loader.into(), rules.into()]);
         // pasta starts a new PID namespace, and bubblewrap needs a `/proc` that matches it.
@@ -132,6 +176,10 @@ impl OwnNetwork {
 
 /// Whether the machine has a route to this address.
 fn has_route(address: IpAddr) -> bool {
-    let any: IpAddr = if address.is_ipv4() { Ipv4Addr::UNSPECIFIED.into() } else { Ipv6Addr::UNSPECIFIED.into() };
+    let any: IpAddr = if address.is_ipv4() {
+        Ipv4Addr::UNSPECIFIED.into()
+    } else {
+        Ipv6Addr::UNSPECIFIED.into()
+    };
     UdpSocket::bind((any, 0)).is_ok_and(|socket| socket.connect((address, 9)).is_ok())
 }

@@ -36,11 +36,20 @@ pub struct Sandbox {
 }
 
 /// What programs need of `/run` to resolve names, except in closed networks: services there query the internet.
-const NAMES_RUN: [&str; 4] =
-    ["/run/systemd/resolve", "/run/resolvconf", "/run/NetworkManager/resolv.conf", "/run/nscd"];
+const NAMES_RUN: [&str; 4] = [
+    "/run/systemd/resolve",
+    "/run/resolvconf",
+    "/run/NetworkManager/resolv.conf",
+    "/run/nscd",
+];
 /// What programs need of `/run` to find users and graphics cards. The rest are sockets of services, some of which start
 /// programs on request.
-const SYSTEM_RUN: [&str; 4] = ["/run/udev", "/run/nvidia-persistenced", "/run/opengl-driver", "/run/current-system"];
+const SYSTEM_RUN: [&str; 4] = [
+    "/run/udev",
+    "/run/nvidia-persistenced",
+    "/run/opengl-driver",
+    "/run/current-system",
+];
 /// Graphics cards, besides all in `/dev` whose name begins with `nvidia`.
 const DEVICES: [&str; 2] = ["/dev/dri", "/dev/kfd"];
 /// Timeout of a trial run of a sandbox.
@@ -65,25 +74,44 @@ impl Sandbox {
             "bubblewrap (bwrap) is not there; on Debian, Ubuntu and Fedora the package bubblewrap has it".to_owned()
         })?;
         let mut mounts = vec![Mount::empty("/run")];
-        let names = NAMES_RUN.into_iter().filter(|_| config.sandbox.network != SandboxNetwork::Closed);
+        let names = NAMES_RUN
+            .into_iter()
+            .filter(|_| config.sandbox.network != SandboxNetwork::Closed);
         mounts.extend(names.chain(SYSTEM_RUN).map(Mount::read_only));
         let readable = config.webots_home.iter().chain(&config.sandbox.readable);
-        mounts.extend(readable.filter_map(|path| path.0.canonicalize().ok()).map(Mount::read_only));
-        let writable = config.sandbox.writable.iter().filter_map(|path| path.0.canonicalize().ok());
+        mounts.extend(
+            readable
+                .filter_map(|path| path.0.canonicalize().ok())
+                .map(Mount::read_only),
+        );
+        let writable = config
+            .sandbox
+            .writable
+            .iter()
+            .filter_map(|path| path.0.canonicalize().ok());
         mounts.extend(writable.map(|at| Mount::writable(at.clone(), &at)));
         // Last, so that nothing overrides these.
         let homes = homes();
         mounts.extend(hidden(config));
         mounts.retain(|mount| mount.at.exists());
         let shared_memory = config.limits.disk << 20;
-        let mut sandbox = Self { bubblewrap, homes, mounts, ends_namespaces: true, network: None, shared_memory };
+        let mut sandbox = Self {
+            bubblewrap,
+            homes,
+            mounts,
+            ends_namespaces: true,
+            network: None,
+            shared_memory,
+        };
         let mut tried = sandbox.trial();
         if tried.is_err() {
             sandbox.ends_namespaces = false;
             tried = sandbox.trial();
         }
         let told = |error: io::Error| one_line(error.to_string().trim());
-        tried.map(|()| sandbox).map_err(|error| format!("bubblewrap makes no sandbox here ({}): {REMEDY}", told(error)))
+        tried
+            .map(|()| sandbox)
+            .map_err(|error| format!("bubblewrap makes no sandbox here ({}): {REMEDY}", told(error)))
     }
 
     /// The prefix of the command that runs a program in a sandbox of its own. Creates the directories that it needs in
@@ -93,13 +121,26 @@ impl Sandbox {
     /// When a directory can't be created.
     pub fn command(&self, spec: &SpawnSpec, port: u16, display: &Display) -> io::Result<Vec<OsString>> {
         let instance = &spec.mark;
-        let mut command =
-            self.network.as_ref().map_or_else(|| Ok(Vec::new()), |network| network.command(instance, port))?;
+        let mut command = self
+            .network
+            .as_ref()
+            .map_or_else(|| Ok(Vec::new()), |network| network.command(instance, port))?;
         let filter = instance.join("system-calls");
         std::fs::write(&filter, system_calls::filter())?;
         command.extend(["/bin/sh", "-c", "exec \"$@\" 3<\"$0\""].map(Into::into));
-        command.extend([filter.into(), self.bubblewrap.clone().into(), "--seccomp".into(), "3".into()]);
-        let fixed = ["--die-with-parent", "--new-session", "--unshare-user", "--unshare-pid", "--unshare-ipc"];
+        command.extend([
+            filter.into(),
+            self.bubblewrap.clone().into(),
+            "--seccomp".into(),
+            "3".into(),
+        ]);
+        let fixed = [
+            "--die-with-parent",
+            "--new-session",
+            "--unshare-user",
+            "--unshare-pid",
+            "--unshare-ipc",
+        ];
         command.extend(fixed.map(Into::into));
         if self.ends_namespaces {
             command.push("--disable-userns".into());
@@ -109,8 +150,20 @@ impl Sandbox {
             let (user, group) = (nix::unistd::getuid().to_string(), nix::unistd::getgid().to_string());
             command.extend(["--uid".into(), user.into(), "--gid".into(), group.into()]);
         }
-        command
-            .extend(["--cap-drop", "ALL", "--ro-bind", "/", "/", "--dev", "/dev", "--proc", "/proc"].map(Into::into));
+        command.extend(
+            [
+                "--cap-drop",
+                "ALL",
+                "--ro-bind",
+                "/",
+                "/",
+                "--dev",
+                "/dev",
+                "--proc",
+                "/proc",
+            ]
+            .map(Into::into),
+        );
         // The kernel lets root write there without capabilities.
         command.extend(["--ro-bind-try", "/proc/sys", "/proc/sys"].map(Into::into));
         for device in devices() {
@@ -122,7 +175,10 @@ impl Sandbox {
             mounts.insert((mount.at.components().count(), mount.at.clone()), mount);
         }
         // Empty directories are tmpfs, which takes memory: they are made read-only, as is the rest of `/dev`.
-        let empty = mounts.values().filter(|mount| mount.source.is_none()).map(|mount| mount.at.clone());
+        let empty = mounts
+            .values()
+            .filter(|mount| mount.source.is_none())
+            .map(|mount| mount.at.clone());
         let closed: Vec<PathBuf> = empty.chain(["/dev".into()]).collect();
         command.extend(mounts.into_values().flat_map(Mount::into_arguments));
         // bubblewrap has `--size` since 0.7, and `--disable-userns` since 0.8.
@@ -150,7 +206,12 @@ impl Sandbox {
         let project = spec.mark.join(InstanceDir::PROJECT);
         own.push(Mount::writable(project.clone(), &project));
         // Symlinks would be resolved inside the sandbox, where their targets may not exist.
-        let files = spec.command.first().map(PathBuf::from).into_iter().chain(self.display_files(display));
+        let files = spec
+            .command
+            .first()
+            .map(PathBuf::from)
+            .into_iter()
+            .chain(self.display_files(display));
         own.extend(files.filter_map(|file| file.canonicalize().ok()).map(Mount::read_only));
         own.extend(self.network.as_ref().and_then(|network| network.mounts(&spec.mark)));
         own.retain(|mount| mount.at.exists() || mount.at == runtime_folder());
@@ -165,7 +226,10 @@ impl Sandbox {
         };
         let authority = std::env::var_os("XAUTHORITY").map(PathBuf::from);
         let usual = || self.homes.first().map(|home| home.join(".Xauthority"));
-        display::socket(name).into_iter().chain(authority.or_else(usual)).collect()
+        display::socket(name)
+            .into_iter()
+            .chain(authority.or_else(usual))
+            .collect()
     }
 
     /// Variables that differ in a sandbox. Shared memory with the display is not available.
@@ -191,7 +255,10 @@ impl Sandbox {
         }
         tried.map_err(|error| {
             self.network = None;
-            format!("pasta makes no network here ({}): {NETWORK_REMEDY}", one_line(error.to_string().trim()))
+            format!(
+                "pasta makes no network here ({}): {NETWORK_REMEDY}",
+                one_line(error.to_string().trim())
+            )
         })
     }
 
@@ -200,7 +267,10 @@ impl Sandbox {
         let instance = tempfile::tempdir()?;
         let project = instance.path().join(InstanceDir::PROJECT);
         std::fs::create_dir(&project)?;
-        let spec = SpawnSpec { folder: Some(project), ..SpawnSpec::new(Vec::new(), instance.path()) };
+        let spec = SpawnSpec {
+            folder: Some(project),
+            ..SpawnSpec::new(Vec::new(), instance.path())
+        };
         // A port that was free a moment ago.
         let port = TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?.local_addr()?.port();
         let mut command = self.command(&spec, port, &Display::Outside(String::new()))?;
@@ -221,7 +291,10 @@ fn runtime_folder() -> PathBuf {
 
 /// The home directories of the server's user: `HOME`, and the one in the user database.
 fn homes() -> Vec<PathBuf> {
-    let known = nix::unistd::User::from_uid(nix::unistd::getuid()).ok().flatten().map(|user| user.dir);
+    let known = nix::unistd::User::from_uid(nix::unistd::getuid())
+        .ok()
+        .flatten()
+        .map(|user| user.dir);
     let all = std::env::var_os("HOME").map(PathBuf::from).into_iter().chain(known);
     let real = all.filter_map(|home| home.canonicalize().ok());
     let mut homes: Vec<PathBuf> = real.filter(|home| home.parent().is_some()).collect();
@@ -241,5 +314,8 @@ fn temporary_folders() -> impl Iterator<Item = PathBuf> {
 fn devices() -> impl Iterator<Item = PathBuf> {
     let all = std::fs::read_dir("/dev").into_iter().flatten().flatten();
     let nvidia = all.filter(|entry| entry.file_name().as_encoded_bytes().starts_with(b"nvidia"));
-    DEVICES.iter().map(PathBuf::from).chain(nvidia.map(|entry| entry.path()))
+    DEVICES
+        .iter()
+        .map(PathBuf::from)
+        .chain(nvidia.map(|entry| entry.path()))
 }

@@ -6,7 +6,12 @@
 
 /// The architectures that a program may use (x86 and ARM, 64 and 32 bits): the kernel's number of each, and the number
 /// of `add_key`, which `request_key` and `keyctl` follow.
-const ARCHITECTURES: [(u32, u32); 4] = [(0xc000_003e, 248), (0x4000_0003, 286), (0xc000_00b7, 217), (0x4000_0028, 309)];
+const ARCHITECTURES: [(u32, u32); 4] = [
+    (0xc000_003e, 248),
+    (0x4000_0003, 286),
+    (0xc000_00b7, 217),
+    (0x4000_0028, 309),
+];
 /// Mask without the bit that distinguishes calls by the x32 ABI from those of 64-bit x86.
 const NUMBER: u32 = 0x3fff_ffff;
 /// Results of a filter: the call is made, or fails with `EPERM`.
@@ -30,7 +35,10 @@ pub fn filter() -> Vec<u8> {
             (give, 0, 0, ALLOW),
         ]
     };
-    let all = ARCHITECTURES.into_iter().flat_map(of_architecture).chain([(give, 0, 0, ALLOW)]);
+    let all = ARCHITECTURES
+        .into_iter()
+        .flat_map(of_architecture)
+        .chain([(give, 0, 0, ALLOW)]);
     all.flat_map(|(code, yes, no, value): (u16, u8, u8, u32)| {
         let [first, second] = code.to_ne_bytes();
         let [a, b, c, d] = value.to_ne_bytes();

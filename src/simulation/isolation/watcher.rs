@@ -42,8 +42,13 @@ impl Watcher {
     /// When the system can't start a thread.
     pub fn start(run: PathBuf, reserve: u64) -> io::Result<Self> {
         let (watches, receiver) = channel();
-        let mut table = Table { disk: Disk::new(run, reserve), all: Vec::new() };
-        std::thread::Builder::new().name("watcher".to_owned()).spawn(move || table.run(&receiver))?;
+        let mut table = Table {
+            disk: Disk::new(run, reserve),
+            all: Vec::new(),
+        };
+        std::thread::Builder::new()
+            .name("watcher".to_owned())
+            .spawn(move || table.run(&receiver))?;
         Ok(Self(watches))
     }
 
@@ -73,8 +78,11 @@ impl Table {
         loop {
             let next = tick.min(Instant::now() + self.disk.pause());
             let left = next.saturating_duration_since(Instant::now());
-            let come =
-                if self.all.is_empty() { watches.recv().map_err(Into::into) } else { watches.recv_timeout(left) };
+            let come = if self.all.is_empty() {
+                watches.recv().map_err(Into::into)
+            } else {
+                watches.recv_timeout(left)
+            };
             match come {
                 Ok(mut one) => {
                     one.lost = self.disk.lost;
@@ -84,7 +92,10 @@ impl Table {
                 Err(RecvTimeoutError::Disconnected) => return,
             }
             // Its directory is removed. What others write meanwhile must not hide behind the room that this frees.
-            for gone in self.all.extract_if(.., |one| one.end.as_ref().is_none_or(oneshot::Sender::is_closed)) {
+            for gone in self
+                .all
+                .extract_if(.., |one| one.end.as_ref().is_none_or(oneshot::Sender::is_closed))
+            {
                 self.disk.lost += gone.taken;
             }
             if let Some(least) = self.disk.look()
@@ -141,5 +152,7 @@ impl Table {
 
 /// CPU time of this thread. Time that a tick waits for a busy machine or its disk does not count.
 fn processor_time() -> Duration {
-    clock_gettime(ClockId::CLOCK_THREAD_CPUTIME_ID).map(Duration::from).unwrap_or_default()
+    clock_gettime(ClockId::CLOCK_THREAD_CPUTIME_ID)
+        .map(Duration::from)
+        .unwrap_or_default()
 }

@@ -16,7 +16,10 @@ const FIRST_PORT: u16 = 6000;
 fn parse(name: &str) -> Option<(&str, u16)> {
     let (host, numbers) = name.rsplit_once(':')?;
     let (number, _screen) = numbers.split_once('.').unwrap_or((numbers, "0"));
-    Some((host, number.parse().ok().filter(|number| *number <= u16::MAX - FIRST_PORT)?))
+    Some((
+        host,
+        number.parse().ok().filter(|number| *number <= u16::MAX - FIRST_PORT)?,
+    ))
 }
 
 /// The socket of a display of this machine; `None` if it is reached by TCP.
@@ -28,7 +31,10 @@ pub fn socket(display: &str) -> Option<PathBuf> {
 /// The display to use: the configured one, else that of the environment variable `DISPLAY`, else `:0`.
 pub fn effective(configured: Option<&String>) -> String {
     let of_environment = || std::env::var("DISPLAY").ok().filter(|display| !display.is_empty());
-    configured.cloned().or_else(of_environment).unwrap_or_else(|| ":0".to_owned())
+    configured
+        .cloned()
+        .or_else(of_environment)
+        .unwrap_or_else(|| ":0".to_owned())
 }
 
 /// Checks that a display answers, not whether it admits this user. Blocks for at most two seconds per address.

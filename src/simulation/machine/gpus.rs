@@ -33,7 +33,9 @@ pub(super) struct GpuReading {
 /// Starts the thread, and returns the receiver of its last reading. The thread ends when the receiver is dropped.
 pub(super) fn follow() -> std::io::Result<watch::Receiver<Option<GpuReading>>> {
     let (sender, last) = watch::channel(None);
-    std::thread::Builder::new().name("gpus".to_owned()).spawn(move || read(&sender))?;
+    std::thread::Builder::new()
+        .name("gpus".to_owned())
+        .spawn(move || read(&sender))?;
     Ok(last)
 }
 
@@ -49,7 +51,11 @@ fn read(sender: &watch::Sender<Option<GpuReading>>) {
                     let gpus: Vec<Gpu> = (0..count).filter_map(|index| read_one(&nvml, index).ok()).collect();
                     known = known.max(count as usize);
                     is_complete = gpus.len() == known;
-                    sender.send_replace(Some(GpuReading { at: Instant::now(), gpus, known }));
+                    sender.send_replace(Some(GpuReading {
+                        at: Instant::now(),
+                        gpus,
+                        known,
+                    }));
                     std::thread::sleep(PERIOD);
                 }
             }
@@ -81,8 +87,14 @@ fn read_one(nvml: &Nvml, index: u32) -> Result<Gpu, NvmlError> {
 
 /// The GPUs that answer, and the problem if others don't.
 pub(super) fn current(last: Option<&GpuReading>) -> (Vec<Gpu>, Option<String>) {
-    let Some(GpuReading { at, gpus, known }) = last else { return (Vec::new(), None) };
-    let gpus = if at.elapsed() <= SILENCE { gpus.clone() } else { Vec::new() };
+    let Some(GpuReading { at, gpus, known }) = last else {
+        return (Vec::new(), None);
+    };
+    let gpus = if at.elapsed() <= SILENCE {
+        gpus.clone()
+    } else {
+        Vec::new()
+    };
     let missing = known.saturating_sub(gpus.len());
     let problem = format!("{missing} of {known} GPUs don't answer (see Xid in the kernel's log)");
     (gpus, (missing > 0).then_some(problem))
@@ -96,8 +108,15 @@ mod tests {
     fn gpus_that_are_lost_or_silent_are_told() {
         let after = |seconds, gpus| {
             let at = Instant::now().checked_sub(Duration::from_secs(seconds)).unwrap();
-            let (gpus, problem) = current(Some(&GpuReading { at, gpus: vec![Gpu::default(); gpus], known: 2 }));
-            (gpus.len(), problem.map_or(String::new(), |why| why.chars().take(6).collect()))
+            let (gpus, problem) = current(Some(&GpuReading {
+                at,
+                gpus: vec![Gpu::default(); gpus],
+                known: 2,
+            }));
+            (
+                gpus.len(),
+                problem.map_or(String::new(), |why| why.chars().take(6).collect()),
+            )
         };
         assert_eq!(current(None), (vec![], None), "a machine without GPUs has lost none");
         assert_eq!(after(0, 2), (2, String::new()));

@@ -83,8 +83,21 @@ impl LoadMonitor {
         spread: Arc<Spread>,
     ) -> Result<(Self, watch::Receiver<Arc<Readings>>), AppError> {
         let (sensor, gpus) = (MachineSensor::open(disk)?, gpus::follow()?);
-        let (published, readings) = watch::channel(Arc::new(Readings { host: sensor.host(), ..Readings::default() }));
-        Ok((Self { slots, sensor, gpus, spread, csv, published }, readings))
+        let (published, readings) = watch::channel(Arc::new(Readings {
+            host: sensor.host(),
+            ..Readings::default()
+        }));
+        Ok((
+            Self {
+                slots,
+                sensor,
+                gpus,
+                spread,
+                csv,
+                published,
+            },
+            readings,
+        ))
     }
 
     fn publish(&self, machine: Machine) {
@@ -103,7 +116,11 @@ impl LoadMonitor {
                 _ => {}
             }
             push(&mut readings.loads, MEAN_OF, sensors::load(&machine, &gpu));
-            push(&mut readings.history, KEPT, sample.iter().filter_map(|text| text.parse().ok()).collect());
+            push(
+                &mut readings.history,
+                KEPT,
+                sample.iter().filter_map(|text| text.parse().ok()).collect(),
+            );
             readings.load = Load::mean(readings.loads.iter().copied());
             (readings.machine, readings.gpus, readings.gpu_problem) = (machine, gpus, gpu_problem);
             readings.sample = sample;
@@ -170,8 +187,21 @@ mod tests {
         let (monitor, readings) = monitor(Spread::default());
         let load = || readings.borrow().load.map(Load::percent);
         assert_eq!(load(), None);
-        let read = |cpu: f64| monitor.publish(Machine { cpu, ..Machine::default() });
-        let table = [(10.0, 10.0), (20.0, 15.0), (30.0, 20.0), (40.0, 25.0), (50.0, 30.0), (60.0, 40.0), (0.0, 36.0)];
+        let read = |cpu: f64| {
+            monitor.publish(Machine {
+                cpu,
+                ..Machine::default()
+            })
+        };
+        let table = [
+            (10.0, 10.0),
+            (20.0, 15.0),
+            (30.0, 20.0),
+            (40.0, 25.0),
+            (50.0, 30.0),
+            (60.0, 40.0),
+            (0.0, 36.0),
+        ];
         for (cpu, mean) in table {
             read(cpu);
             assert_eq!(load(), Some(mean), "after {cpu}");
@@ -186,11 +216,19 @@ mod tests {
 
     #[test]
     fn the_gpu_of_the_next_simulation_counts_for_the_load() {
-        let gpu = |index, compute| Gpu { index, compute, ..Gpu::default() };
+        let gpu = |index, compute| Gpu {
+            index,
+            compute,
+            ..Gpu::default()
+        };
         let gpus = vec![gpu(0, 90.0), gpu(1, 60.0), gpu(2, 10.0)];
         for (displays, load) in [(0, 10.0), (2, 60.0)] {
             let (mut monitor, readings) = monitor(Spread::over(displays));
-            let reading = GpuReading { at: Instant::now(), gpus: gpus.clone(), known: 3 };
+            let reading = GpuReading {
+                at: Instant::now(),
+                gpus: gpus.clone(),
+                known: 3,
+            };
             monitor.gpus = watch::channel(Some(reading)).1;
             monitor.publish(Machine::default());
             assert_eq!(readings.borrow().load.map(Load::percent), Some(load));

@@ -112,7 +112,12 @@ impl MachineSensor {
 
     /// The machine's name, system and hardware.
     pub fn host(&self) -> Host {
-        let cpu = self.system.cpus().first().map(|cpu| cpu.brand().trim().to_owned()).unwrap_or_default();
+        let cpu = self
+            .system
+            .cpus()
+            .first()
+            .map(|cpu| cpu.brand().trim().to_owned())
+            .unwrap_or_default();
         Host {
             name: System::host_name().unwrap_or_default(),
             system: System::long_os_version().unwrap_or_default(),
@@ -130,10 +135,15 @@ impl MachineSensor {
         self.system.refresh_memory();
         // This reads one file; sysinfo reads several per interface.
         let before = std::mem::replace(&mut self.interfaces, dev_status().unwrap_or_default());
-        let seconds = std::mem::replace(&mut self.read, Instant::now()).elapsed().as_secs_f64().max(0.001);
+        let seconds = std::mem::replace(&mut self.read, Instant::now())
+            .elapsed()
+            .as_secs_f64()
+            .max(0.001);
         let passed = |bytes: fn(&DeviceStatus) -> u64| -> u64 {
             let outside = self.interfaces.values().filter(|one| one.name != "lo");
-            outside.filter_map(|one| Some(bytes(one).saturating_sub(bytes(before.get(&one.name)?)))).sum()
+            outside
+                .filter_map(|one| Some(bytes(one).saturating_sub(bytes(before.get(&one.name)?))))
+                .sum()
         };
         let (sent, received) = (passed(|one| one.sent_bytes), passed(|one| one.recv_bytes));
         Machine {
@@ -156,9 +166,16 @@ fn disk_use(folder: &Path) -> f64 {
     })
 }
 
-#[expect(clippy::cast_precision_loss, reason = "a percentage needs no more digits than f64 has")]
+#[expect(
+    clippy::cast_precision_loss,
+    reason = "a percentage needs no more digits than f64 has"
+)]
 pub(super) fn percent(part: u64, whole: u64) -> f64 {
-    if whole == 0 { 0.0 } else { 100.0 * part as f64 / whole as f64 }
+    if whole == 0 {
+        0.0
+    } else {
+        100.0 * part as f64 / whole as f64
+    }
 }
 
 #[expect(clippy::cast_precision_loss, reason = "a rate needs no more digits than f64 has")]
@@ -172,9 +189,19 @@ mod tests {
 
     #[test]
     fn disk_use_is_what_df_tells() {
-        let output = std::process::Command::new("df").args(["--output=pcent", "/tmp"]).output().unwrap();
+        let output = std::process::Command::new("df")
+            .args(["--output=pcent", "/tmp"])
+            .output()
+            .unwrap();
         let told = String::from_utf8(output.stdout).unwrap();
-        let told: f64 = told.lines().nth(1).unwrap().trim().trim_end_matches('%').parse().unwrap();
+        let told: f64 = told
+            .lines()
+            .nth(1)
+            .unwrap()
+            .trim()
+            .trim_end_matches('%')
+            .parse()
+            .unwrap();
         let own = disk_use(Path::new("/tmp"));
         // df rounds up, and other programs write in between.
         assert!((told - 1.5..=told + 0.5).contains(&own), "{own} where df says {told}");
@@ -182,12 +209,26 @@ mod tests {
 
     #[test]
     fn the_load_is_that_of_the_busiest_part() {
-        let machine = |cpu, memory, swap| Machine { cpu, memory, swap, ..Machine::default() };
-        let gpu = |compute, memory| Gpu { compute, memory, ..Gpu::default() };
+        let machine = |cpu, memory, swap| Machine {
+            cpu,
+            memory,
+            swap,
+            ..Machine::default()
+        };
+        let gpu = |compute, memory| Gpu {
+            compute,
+            memory,
+            ..Gpu::default()
+        };
         let table = [
             (machine(20.0, 30.0, 0.0), gpu(0.0, 0.0), 20.0, "the CPU"),
             (machine(5.0, 60.0, 0.0), gpu(0.0, 0.0), 20.0, "a third of the memory"),
-            (machine(5.0, 90.0, 60.0), gpu(10.0, 90.0), 80.0, "memories full together"),
+            (
+                machine(5.0, 90.0, 60.0),
+                gpu(10.0, 90.0),
+                80.0,
+                "memories full together",
+            ),
             (machine(5.0, 30.0, 0.0), gpu(70.0, 0.0), 70.0, "the GPU"),
         ];
         for (machine, gpu, expected, why) in table {

@@ -25,7 +25,10 @@ pub struct Spread {
 impl Spread {
     /// Spreads over the first `displays` GPUs; over all if it is 0.
     pub fn over(displays: usize) -> Self {
-        Self { displays, ..Self::default() }
+        Self {
+            displays,
+            ..Self::default()
+        }
     }
 
     /// The GPU that the next simulation would get.
@@ -50,11 +53,19 @@ impl Spread {
         now: Instant,
     ) -> Option<&'gpus Gpu> {
         let times = |gpu: &Gpu| given.get(&gpu.index).map(Vec::as_slice).unwrap_or_default();
-        let expected = |gpu: &Gpu| times(gpu).iter().filter(|at| is_unseen(**at, now)).map(|_| EXPECTED).sum::<f64>();
+        let expected = |gpu: &Gpu| {
+            times(gpu)
+                .iter()
+                .filter(|at| is_unseen(**at, now))
+                .map(|_| EXPECTED)
+                .sum::<f64>()
+        };
         let load = |gpu: &Gpu| gpu.load() + expected(gpu);
         let has_display = |gpu: &&Gpu| self.displays == 0 || (gpu.index as usize) < self.displays;
         let order = |one: &&Gpu, other: &&Gpu| {
-            load(one).total_cmp(&load(other)).then_with(|| times(one).last().cmp(&times(other).last()))
+            load(one)
+                .total_cmp(&load(other))
+                .then_with(|| times(one).last().cmp(&times(other).last()))
         };
         gpus.iter().filter(has_display).min_by(order)
     }
@@ -69,7 +80,14 @@ mod tests {
     use super::*;
 
     fn gpus(loads: &[f64]) -> Vec<Gpu> {
-        (0..).zip(loads).map(|(index, compute)| Gpu { index, compute: *compute, ..Gpu::default() }).collect()
+        (0..)
+            .zip(loads)
+            .map(|(index, compute)| Gpu {
+                index,
+                compute: *compute,
+                ..Gpu::default()
+            })
+            .collect()
     }
 
     /// The GPUs assigned to `count` simulations that start at once.
@@ -82,11 +100,20 @@ mod tests {
         let now = Instant::now();
         let spread = Spread::default();
         assert_eq!(spread.take(&[], now), None);
-        assert_eq!(taken(&spread, &gpus(&[50.0, 30.0, 95.0, 30.0]), 6, now), [1, 3, 1, 3, 0, 1]);
+        assert_eq!(
+            taken(&spread, &gpus(&[50.0, 30.0, 95.0, 30.0]), 6, now),
+            [1, 3, 1, 3, 0, 1]
+        );
         let later = now + UNSEEN;
         assert_eq!(spread.next(&gpus(&[50.0, 30.0, 20.0, 30.0]), later).unwrap().index, 2);
-        let full = Gpu { memory: 90.0, ..Gpu::default() };
-        assert_eq!(spread.next(&[full, gpus(&[0.0, 60.0]).remove(1)], later).unwrap().index, 1);
+        let full = Gpu {
+            memory: 90.0,
+            ..Gpu::default()
+        };
+        assert_eq!(
+            spread.next(&[full, gpus(&[0.0, 60.0]).remove(1)], later).unwrap().index,
+            1
+        );
     }
 
     #[test]

@@ -44,7 +44,9 @@ impl UsageMonitor {
         }
         let mut usages = measure();
         for (root, usage) in &mut usages {
-            let before = last.as_ref().and_then(|(at, usages)| Some((at.elapsed(), usages.get(root)?)));
+            let before = last
+                .as_ref()
+                .and_then(|(at, usages)| Some((at.elapsed(), usages.get(root)?)));
             let mean = before.map(|(passed, before)| {
                 100.0 * usage.time.saturating_sub(before.time).as_secs_f64() / passed.as_secs_f64()
             });
@@ -82,7 +84,12 @@ fn all_by_parent() -> HashMap<i32, Vec<Stat>> {
 fn tree_sum(root: i32, below: &HashMap<i32, Vec<Stat>>) -> Usage {
     let (mut seen, mut open, mut sum) = (HashSet::new(), vec![root], Usage::default());
     while let Some(pid) = open.pop() {
-        for stat in below.get(&pid).into_iter().flatten().filter(|stat| seen.insert(stat.pid)) {
+        for stat in below
+            .get(&pid)
+            .into_iter()
+            .flatten()
+            .filter(|stat| seen.insert(stat.pid))
+        {
             // Children that have exited count for their parent: a program that starts others one by one is busy, too.
             let waited = u64::try_from(stat.cutime.saturating_add(stat.cstime)).unwrap_or_default();
             sum.time += Duration::from_secs(stat.utime + stat.stime + waited) / ticks_per_second();

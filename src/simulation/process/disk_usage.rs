@@ -56,7 +56,11 @@ impl DiskRoom {
     pub fn of(folder: &Path) -> std::io::Result<Self> {
         let disk = statvfs(folder)?;
         let bytes = disk.blocks_available().saturating_mul(disk.fragment_size());
-        Ok(Self { bytes, inodes: disk.files_available(), all_inodes: disk.files() })
+        Ok(Self {
+            bytes,
+            inodes: disk.files_available(),
+            all_inodes: disk.files(),
+        })
     }
 
     /// What is below the reserve (in MiB), as text without numbers that change with each call; `None` if nothing is.
@@ -71,7 +75,13 @@ impl DiskRoom {
 impl DiskUsage {
     /// Adds up files by this measure; stops above `enough`.
     pub fn new(measure: fn(&Metadata) -> u64, enough: u64) -> Self {
-        Self { measure, enough, until: None, total: 0, nameless: HashSet::new() }
+        Self {
+            measure,
+            enough,
+            until: None,
+            total: 0,
+            nameless: HashSet::new(),
+        }
     }
 
     /// Adds everything below a directory until the time is up. Symlinks are not followed. Returns false if a directory
@@ -136,7 +146,10 @@ mod tests {
         std::fs::write(folder.path().join("a"), vec![1; 100_000]).unwrap();
         std::fs::create_dir(folder.path().join("b")).unwrap();
         std::fs::write(folder.path().join("b/empty"), "").unwrap();
-        std::fs::File::create(folder.path().join("hole")).unwrap().set_len(1 << 40).unwrap();
+        std::fs::File::create(folder.path().join("hole"))
+            .unwrap()
+            .set_len(1 << 40)
+            .unwrap();
         std::os::unix::fs::symlink("/", folder.path().join("link")).unwrap();
         let bytes = size(folder.path(), room);
         assert!((100_000 + 4 * SMALLEST..200_000).contains(&bytes), "{bytes}");

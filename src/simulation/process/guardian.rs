@@ -43,10 +43,19 @@ impl Guardian {
     pub fn start(run: &Path, containers: Option<&str>) -> std::io::Result<Self> {
         let (reader, lifeline) = std::io::pipe()?;
         let mut command = Command::new("/proc/self/exe");
-        std::os::unix::process::CommandExt::arg0(&mut command, "simulation-server").arg("guard").arg(run);
+        std::os::unix::process::CommandExt::arg0(&mut command, "simulation-server")
+            .arg("guard")
+            .arg(run);
         command.args(containers.map(|owner| format!("--containers={owner}")));
-        let child = command.stdin(reader).stdout(Stdio::null()).stderr(Stdio::null()).spawn()?;
-        Ok(Self { _child: child, _lifeline: lifeline })
+        let child = command
+            .stdin(reader)
+            .stdout(Stdio::null())
+            .stderr(Stdio::null())
+            .spawn()?;
+        Ok(Self {
+            _child: child,
+            _lifeline: lifeline,
+        })
     }
 }
 

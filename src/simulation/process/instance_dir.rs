@@ -131,7 +131,11 @@ fn run(words: &[&str], folder: &Path) -> io::Result<()> {
     // Its mark is not that of a run: ending a run does not kill it.
     let ran = Run::new(command, Path::new("/"), LIMIT).blocking(|line| complaint = line);
     let ran = ran.map_err(|error| io::Error::other(format!("{} {error}", words.join(" "))))?;
-    if ran.ending == ExitReason::Code(0) { Ok(()) } else { Err(io::Error::other(complaint)) }
+    if ran.ending == ExitReason::Code(0) {
+        Ok(())
+    } else {
+        Err(io::Error::other(complaint))
+    }
 }
 
 #[cfg(test)]

@@ -61,7 +61,9 @@ mod tests {
         let text = format!("Step 1/2 : FROM a\r\n\x1b[31mred\n\n10%\r20%\n{long} and more\nlast");
         for size in 1..text.len() {
             let (mut lines, mut told) = (Lines::default(), Vec::new());
-            text.as_bytes().chunks(size).for_each(|chunk| lines.feed(chunk, |line| told.push(line)));
+            text.as_bytes()
+                .chunks(size)
+                .for_each(|chunk| lines.feed(chunk, |line| told.push(line)));
             lines.end(|line| told.push(line));
             assert_eq!(told, ["Step 1/2 : FROM a", " [31mred", "10%", "20%", &long, "last"]);
         }

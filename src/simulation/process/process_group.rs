@@ -95,17 +95,31 @@ impl ProcessGroup {
         if !spec.inherits {
             command.env_clear();
         }
-        command.args(arguments).envs(spec.environment.iter().map(|(name, value)| (name, value)));
+        command
+            .args(arguments)
+            .envs(spec.environment.iter().map(|(name, value)| (name, value)));
         command.env(process_tree::MARK, &spec.mark).process_group(0);
         if let Some(folder) = &spec.folder {
             command.current_dir(folder);
         }
         let child = command.stdin(Stdio::null()).stdout(output).stderr(errors).spawn()?;
-        let leader = child.id().and_then(|id| i32::try_from(id).ok()).ok_or(std::io::ErrorKind::Other)?;
+        let leader = child
+            .id()
+            .and_then(|id| i32::try_from(id).ok())
+            .ok_or(std::io::ErrorKind::Other)?;
         let (terminate, asked) = oneshot::channel();
-        let group = KillOnDrop { leader: Pid::from_raw(leader), wrappers: spec.wrappers };
+        let group = KillOnDrop {
+            leader: Pid::from_raw(leader),
+            wrappers: spec.wrappers,
+        };
         let ended = wait(group, child, asked, spec.grace);
-        Ok((Self { leader, terminate: Some(terminate) }, ended))
+        Ok((
+            Self {
+                leader,
+                terminate: Some(terminate),
+            },
+            ended,
+        ))
     }
 
     /// The process id of the program, which is the number of the group.
@@ -222,10 +236,17 @@ mod tests {
     #[test]
     fn only_a_signal_is_told_as_one() {
         let reason = |raw| ExitReason::of(ExitStatus::from_raw(raw), false);
-        assert_eq!(reason(129 << 8), ExitReason::Code(129), "git's wrong usage is no SIGHUP");
+        assert_eq!(
+            reason(129 << 8),
+            ExitReason::Code(129),
+            "git's wrong usage is no SIGHUP"
+        );
         assert_eq!(reason(127 << 8), ExitReason::NotStarted);
         assert_eq!(reason(9), ExitReason::Signal(9));
-        assert_eq!(ExitReason::of(ExitStatus::from_raw(139 << 8), true), ExitReason::Signal(11));
+        assert_eq!(
+            ExitReason::of(ExitStatus::from_raw(139 << 8), true),
+            ExitReason::Signal(11)
+        );
         assert_eq!(
             ExitReason::of(ExitStatus::from_raw(255 << 8), true),
             ExitReason::Code(255),
@@ -235,7 +256,10 @@ mod tests {
 
     fn shell(script: &str) -> SpawnSpec {
         let command = ["bash", "-c", script].map(OsString::from).to_vec();
-        SpawnSpec { grace: Duration::from_secs(20), ..SpawnSpec::new(command, Path::new("/nowhere")) }
+        SpawnSpec {
+            grace: Duration::from_secs(20),
+            ..SpawnSpec::new(command, Path::new("/nowhere"))
+        }
     }
 
     #[actix_rt::test]
@@ -243,7 +267,10 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("written");
         // The launcher exits at once, while its child still does its last work.
-        let script = format!("(trap 'sleep 0.2; echo done > {}; exit' TERM; sleep 1000 & wait) & wait", file.display());
+        let script = format!(
+            "(trap 'sleep 0.2; echo done > {}; exit' TERM; sleep 1000 & wait) & wait",
+            file.display()
+        );
         let (reader, output) = std::io::pipe().unwrap();
         let script = format!("echo ready; {script}");
         let (mut group, ended) = ProcessGroup::start(&shell(&script), output.into(), Stdio::null()).unwrap();

@@ -31,8 +31,16 @@ pub fn tree(root: i32) -> Vec<i32> {
 /// The children of a process; none if it has ended.
 pub fn children(pid: i32) -> Vec<i32> {
     let threads = std::fs::read_dir(format!("/proc/{pid}/task")).into_iter().flatten();
-    let children = threads.flatten().filter_map(|thread| std::fs::read_to_string(thread.path().join("children")).ok());
-    children.flat_map(|ids| ids.split_whitespace().filter_map(|id| id.parse().ok()).collect::<Vec<_>>()).collect()
+    let children = threads
+        .flatten()
+        .filter_map(|thread| std::fs::read_to_string(thread.path().join("children")).ok());
+    children
+        .flat_map(|ids| {
+            ids.split_whitespace()
+                .filter_map(|id| id.parse().ok())
+                .collect::<Vec<_>>()
+        })
+        .collect()
 }
 
 /// Kills every process that has the mark of an instance below `folder`, and the groups that such processes lead.
@@ -83,12 +91,17 @@ pub fn nameless_files(pid: i32) -> Option<Vec<Metadata>> {
     let is_nameless = |path: &Path| {
         std::fs::read_link(path).is_ok_and(|target| target.as_os_str().as_encoded_bytes().ends_with(b" (deleted)"))
     };
-    let paths = descriptors.flatten().map(|descriptor| descriptor.path()).filter(|path| is_nameless(path));
+    let paths = descriptors
+        .flatten()
+        .map(|descriptor| descriptor.path())
+        .filter(|path| is_nameless(path));
     let files = paths.filter_map(|path| path.metadata().ok());
     Some(files.filter(|about| about.is_file() && about.nlink() == 0).collect())
 }
 
 /// Whether a process has not ended. The open files of a zombie can't be read.
 fn is_running(pid: i32) -> bool {
-    Process::new(pid).and_then(|process| process.stat()).is_ok_and(|stat| !matches!(stat.state, 'Z' | 'X'))
+    Process::new(pid)
+        .and_then(|process| process.stat())
+        .is_ok_and(|stat| !matches!(stat.state, 'Z' | 'X'))
 }

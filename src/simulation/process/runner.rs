@@ -66,7 +66,14 @@ impl Run {
     /// A program of the server's own with its arguments, in the server's environment and with this mark.
     pub fn new<A: Into<OsString>>(command: impl IntoIterator<Item = A>, mark: &Path, time: Duration) -> Self {
         let spec = SpawnSpec::new(command.into_iter().map(Into::into).collect(), mark);
-        Self { spec, time, answer: 1 << 20, limits: Vec::new(), niceness: 0, may_block: false }
+        Self {
+            spec,
+            time,
+            answer: 1 << 20,
+            limits: Vec::new(),
+            niceness: 0,
+            may_block: false,
+        }
     }
 
     /// The same as [`Self::run`], but blocks the calling thread.
@@ -91,7 +98,14 @@ impl Run {
     /// # Errors
     /// When it can't be started, or is killed because it exceeds a limit.
     pub async fn run(self, told: impl FnMut(String)) -> Result<Ran, RunError> {
-        let Self { spec, time, answer: most, limits, niceness, may_block } = self;
+        let Self {
+            spec,
+            time,
+            answer: most,
+            limits,
+            niceness,
+            may_block,
+        } = self;
         let ((output, mut answer), (said, errors)) = (io::pipe()?, io::pipe()?);
         if most == 0 {
             answer = errors.try_clone()?;
@@ -104,7 +118,9 @@ impl Run {
         let (_group, ended) = if may_block {
             start()?
         } else {
-            actix_rt::task::spawn_blocking(start).await.map_err(io::Error::other)??
+            actix_rt::task::spawn_blocking(start)
+                .await
+                .map_err(io::Error::other)??
         };
         let said = Receiver::from_owned_fd(said.into())?;
         let output = Receiver::from_owned_fd(output.into())?;
@@ -119,7 +135,11 @@ impl Run {
         let Ok((answer, (), ending)) = actix_rt::time::timeout(time, all).await else {
             return Err(RunError::Slow(time));
         };
-        if answer.len() as u64 > most { Err(RunError::TooLong) } else { Ok(Ran { ending, answer }) }
+        if answer.len() as u64 > most {
+            Err(RunError::TooLong)
+        } else {
+            Ok(Ran { ending, answer })
+        }
     }
 }
 
@@ -147,9 +167,21 @@ where
 fn bound(leader: i32, limits: &[(Resource, u64)], niceness: i32) {
     let pid = Pid::from_raw(leader);
     let limit = |(resource, most): &(Resource, u64)| {
-        prlimit(pid, *resource, Rlimit { current: Some(*most), maximum: Some(*most) }).map(drop)
+        prlimit(
+            pid,
+            *resource,
+            Rlimit {
+                current: Some(*most),
+                maximum: Some(*most),
+            },
+        )
+        .map(drop)
     };
-    let nice = if niceness == 0 { Ok(()) } else { setpriority_process(pid, niceness) };
+    let nice = if niceness == 0 {
+        Ok(())
+    } else {
+        setpriority_process(pid, niceness)
+    };
     if let Err(error) = nice.and(limits.iter().try_for_each(limit)) {
         log::warn!("process {leader} runs without its limits: {error}");
     }
@@ -188,29 +220,76 @@ mod tests {
         let script = "echo answer; printf 'one\\rtwo\\n' >&2; exit 3";
         let mut lines = Vec::new();
         let ran = shell(script, LONG).run(|line| lines.push(line)).await.unwrap();
-        assert_eq!((ran.ending, ran.answer.as_slice()), (ExitReason::Code(3), &b"answer\n"[..]));
+        assert_eq!(
+            (ran.ending, ran.answer.as_slice()),
+            (ExitReason::Code(3), &b"answer\n"[..])
+        );
         assert_eq!(lines, ["one", "two"]);
         lines.clear();
-        let ran = Run { answer: 0, ..shell(script, LONG) }.run(|line| lines.push(line)).await.unwrap();
-        assert_eq!((ran.ending, lines), (ExitReason::Code(3), ["answer", "one", "two"].map(str::to_owned).to_vec()));
-        let ran = std::thread::spawn(move || shell(script, LONG).blocking(drop)).join().unwrap();
+        let ran = Run {
+            answer: 0,
+            ..shell(script, LONG)
+        }
+        .run(|line| lines.push(line))
+        .await
+        .unwrap();
+        assert_eq!(
+            (ran.ending, lines),
+            (
+                ExitReason::Code(3),
+                ["answer", "one", "two"].map(str::to_owned).to_vec()
+            )
+        );
+        let ran = std::thread::spawn(move || shell(script, LONG).blocking(drop))
+            .join()
+            .unwrap();
         assert_eq!(ran.unwrap().answer, b"answer\n");
-        assert!(shell(script, LONG).blocking(drop).is_ok(), "also where there is a runtime");
+        assert!(
+            shell(script, LONG).blocking(drop).is_ok(),
+            "also where there is a runtime"
+        );
     }
 
     #[actix_rt::test]
     async fn who_takes_too_much_is_ended() {
         let begin = Instant::now();
-        let slow = shell("sleep 1000 & sleep 1000", Duration::from_millis(100)).run(drop).await.unwrap_err();
+        let slow = shell("sleep 1000 & sleep 1000", Duration::from_millis(100))
+            .run(drop)
+            .await
+            .unwrap_err();
         assert!(matches!(slow, RunError::Slow(_)) && begin.elapsed() < LONG, "{slow}");
-        let long = Run { answer: 3, ..shell("echo long", LONG) }.run(drop).await.unwrap_err();
+        let long = Run {
+            answer: 3,
+            ..shell("echo long", LONG)
+        }
+        .run(drop)
+        .await
+        .unwrap_err();
         assert!(matches!(long, RunError::TooLong), "{long}");
-        let endless = Run { answer: 3, ..shell("yes", LONG) }.run(drop).await.unwrap_err();
-        assert!(matches!(endless, RunError::TooLong) && begin.elapsed() < LONG, "{endless}");
-        let none = Run::new(["/nowhere/program"], Path::new("/"), LONG).run(drop).await.unwrap_err();
+        let endless = Run {
+            answer: 3,
+            ..shell("yes", LONG)
+        }
+        .run(drop)
+        .await
+        .unwrap_err();
+        assert!(
+            matches!(endless, RunError::TooLong) && begin.elapsed() < LONG,
+            "{endless}"
+        );
+        let none = Run::new(["/nowhere/program"], Path::new("/"), LONG)
+            .run(drop)
+            .await
+            .unwrap_err();
         assert!(matches!(none, RunError::NotStarted(_)), "{none}");
         let script = "until [ \"$(ulimit -f)\" -le 8 ] 2>/dev/null; do sleep 0.01; done; echo bounded";
-        let bounded = Run { limits: vec![(Resource::Fsize, 8192)], ..shell(script, LONG) }.run(drop).await.unwrap();
+        let bounded = Run {
+            limits: vec![(Resource::Fsize, 8192)],
+            ..shell(script, LONG)
+        }
+        .run(drop)
+        .await
+        .unwrap();
         assert_eq!(bounded.answer, b"bounded\n");
     }
 

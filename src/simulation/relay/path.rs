@@ -20,7 +20,9 @@ pub fn parse_path(path: &str) -> Option<(Token, &str)> {
 
 /// Whether a segment of a path is a plain name, even if it is decoded twice: a percent sign is not allowed.
 fn is_safe_segment(part: &str) -> bool {
-    let Ok(name) = percent_decode_str(part).decode_utf8() else { return false };
+    let Ok(name) = percent_decode_str(part).decode_utf8() else {
+        return false;
+    };
     let is_plain = !name.contains(|letter: char| letter.is_control() || matches!(letter, '/' | '\\' | '%'));
     is_plain && !matches!(name.as_ref(), "" | "." | "..")
 }
@@ -59,9 +61,15 @@ mod tests {
             let path = path(rest);
             assert_eq!(parse_path(&path), passed.map(|passed| (token, passed)), "{rest}");
         }
-        for path in
-            ["/stream/", "/stream//a", "/stream/x/a", "/streams/x", "/", &path("x/a"), &format!("/x{}", path("/a"))]
-        {
+        for path in [
+            "/stream/",
+            "/stream//a",
+            "/stream/x/a",
+            "/streams/x",
+            "/",
+            &path("x/a"),
+            &format!("/x{}", path("/a")),
+        ] {
             assert_eq!(parse_path(path), None, "{path}");
         }
     }

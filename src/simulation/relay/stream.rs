@@ -62,7 +62,12 @@ impl Stream {
 impl Direction {
     /// Reads from this connection; `pending` was read from it already.
     pub fn new(from: TcpStream, pending: Bytes) -> Self {
-        Self { from, pending, source: Source::Readable, has_ended: false }
+        Self {
+            from,
+            pending,
+            source: Source::Readable,
+            has_ended: false,
+        }
     }
 
     /// Notes what epoll reports.
@@ -118,5 +123,11 @@ fn write(mut to: &TcpStream, bytes: &[u8]) -> io::Result<usize> {
     if bytes.is_empty() {
         return Ok(0);
     }
-    to.write(bytes).or_else(|error| if error.kind() == ErrorKind::WouldBlock { Ok(0) } else { Err(error) })
+    to.write(bytes).or_else(|error| {
+        if error.kind() == ErrorKind::WouldBlock {
+            Ok(0)
+        } else {
+            Err(error)
+        }
+    })
 }

@@ -31,7 +31,11 @@ impl StreamThread {
     /// When the system allows no thread, or no epoll instance.
     pub fn start() -> io::Result<Arc<Self>> {
         let epoll = Epoll::new(EpollCreateFlags::EPOLL_CLOEXEC)?;
-        let started = Arc::new(Self { epoll, streams: Mutex::default(), next: AtomicU64::new(0) });
+        let started = Arc::new(Self {
+            epoll,
+            streams: Mutex::default(),
+            next: AtomicU64::new(0),
+        });
         let thread = Arc::clone(&started);
         std::thread::Builder::new().name("streams".to_owned()).spawn(move || {
             // Without this thread all streams would stall: the server aborts, and the service manager restarts it.
@@ -61,11 +65,20 @@ impl StreamThread {
         // The streams that continue after others had their turn.
         let mut interrupted = BTreeSet::new();
         loop {
-            let timeout = if interrupted.is_empty() { EpollTimeout::NONE } else { EpollTimeout::ZERO };
+            let timeout = if interrupted.is_empty() {
+                EpollTimeout::NONE
+            } else {
+                EpollTimeout::ZERO
+            };
             // A signal may interrupt it.
             let count = self.epoll.wait(&mut events, timeout).unwrap_or_default();
-            let resumed = std::mem::take(&mut interrupted).into_iter().map(|number| (number << 1, Source::Empty));
-            let reported = events.iter().take(count).map(|event| (event.data(), source(event.events())));
+            let resumed = std::mem::take(&mut interrupted)
+                .into_iter()
+                .map(|number| (number << 1, Source::Empty));
+            let reported = events
+                .iter()
+                .take(count)
+                .map(|event| (event.data(), source(event.events())));
             for (key, source) in resumed.chain(reported) {
                 if self.copy(key, source, &mut buffer) {
                     interrupted.insert(key >> 1);
@@ -78,7 +91,9 @@ impl StreamThread {
     /// was interrupted.
     fn copy(&self, key: u64, source: Source, buffer: &mut [u8]) -> bool {
         let mut streams = self.streams.lock();
-        let Some(stream) = streams.get_mut(&(key >> 1)) else { return false };
+        let Some(stream) = streams.get_mut(&(key >> 1)) else {
+            return false;
+        };
         if key & 1 == 0 { &mut stream.up } else { &mut stream.down }.note(source);
         let is_interrupted = stream.copy(buffer);
         if stream.has_ended() {

@@ -16,8 +16,12 @@ use super::stream_thread::StreamThread;
 pub(super) const ANSWER_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Headers of Webots' answer that are forwarded to the client.
-const FORWARDED_HEADERS: [HeaderName; 4] =
-    [header::CONTENT_TYPE, header::ETAG, header::CACHE_CONTROL, header::LAST_MODIFIED];
+const FORWARDED_HEADERS: [HeaderName; 4] = [
+    header::CONTENT_TYPE,
+    header::ETAG,
+    header::CACHE_CONTROL,
+    header::LAST_MODIFIED,
+];
 
 /// Reaches simulations on this machine; one per worker.
 pub struct Upstream {
@@ -40,8 +44,16 @@ impl Upstream {
     pub fn new(address: IpAddr, stream_thread: Arc<StreamThread>, silence: Duration) -> Self {
         let connector = awc::Connector::new().limit(0);
         // Redirects are not followed, and the transfer of an answer may take as long as the simulation.
-        let client = awc::Client::builder().connector(connector).disable_timeout().disable_redirects();
-        Self { client: client.no_default_headers().finish(), address, stream_thread, silence }
+        let client = awc::Client::builder()
+            .connector(connector)
+            .disable_timeout()
+            .disable_redirects();
+        Self {
+            client: client.no_default_headers().finish(),
+            address,
+            stream_thread,
+            silence,
+        }
     }
 
     /// The address of the simulation with this port.
@@ -76,7 +88,10 @@ impl Upstream {
         if matches!(answer.status(), StatusCode::NO_CONTENT | StatusCode::NOT_MODIFIED) {
             return response.finish();
         }
-        let length = answer.headers().get(header::CONTENT_LENGTH).and_then(|length| length.to_str().ok()?.parse().ok());
+        let length = answer
+            .headers()
+            .get(header::CONTENT_LENGTH)
+            .and_then(|length| length.to_str().ok()?.parse().ok());
         if let Some(length) = length {
             response.no_chunking(length);
         }

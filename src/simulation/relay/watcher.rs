@@ -37,7 +37,9 @@ pub(super) async fn relay(
                     if let Ok(text) = ByteString::try_from(text)
                         && is_view_request(&text)
                     {
-                        to_webots.encode(Message::Text(text), &mut requests).map_err(io::Error::other)?;
+                        to_webots
+                            .encode(Message::Text(text), &mut requests)
+                            .map_err(io::Error::other)?;
                     }
                 }
                 Frame::Close(_) => return Ok(()),
@@ -63,7 +65,10 @@ fn is_view_request(text: &str) -> bool {
     let is_size = |(width, height): (&str, &str)| is_number(width) && is_number(height);
     match text.strip_suffix(";broadcast") {
         Some("x3d" | "w3d") => true,
-        Some(other) => other.strip_prefix("mjpeg: ").and_then(|size| size.split_once('x')).is_some_and(is_size),
+        Some(other) => other
+            .strip_prefix("mjpeg: ")
+            .and_then(|size| size.split_once('x'))
+            .is_some_and(is_size),
         None => false,
     }
 }

@@ -34,7 +34,9 @@ pub async fn connect(
         Err(error) => return websocket::refuse(&error),
     };
     let opened = timeout(ANSWER_TIMEOUT, open(upstream, port, path, request)).await;
-    let Ok(Ok((webots, from_webots))) = opened else { return no_answer() };
+    let Ok(Ok((webots, from_webots))) = opened else {
+        return no_answer();
+    };
     let upgraded = upgrade(request);
     let stream_thread = upstream.stream_thread.clone();
     actix_rt::spawn(async move {
@@ -44,11 +46,18 @@ pub async fn connect(
         let held = (held, client.permit);
         if read_only {
             // An error: one of them has left.
-            watcher::relay((to_client, from_client), (webots, from_webots)).await.ok();
+            watcher::relay((to_client, from_client), (webots, from_webots))
+                .await
+                .ok();
             return drop(held);
         }
-        let (Ok(to_client), Ok(to_webots)) = (to_client.into_std(), webots.into_std()) else { return };
-        let (up, down) = (Direction::new(to_client, from_client), Direction::new(to_webots, from_webots));
+        let (Ok(to_client), Ok(to_webots)) = (to_client.into_std(), webots.into_std()) else {
+            return;
+        };
+        let (up, down) = (
+            Direction::new(to_client, from_client),
+            Direction::new(to_webots, from_webots),
+        );
         if let Err(error) = stream_thread.add(Stream::new(up, down, Box::new(held))) {
             log::warn!("a stream is not relayed: {error}");
         }
@@ -59,14 +68,21 @@ pub async fn connect(
 /// Opens the WebSocket of a simulation with the key of its client's request. Returns the connection, and what was read
 /// from it after the handshake.
 async fn open(upstream: &Upstream, port: u16, path: &str, request: &HttpRequest) -> io::Result<(TcpStream, Bytes)> {
-    let key = request.headers().get(header::SEC_WEBSOCKET_KEY).and_then(|key| key.to_str().ok());
+    let key = request
+        .headers()
+        .get(header::SEC_WEBSOCKET_KEY)
+        .and_then(|key| key.to_str().ok());
     let (address, key) = (upstream.simulation(port), key.ok_or(ErrorKind::InvalidInput)?);
     let mut tcp = TcpStream::connect(address).await?;
     // Messages are small, and must not wait until the one before is acknowledged.
     tcp.set_nodelay(true)?;
     // Delayed acknowledgements (TCP_QUICKACK off) would cost less, but Qt leaves Nagle's algorithm on for accepted
     // connections: a small message of Webots would wait up to 40 ms for the acknowledgement of the one before.
-    setsockopt(&tcp, sockopt::TcpUserTimeout, &u32::try_from(upstream.silence.as_millis()).unwrap_or(u32::MAX))?;
+    setsockopt(
+        &tcp,
+        sockopt::TcpUserTimeout,
+        &u32::try_from(upstream.silence.as_millis()).unwrap_or(u32::MAX),
+    )?;
     let head = format!(
         "GET {path} HTTP/1.1\r\nHost: {address}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
          Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: {key}\r\n\r\n"

@@ -88,19 +88,28 @@ const DIGITS: usize = 16;
 impl Token {
     /// A new token.
     pub fn random() -> Self {
-        Self { number: rand::random(), secret: rand::random() }
+        Self {
+            number: rand::random(),
+            secret: rand::random(),
+        }
     }
 
     /// The next token of the same session.
     pub fn next(self) -> Self {
-        Self { secret: rand::random(), ..self }
+        Self {
+            secret: rand::random(),
+            ..self
+        }
     }
 
     /// Parses a token of a client; `None` if it is invalid.
     pub fn parse(text: &str) -> Option<Self> {
         let is_hex = text.len() == 3 * DIGITS && text.bytes().all(|byte| byte.is_ascii_hexdigit());
         let (number, secret) = text.split_at_checked(DIGITS).filter(|_| is_hex)?;
-        Some(Self { number: u64::from_str_radix(number, 16).ok()?, secret: u128::from_str_radix(secret, 16).ok()? })
+        Some(Self {
+            number: u64::from_str_radix(number, 16).ok()?,
+            secret: u128::from_str_radix(secret, 16).ok()?,
+        })
     }
 
     /// The token as text, only for its client.

@@ -125,10 +125,20 @@ impl Present {
                 None => (EndReason::Left, "Its client has gone"),
                 Some(_) => (EndReason::Fault, "The server has lost this simulation"),
             };
-            End { reason, why: why.to_owned(), taken: Taken::default() }
+            End {
+                reason,
+                why: why.to_owned(),
+                taken: Taken::default(),
+            }
         });
         self.events.truncate(MAX_EVENTS - 1);
         self.note(&format!("ended ({}): {}", how.reason.label(), how.why));
-        Ended { simulation: self.shown, client: self.client, at: seconds_since_1970(), events: self.events, how }
+        Ended {
+            simulation: self.shown,
+            client: self.client,
+            at: seconds_since_1970(),
+            events: self.events,
+            how,
+        }
     }
 }

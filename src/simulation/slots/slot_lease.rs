@@ -42,7 +42,10 @@ impl SlotLease {
         (client, identity): (Peer, ClientIdentity),
     ) -> Result<Self, String> {
         slots.acquire(Present::new(Simulation::new(id, world, identity), client, listener))?;
-        Ok(Self { id, slots: Arc::clone(slots) })
+        Ok(Self {
+            id,
+            slots: Arc::clone(slots),
+        })
     }
 
     /// The id of the simulation.
@@ -66,14 +69,19 @@ impl SlotLease {
     pub fn end(&self, reason: EndReason, why: &str, taken: Taken) {
         self.slots.change(self.id, |present| {
             present.accesses.clear();
-            present.how.get_or_insert(End { reason, why: why.to_owned(), taken });
+            present.how.get_or_insert(End {
+                reason,
+                why: why.to_owned(),
+                taken,
+            });
         });
     }
 
     /// Opens the stream of the simulation, until its end is reported. Returns the token for its client.
     pub fn open_stream(&self) -> Token {
         let token = Token::random();
-        self.slots.change(self.id, |present| present.accesses.push((token, Holder::Client)));
+        self.slots
+            .change(self.id, |present| present.accesses.push((token, Holder::Client)));
         token
     }
 }

@@ -48,7 +48,15 @@ impl SlotPool {
         ends: Ends,
     ) -> Arc<Self> {
         let present = BTreeMap::new();
-        Arc::new(Self(Mutex::new(Slots { ports, queue_capacity, per_address, per_user, arrivals: 0, present, ends })))
+        Arc::new(Self(Mutex::new(Slots {
+            ports,
+            queue_capacity,
+            per_address,
+            per_user,
+            arrivals: 0,
+            present,
+            ends,
+        })))
     }
 
     /// Checks every second whether ports that other programs used are free again, and grants them.
@@ -67,7 +75,11 @@ impl SlotPool {
     pub(super) fn acquire(&self, mut present: Present) -> Result<(), String> {
         let mut slots = self.0.lock();
         slots.arrivals += 1;
-        let address = present.client.rate_limit_key().map(Party::Address).zip(slots.per_address);
+        let address = present
+            .client
+            .rate_limit_key()
+            .map(Party::Address)
+            .zip(slots.per_address);
         let user = present.shown.identity.user.clone().map(Party::User).zip(slots.per_user);
         present.parties = address.into_iter().chain(user).collect();
         let (id, refusal) = (present.shown.id, slots.refusal(&present));
@@ -108,7 +120,9 @@ impl SlotPool {
     pub fn stop(&self, id: &str, why: String) -> bool {
         let slots = self.0.lock();
         let found = slots.present.values().find(|one| one.shown.id.to_string() == id);
-        found.inspect(|one| one.listener.do_send(SlotEvent::Stopped(why))).is_some()
+        found
+            .inspect(|one| one.listener.do_send(SlotEvent::Stopped(why)))
+            .is_some()
     }
 
     /// The numbers of simulations by state.
@@ -120,7 +134,10 @@ impl SlotPool {
     pub fn snapshot(&self) -> Snapshot {
         let slots = self.0.lock();
         let simulations = slots.present.values().map(|one| one.shown.clone()).collect();
-        Snapshot { instances: slots.instances(), simulations }
+        Snapshot {
+            instances: slots.instances(),
+            simulations,
+        }
     }
 }
 
@@ -132,11 +149,18 @@ impl Slots {
     /// The first simulation in the queue whose client's address and user may have another slot.
     fn next_in_queue(&self) -> Option<SimulationId> {
         let mut lent: HashMap<&Party, usize> = HashMap::new();
-        for (party, _) in self.present.values().filter(|one| one.shown.port.is_some()).flat_map(|one| &one.parties) {
+        for (party, _) in self
+            .present
+            .values()
+            .filter(|one| one.shown.port.is_some())
+            .flat_map(|one| &one.parties)
+        {
             *lent.entry(party).or_default() += 1;
         }
         let may_have_one = |(party, most): &(Party, usize)| lent.get(party).is_none_or(|slots| slots < most);
-        self.queue().find(|waiting| waiting.parties.iter().all(may_have_one)).map(|waiting| waiting.shown.id)
+        self.queue()
+            .find(|waiting| waiting.parties.iter().all(may_have_one))
+            .map(|waiting| waiting.shown.id)
     }
 
     /// Why one more simulation may not wait, as text for its client; `None` if it may.
@@ -161,7 +185,12 @@ impl Slots {
     /// Grants free slots to the clients in the queue, and sends the others their position.
     fn serve(&mut self) {
         self.grant();
-        for (ahead, waiting) in self.present.values_mut().filter(|one| one.shown.port.is_none()).enumerate() {
+        for (ahead, waiting) in self
+            .present
+            .values_mut()
+            .filter(|one| one.shown.port.is_none())
+            .enumerate()
+        {
             if waiting.sent_position.replace(ahead) != Some(ahead) {
                 waiting.listener.do_send(SlotEvent::Queued(ahead));
             }
@@ -185,7 +214,11 @@ impl Slots {
 
     fn instances(&self) -> Instances {
         let count = |stages: &[Stage]| {
-            let matching = self.present.values().filter(|one| stages.contains(&one.shown.stage)).count();
+            let matching = self
+                .present
+                .values()
+                .filter(|one| stages.contains(&one.shown.stage))
+                .count();
             u32::try_from(matching).unwrap_or(u32::MAX)
         };
         Instances {

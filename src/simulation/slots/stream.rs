@@ -28,7 +28,13 @@ pub struct WatchGuard {
 impl Present {
     /// Notifies the session if one watcher is connected: it is the first one, or the last one that leaves.
     fn notify_of_watchers(&self, is_watched: bool) {
-        if self.accesses.iter().filter(|(_, holder)| *holder == Holder::Watcher).count() == 1 {
+        if self
+            .accesses
+            .iter()
+            .filter(|(_, holder)| *holder == Holder::Watcher)
+            .count()
+            == 1
+        {
             self.listener.do_send(SlotEvent::Watched(is_watched));
         }
     }
@@ -40,7 +46,11 @@ impl SlotPool {
         self.0.lock().present.values().find_map(|one| {
             let (_, holder) = one.accesses.iter().find(|(access, _)| *access == token)?;
             let read_only = *holder != Holder::Client;
-            Some(StreamTarget { simulation: one.shown.id, port: one.shown.port?, read_only })
+            Some(StreamTarget {
+                simulation: one.shown.id,
+                port: one.shown.port?,
+                read_only,
+            })
         })
     }
 
@@ -57,10 +67,17 @@ impl SlotPool {
     pub fn start_watching(self: &Arc<Self>, simulation: SimulationId, token: Token) -> Option<WatchGuard> {
         let mut slots = self.0.lock();
         let present = slots.present.get_mut(&simulation)?;
-        let invited = present.accesses.iter_mut().find(|access| **access == (token, Holder::Invited))?;
+        let invited = present
+            .accesses
+            .iter_mut()
+            .find(|access| **access == (token, Holder::Invited))?;
         invited.1 = Holder::Watcher;
         present.notify_of_watchers(true);
-        Some(WatchGuard { token, simulation, slots: Arc::clone(self) })
+        Some(WatchGuard {
+            token,
+            simulation,
+            slots: Arc::clone(self),
+        })
     }
 }
 

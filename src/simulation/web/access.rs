@@ -25,7 +25,9 @@ impl Visitor {
     /// # Errors
     /// When its address has sent too many passwords: the administrator must not get the page for strangers.
     pub fn of(request: &HttpRequest, server: &AppState) -> Result<Self, AuthError> {
-        let Some(auth) = &server.admin_auth else { return Ok(Self::Anybody) };
+        let Some(auth) = &server.admin_auth else {
+            return Ok(Self::Anybody);
+        };
         match auth.check(request, server.config.trusted_proxies.peer(request)) {
             Ok(()) => Ok(Self::Administrator),
             Err(AuthError::NoPassword) => Ok(Self::Stranger),
@@ -49,10 +51,14 @@ impl Visitor {
 /// # Errors
 /// The response to a page that may not.
 pub fn check_origin(request: &HttpRequest, allowed: &[Origin]) -> actix_web::Result<()> {
-    let Some(origin) = request.headers().get(header::ORIGIN) else { return Ok(()) };
+    let Some(origin) = request.headers().get(header::ORIGIN) else {
+        return Ok(());
+    };
     let origin = origin.to_str().unwrap_or_default();
     if allowed.is_empty() || allowed.iter().any(|one| one.0 == origin) {
         return Ok(());
     }
-    Err(ErrorForbidden("Error: this page is not one of those that may start simulations here."))
+    Err(ErrorForbidden(
+        "Error: this page is not one of those that may start simulations here.",
+    ))
 }

@@ -30,7 +30,11 @@ struct StopRequest {
 }
 
 fn refusal(request: &HttpRequest, server: &AppState) -> Option<HttpResponse> {
-    refuse_action(server.admin_auth.as_ref(), request, server.config.trusted_proxies.peer(request))
+    refuse_action(
+        server.admin_auth.as_ref(),
+        request,
+        server.config.trusted_proxies.peer(request),
+    )
 }
 
 async fn drain(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
@@ -60,7 +64,10 @@ async fn stop(
         return Err(ErrorNotFound("Error: there is no such simulation; it may have ended."));
     }
     let peer = server.config.trusted_proxies.peer(&request);
-    log::info!("{id}: client {peer} stops it, reason: {}", if reason.is_empty() { "none" } else { &reason });
+    log::info!(
+        "{id}: client {peer} stops it, reason: {}",
+        if reason.is_empty() { "none" } else { &reason }
+    );
     Ok(HttpResponse::Accepted().body("stopping"))
 }
 
@@ -68,5 +75,9 @@ async fn stop(
 async fn sign_in(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
     let peer = server.config.trusted_proxies.peer(&request);
     let refusal = require_administrator(server.admin_auth.as_ref(), &request, peer);
-    refusal.unwrap_or_else(|| HttpResponse::SeeOther().insert_header((header::LOCATION, "monitor")).finish())
+    refusal.unwrap_or_else(|| {
+        HttpResponse::SeeOther()
+            .insert_header((header::LOCATION, "monitor"))
+            .finish()
+    })
 }

@@ -25,25 +25,48 @@ pub fn gauges<'text>(server: &AppState, snapshot: &Snapshot) -> Vec<Gauge<'text>
     let failed = "Starts in a row that failed for a reason of this server's own";
     let lost = "1 while GPUs have answered and some or all don't any more";
     vec![
-        Gauge::plain("webots_simulation_load_percent", "Load as /load tells it", server.load().percent()),
+        Gauge::plain(
+            "webots_simulation_load_percent",
+            "Load as /load tells it",
+            server.load().percent(),
+        ),
         Gauge::plain(
             "webots_simulation_ready",
             "0 while no simulation can be started",
             flag(server.problem().is_none()),
         ),
-        Gauge::plain("webots_simulation_failed_starts", failed, f64::from(server.failed_starts.count())),
-        Gauge::plain("webots_simulation_draining", "1 while no new clients are taken", flag(server.is_draining())),
-        Gauge::plain("webots_simulation_places", "Simulations that fit", f64::from(instances.places)),
+        Gauge::plain(
+            "webots_simulation_failed_starts",
+            failed,
+            f64::from(server.failed_starts.count()),
+        ),
+        Gauge::plain(
+            "webots_simulation_draining",
+            "1 while no new clients are taken",
+            flag(server.is_draining()),
+        ),
+        Gauge::plain(
+            "webots_simulation_places",
+            "Simulations that fit",
+            f64::from(instances.places),
+        ),
         Gauge {
             name: "webots_simulation_instances",
             help: "Simulations by state",
             labels: &["state"],
-            values: by_state.iter().map(|(state, count)| (vec![(*state).to_owned()], f64::from(*count))).collect(),
+            values: by_state
+                .iter()
+                .map(|(state, count)| (vec![(*state).to_owned()], f64::from(*count)))
+                .collect(),
         },
         Gauge::plain("webots_machine_cpu_percent", "CPU in use", machine.cpu),
         Gauge::plain("webots_machine_memory_percent", "Memory in use", machine.memory),
         Gauge::plain("webots_machine_swap_percent", "Swap in use", machine.swap),
-        Gauge::plain("webots_machine_disk_percent", "Disk in use where the cache is", machine.disk),
+        Gauge::plain(
+            "webots_machine_disk_percent",
+            "Disk in use where the cache is",
+            machine.disk,
+        ),
         Gauge::plain("webots_machine_gpu_lost", lost, flag(readings.gpu_problem.is_some())),
         Gauge {
             name: "webots_machine_gpu_compute_percent",

@@ -63,7 +63,9 @@ pub fn configure(app: &mut web::ServiceConfig) {
 
 async fn monitor(request: HttpRequest, server: web::Data<AppState>) -> actix_web::Result<HttpResponse> {
     let visitor = Visitor::of(&request, &server)?;
-    let page = view(&server, visitor).await.and_then(|view| pages::monitor(&server, &view, visitor));
+    let page = view(&server, visitor)
+        .await
+        .and_then(|view| pages::monitor(&server, &view, visitor));
     Ok(html(page, OWN_FILES))
 }
 
@@ -91,17 +93,24 @@ async fn usages(server: &AppState, snapshot: &Snapshot) -> Usages {
 }
 
 async fn events(request: HttpRequest, server: web::Data<AppState>) -> actix_web::Result<HttpResponse> {
-    let permit = server.connections.admit(ConnectionKind::Page, server.config.trusted_proxies.peer(&request))?;
+    let permit = server
+        .connections
+        .admit(ConnectionKind::Page, server.config.trusted_proxies.peer(&request))?;
     let visitor = Visitor::of(&request, &server)?;
     let shown = server.clone();
     let render = move || {
         let server = shown.clone();
         async move {
             let view = view(&server, visitor).await;
-            view.inspect_err(|error| log::error!("the monitor page can't be rendered: {error}")).ok()
+            view.inspect_err(|error| log::error!("the monitor page can't be rendered: {error}"))
+                .ok()
         }
     };
-    let live = if visitor == Visitor::Administrator { &server.administrators } else { &server.live };
+    let live = if visitor == Visitor::Administrator {
+        &server.administrators
+    } else {
+        &server.live
+    };
     Ok(live.listen(permit, server.phase.subscribe(), render))
 }
 
@@ -136,7 +145,10 @@ async fn output(
         web::block(move || output_file(&logs, &which.id).and_then(|file| last_lines(&file, MAX_TAIL).ok())).await;
     let tail = tail?.ok_or_else(|| ErrorNotFound("Error: nothing is kept of this simulation."))?;
     Ok(HttpResponse::Ok()
-        .insert_header((header::CONTENT_SECURITY_POLICY, "default-src 'none'; frame-ancestors 'none'"))
+        .insert_header((
+            header::CONTENT_SECURITY_POLICY,
+            "default-src 'none'; frame-ancestors 'none'",
+        ))
         .content_type("text/plain; charset=utf-8")
         .body(tail))
 }
@@ -148,9 +160,13 @@ async fn wwi(request: HttpRequest, server: web::Data<AppState>) -> actix_web::Re
         let file = webots_viewer::file_below(&webots_viewer::folder(&server.config)?, &path)?;
         NamedFile::open(file).ok()
     });
-    let file = file.await?.ok_or_else(|| ErrorNotFound("Error: there is no such file."))?;
+    let file = file
+        .await?
+        .ok_or_else(|| ErrorNotFound("Error: there is no such file."))?;
     let mut response = file.disable_content_disposition().into_response(&request);
-    response.headers_mut().insert(header::CACHE_CONTROL, HeaderValue::from_static("no-cache"));
+    response
+        .headers_mut()
+        .insert(header::CACHE_CONTROL, HeaderValue::from_static("no-cache"));
     Ok(response)
 }
 
@@ -170,7 +186,10 @@ async fn watch(
     let found = one.and_then(|one| Some((one, server.slots.watch(one.id)?)));
     let (one, token) = found.ok_or_else(|| ErrorNotFound("Error: this simulation does not stream."))?;
     let installed = webots_viewer::folder(&server.config).map(|_| webots_viewer::PATH);
-    let (stream, script) = (format!("stream/{}", token.reveal()), installed.filter(|_| which.viewer != "small"));
+    let (stream, script) = (
+        format!("stream/{}", token.reveal()),
+        installed.filter(|_| which.viewer != "small"),
+    );
     let page = Watch { one, stream, script };
     Ok(html(page.render(), VIEWER))
 }

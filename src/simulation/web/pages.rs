@@ -73,20 +73,52 @@ pub fn view(
     let rows = snapshot.simulations.iter().map(|one| {
         let usage = one.pid.and_then(|pid| usages.get(&pid)).copied().unwrap_or_default();
         let ends = one.launched.map_or(0, |launched| launched + server.config.timeout);
-        let html = SimulationRow { visitor, shows_port, one, usage, ends }.render()?;
-        Ok(TableRow { key: one.id.to_string(), html })
+        let html = SimulationRow {
+            visitor,
+            shows_port,
+            one,
+            usage,
+            ends,
+        }
+        .render()?;
+        Ok(TableRow {
+            key: one.id.to_string(),
+            html,
+        })
     });
     let rows = rows.collect::<Result<Vec<TableRow>, askama::Error>>()?;
     let ends = server.ends.latest();
     let ends = ends.iter().map(|record| {
-        let html = EndRow { visitor, record, one: &record.simulation }.render()?;
-        Ok(TableRow { key: record.simulation.id.to_string(), html })
+        let html = EndRow {
+            visitor,
+            record,
+            one: &record.simulation,
+        }
+        .render()?;
+        Ok(TableRow {
+            key: record.simulation.id.to_string(),
+            html,
+        })
     });
     let ends = ends.collect::<Result<Vec<TableRow>, askama::Error>>()?;
     let (instances, load, problem) = (snapshot.instances, server.load().percent(), server.problem());
-    let glance = Glance { server, readings: &readings, instances, load, problem }.render()?;
-    let (parts, tables) = ([("glance", glance)].into(), [("simulations", rows), ("ends", ends)].into());
-    Ok(PageView { parts, tables, sample: readings.sample.clone() })
+    let glance = Glance {
+        server,
+        readings: &readings,
+        instances,
+        load,
+        problem,
+    }
+    .render()?;
+    let (parts, tables) = (
+        [("glance", glance)].into(),
+        [("simulations", rows), ("ends", ends)].into(),
+    );
+    Ok(PageView {
+        parts,
+        tables,
+        sample: readings.sample.clone(),
+    })
 }
 
 /// The whole of `/monitor`, with these parts.
@@ -94,7 +126,13 @@ pub fn view(
 /// # Errors
 /// When a template can't be rendered.
 pub fn monitor(server: &AppState, view: &PageView, visitor: Visitor) -> Result<String, askama::Error> {
-    Monitor { server, readings: &server.readings.borrow().clone(), visitor, view }.render()
+    Monitor {
+        server,
+        readings: &server.readings.borrow().clone(),
+        visitor,
+        view,
+    }
+    .render()
 }
 
 impl Monitor<'_> {
@@ -105,8 +143,10 @@ impl Monitor<'_> {
     /// What worlds' programs can do because isolation is incomplete, and why it is.
     fn shortcoming(&self) -> Option<(&'static str, &str)> {
         let (launcher, containers) = (&self.server.launcher, self.server.containers.as_ref());
-        let of_level =
-            launcher.shortcoming.as_deref().map(|why| ("worlds' programs may do whatever this server may.", why));
+        let of_level = launcher
+            .shortcoming
+            .as_deref()
+            .map(|why| ("worlds' programs may do whatever this server may.", why));
         let of_containers = containers.and_then(|containers| containers.shortcoming.as_deref());
         of_level.or_else(|| of_containers.map(|why| ("", why)))
     }
@@ -146,7 +186,11 @@ fn words(stage: Stage) -> (&'static str, &'static str) {
 #[expect(clippy::cast_precision_loss, reason = "few digits are shown")]
 fn bytes(count: u64) -> String {
     let mebibytes = count as f64 / 2_f64.powi(20);
-    if mebibytes < 1024.0 { format!("{mebibytes:.0} MiB") } else { format!("{:.1} GiB", mebibytes / 1024.0) }
+    if mebibytes < 1024.0 {
+        format!("{mebibytes:.0} MiB")
+    } else {
+        format!("{:.1} GiB", mebibytes / 1024.0)
+    }
 }
 
 /// A duration as text in hours and minutes; the page's script adds the seconds.
@@ -167,7 +211,12 @@ mod tests {
 
     #[test]
     fn sizes_and_times_are_short() {
-        let sizes = [(0, "0 MiB"), (5 << 20, "5 MiB"), (3 << 30, "3.0 GiB"), (2500 << 30, "2500.0 GiB")];
+        let sizes = [
+            (0, "0 MiB"),
+            (5 << 20, "5 MiB"),
+            (3 << 30, "3.0 GiB"),
+            (2500 << 30, "2500.0 GiB"),
+        ];
         for (count, text) in sizes {
             assert_eq!(bytes(count), text);
         }
@@ -181,12 +230,20 @@ mod tests {
         let world = ProjectUrl::parse("https://github.com/u/<i>\"'&/blob/main/worlds/<script>.wbt").unwrap();
         let identity = ClientIdentity::new(Some("<i>root</i>"), Some("<script>'\"&"));
         let one = Simulation::new(SimulationId::next(), &world, identity);
-        for (visitor, has_names) in
-            [(Visitor::Anybody, false), (Visitor::Stranger, false), (Visitor::Administrator, true)]
-        {
-            let html = SimulationRow { visitor, shows_port: true, one: &one, usage: Usage::default(), ends: 0 }
-                .render()
-                .unwrap();
+        for (visitor, has_names) in [
+            (Visitor::Anybody, false),
+            (Visitor::Stranger, false),
+            (Visitor::Administrator, true),
+        ] {
+            let html = SimulationRow {
+                visitor,
+                shows_port: true,
+                one: &one,
+                usage: Usage::default(),
+                ends: 0,
+            }
+            .render()
+            .unwrap();
             assert!(!html.contains("<script>") && !html.contains("<i>"), "{html}");
             assert_eq!(html.contains("root"), has_names, "{html}");
         }

@@ -38,13 +38,22 @@ async fn client(
     check_origin(&request, &config.allowed_origins)?;
     let peer = proxies.peer(&request);
     let permit = server.connections.admit(ConnectionKind::Client, peer)?;
-    let user = config.user_header.as_ref().and_then(|name| proxies.trusted_header(&request, name));
+    let user = config
+        .user_header
+        .as_ref()
+        .and_then(|name| proxies.trusted_header(&request, name));
     let server = Arc::clone(&server);
-    Ok(websocket::open(&request, stream, WebClient::new(server, (peer, user), permit)))
+    Ok(websocket::open(
+        &request,
+        stream,
+        WebClient::new(server, (peer, user), permit),
+    ))
 }
 
 async fn load(server: web::Data<AppState>) -> HttpResponse {
-    HttpResponse::Ok().content_type("text/plain").body(server.load().to_string())
+    HttpResponse::Ok()
+        .content_type("text/plain")
+        .body(server.load().to_string())
 }
 
 async fn status_json(request: HttpRequest, server: web::Data<AppState>) -> actix_web::Result<HttpResponse> {
@@ -58,15 +67,18 @@ async fn status_json(request: HttpRequest, server: web::Data<AppState>) -> actix
 
 async fn metrics_text(server: web::Data<AppState>) -> actix_web::Result<HttpResponse> {
     let snapshot = server.slots.snapshot();
-    let text = server.metrics.render(&metrics::gauges(&server, &snapshot)).map_err(ErrorInternalServerError)?;
+    let text = server
+        .metrics
+        .render(&metrics::gauges(&server, &snapshot))
+        .map_err(ErrorInternalServerError)?;
     Ok(HttpResponse::Ok().content_type(CONTENT_TYPE).body(text))
 }
 
 async fn health(server: web::Data<AppState>) -> HttpResponse {
     match server.problem() {
         None => HttpResponse::Ok().content_type("text/plain").body("ok"),
-        Some(problem) => {
-            HttpResponse::ServiceUnavailable().content_type("text/plain").body(format!("Error: {problem}"))
-        }
+        Some(problem) => HttpResponse::ServiceUnavailable()
+            .content_type("text/plain")
+            .body(format!("Error: {problem}")),
     }
 }

@@ -20,7 +20,11 @@ async fn stream(request: HttpRequest, server: web::Data<AppState>) -> actix_web:
     let nothing = || ErrorNotFound("Error: there is no such stream.");
     // The path as the client has sent it: what is percent-encoded stays so.
     let (token, path) = relay::parse_path(request.uri().path()).ok_or_else(nothing)?;
-    let StreamTarget { simulation, port, read_only } = server.slots.stream(token).ok_or_else(nothing)?;
+    let StreamTarget {
+        simulation,
+        port,
+        read_only,
+    } = server.slots.stream(token).ok_or_else(nothing)?;
     if let Some(refusal) = refuse_body(&request) {
         return Ok(refusal);
     }
@@ -34,7 +38,10 @@ async fn stream(request: HttpRequest, server: web::Data<AppState>) -> actix_web:
     let peer = server.config.trusted_proxies.peer(&request);
     let permit = server.connections.admit(ConnectionKind::Stream, peer)?;
     let upstream = request.app_data::<Upstream>().ok_or_else(nothing)?;
-    let path = request.uri().query().map_or(path.to_owned(), |query| format!("{path}?{query}"));
+    let path = request
+        .uri()
+        .query()
+        .map_or(path.to_owned(), |query| format!("{path}?{query}"));
     if !is_websocket {
         return Ok(upstream.fetch(port, &path, &request, permit).await);
     }

@@ -36,7 +36,10 @@ impl Webots {
         let timer = ctx.run_later(limit.saturating_sub(notice), move |this, ctx| {
             this.send(WebotsEvent::IdleEnd(Some(Instant::now() + notice)));
             let timer = ctx.run_later(notice, move |this, _| {
-                this.stop(EndReason::Idle, &format!("The simulation was paused for {minutes} minutes"));
+                this.stop(
+                    EndReason::Idle,
+                    &format!("The simulation was paused for {minutes} minutes"),
+                );
             });
             this.idle_end = Some((timer, true));
         });

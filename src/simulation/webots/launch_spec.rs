@@ -49,8 +49,15 @@ pub struct LaunchSpec {
 impl LaunchSpec {
     /// The request for its containers. The world's path in the container is added once the image is known.
     pub fn request(&self) -> ContainerRequest {
-        let command = std::iter::once(self.config.container.program.clone()).chain(self.options()).collect();
-        ContainerRequest { project: Arc::clone(&self.project), port: self.slot.port, gpu: self.gpu.clone(), command }
+        let command = std::iter::once(self.config.container.program.clone())
+            .chain(self.options())
+            .collect();
+        ContainerRequest {
+            project: Arc::clone(&self.project),
+            port: self.slot.port,
+            gpu: self.gpu.clone(),
+            command,
+        }
     }
 
     /// The options of Webots, before its world.
@@ -62,8 +69,11 @@ impl LaunchSpec {
             Mode::Mjpeg => (&[], "--stream=mjpeg"),
             _ => (&["--minimize", "--no-rendering"], "--stream"),
         };
-        let mut options =
-            [&["--batch", "--mode=pause"], window].concat().into_iter().map(str::to_owned).collect::<Vec<_>>();
+        let mut options = [&["--batch", "--mode=pause"], window]
+            .concat()
+            .into_iter()
+            .map(str::to_owned)
+            .collect::<Vec<_>>();
         options.push(format!("--port={}", self.slot.port));
         options.push(format!("--heartbeat={}", self.config.timing.heartbeat.as_millis()));
         options.push(stream.to_owned());
@@ -84,7 +94,10 @@ impl LaunchSpec {
         let mut command: Vec<OsString> = vec![self.program.clone().into()];
         command.extend(self.options().into_iter().map(Into::into));
         command.push(self.project.world.path.clone().into());
-        let gpu = self.gpu.iter().map(|gpu| ("CUDA_VISIBLE_DEVICES".into(), gpu.id.clone().into()));
+        let gpu = self
+            .gpu
+            .iter()
+            .map(|gpu| ("CUDA_VISIBLE_DEVICES".into(), gpu.id.clone().into()));
         let spec = SpawnSpec {
             environment: gpu.collect(),
             folder: Some(self.project.folder.clone()),
@@ -103,7 +116,10 @@ impl LaunchSpec {
 
     /// The address at which this server reaches it.
     fn address(&self) -> SocketAddr {
-        let address = self.launcher.reached().unwrap_or_else(|| self.config.address_of_simulations());
+        let address = self
+            .launcher
+            .reached()
+            .unwrap_or_else(|| self.config.address_of_simulations());
         (address, self.slot.port).into()
     }
 

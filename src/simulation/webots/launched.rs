@@ -41,7 +41,10 @@ pub fn launch(
     let folder = spec.config.log_dir.0.join("simulation").join(FOLDER_OF_RUNNING);
     let log = folder.join(format!("{}.log", spec.slot.lease.id()));
     let file = RotatedFile::open(&log, MAX_LOG, "").inspect_err(|error| {
-        let why = format!("what Webots prints is not kept: {} can't be written: {error}", log.display());
+        let why = format!(
+            "what Webots prints is not kept: {} can't be written: {error}",
+            log.display()
+        );
         spec.slot.lease.log(log::Level::Warn, &why, &why);
     });
     let log = file.is_ok().then_some(log);
@@ -67,12 +70,18 @@ pub fn launch(
         }
         // This also kills processes that have left the process group.
         let (on_machine, taken) = match cgroup {
-            Some(cgroup) => actix_rt::task::spawn_blocking(move || cgroup.end()).await.unwrap_or_default(),
+            Some(cgroup) => actix_rt::task::spawn_blocking(move || cgroup.end())
+                .await
+                .unwrap_or_default(),
             None => (false, Taken::default()),
         };
         // The last output shows the cause. A process that can't be killed may keep the pipe open.
         actix_rt::time::timeout(LAST_OUTPUT, all_read).await.ok();
-        End { reason, cause: in_container.or(on_machine.then_some(Cause::OutOfMemory)), taken }
+        End {
+            reason,
+            cause: in_container.or(on_machine.then_some(Cause::OutOfMemory)),
+            taken,
+        }
     };
     Ok((group, tail, ended))
 }
@@ -110,15 +119,44 @@ mod tests {
 
     #[test]
     fn each_end_has_its_kind() {
-        let end = |reason, cause| End { reason, cause, taken: Taken::default() };
+        let end = |reason, cause| End {
+            reason,
+            cause,
+            taken: Taken::default(),
+        };
         let (ok, killed) = (ExitReason::Code(0), ExitReason::Signal(9));
         for (end, was_ready, kind, words) in [
             (end(ok, None), true, EndReason::Finished, "Webots has ended"),
-            (end(killed, None), true, EndReason::Crashed, "Webots was ended by the signal SIGKILL"),
-            (end(ExitReason::Code(3), None), false, EndReason::NoWebots, "Webots ended with exit code 3"),
-            (end(ExitReason::NotStarted, None), false, EndReason::NoWebots, "Webots could not be started"),
-            (end(killed, Some(Cause::OutOfMemory)), true, EndReason::Limit, super::words(Cause::OutOfMemory)),
-            (end(ok, Some(Cause::Docker)), true, EndReason::Fault, super::words(Cause::Docker)),
+            (
+                end(killed, None),
+                true,
+                EndReason::Crashed,
+                "Webots was ended by the signal SIGKILL",
+            ),
+            (
+                end(ExitReason::Code(3), None),
+                false,
+                EndReason::NoWebots,
+                "Webots ended with exit code 3",
+            ),
+            (
+                end(ExitReason::NotStarted, None),
+                false,
+                EndReason::NoWebots,
+                "Webots could not be started",
+            ),
+            (
+                end(killed, Some(Cause::OutOfMemory)),
+                true,
+                EndReason::Limit,
+                super::words(Cause::OutOfMemory),
+            ),
+            (
+                end(ok, Some(Cause::Docker)),
+                true,
+                EndReason::Fault,
+                super::words(Cause::Docker),
+            ),
         ] {
             assert_eq!(end.verdict(was_ready), (kind, words.to_owned()), "{end:?}");
         }

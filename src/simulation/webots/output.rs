@@ -70,7 +70,10 @@ impl Tail {
             return ".".to_owned();
         }
         let lines: Vec<&str> = lines.iter().rev().map(String::as_str).collect();
-        format!(". Its last output: {}", lines.join(" | ").replace(&format!("{}/", project.display()), ""))
+        format!(
+            ". Its last output: {}",
+            lines.join(" | ").replace(&format!("{}/", project.display()), "")
+        )
     }
 
     fn push(&self, line: String) {

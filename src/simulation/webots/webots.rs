@@ -73,7 +73,9 @@ impl Webots {
 
     /// Prepares its containers, if it has any, then starts it. Dropping the preparation discards what was created.
     fn prepare(&mut self, ctx: &mut Context<Self>) {
-        let Some(containers) = self.spec.containers.clone() else { return self.launch(None, ctx) };
+        let Some(containers) = self.spec.containers.clone() else {
+            return self.launch(None, ctx);
+        };
         let (client, request) = (self.spec.events.clone(), self.spec.request());
         // A full mailbox drops this line.
         let progress = move |text| drop(client.try_send(WebotsEvent::Progress(text)));
@@ -81,19 +83,29 @@ impl Webots {
             let mut prepared = containers.prepare(request, &progress).await?;
             prepared.start_others().await.map(|()| prepared)
         };
-        self.preparing = Some(ctx.spawn(prepared.into_actor(self).map(|prepared, this, ctx| match prepared {
-            Ok(containers) => this.launch(Some(containers), ctx),
-            Err(StartError::Project(why)) => this.over(EndReason::NoWebots, &why, Taken::default(), ctx),
-            Err(StartError::Server(why)) => this.over(EndReason::Fault, &why, Taken::default(), ctx),
-        })));
+        self.preparing = Some(
+            ctx.spawn(prepared.into_actor(self).map(|prepared, this, ctx| match prepared {
+                Ok(containers) => this.launch(Some(containers), ctx),
+                Err(StartError::Project(why)) => this.over(EndReason::NoWebots, &why, Taken::default(), ctx),
+                Err(StartError::Server(why)) => this.over(EndReason::Fault, &why, Taken::default(), ctx),
+            })),
+        );
     }
 
     fn launch(&mut self, containers: Option<SimulationContainers>, ctx: &mut Context<Self>) {
         self.preparing = None;
         if let Some(containers) = &containers {
             self.restart = containers.restart();
-            containers.warnings.iter().cloned().for_each(|warning| self.send(WebotsEvent::Progress(warning)));
-            containers.texts.iter().cloned().for_each(|text| self.send(WebotsEvent::Text(text)));
+            containers
+                .warnings
+                .iter()
+                .cloned()
+                .for_each(|warning| self.send(WebotsEvent::Progress(warning)));
+            containers
+                .texts
+                .iter()
+                .cloned()
+                .for_each(|text| self.send(WebotsEvent::Text(text)));
         }
         if let Err(error) = self.spawn(containers, ctx) {
             let why = format!("Webots can't be started: {error}");
@@ -112,7 +124,10 @@ impl Webots {
         });
         let limit = self.spec.config.timeout;
         ctx.run_later(Duration::from_secs(limit), move |this, _| {
-            this.stop(EndReason::TimeLimit, &format!("The time limit of {limit} seconds was reached"));
+            this.stop(
+                EndReason::TimeLimit,
+                &format!("The time limit of {limit} seconds was reached"),
+            );
         });
     }
 
@@ -127,7 +142,10 @@ impl Webots {
         let pid = group.leader();
         self.log(Level::Info, &format!("started {program} for {world} (process {pid})"));
         (self.tail, self.group) = (tail, Some(group));
-        ended.into_actor(self).map(|end, this, ctx| this.ended(&end, ctx)).spawn(ctx);
+        ended
+            .into_actor(self)
+            .map(|end, this, ctx| this.ended(&end, ctx))
+            .spawn(ctx);
         let excess = self.spec.until_too_much(pid).into_actor(self);
         excess.map(|why, this, _| this.stop(EndReason::Limit, &why)).spawn(ctx);
         Ok(())
@@ -170,7 +188,10 @@ impl Webots {
         let silence = self.last_heartbeat.elapsed();
         let hangs_after = self.spec.config.timing.heartbeat * MISSED_HEARTBEATS;
         if silence > hangs_after + self.spec.config.hang_limit {
-            self.stop(EndReason::Hung, &format!("Webots gave no sign of life for {} seconds", silence.as_secs()));
+            self.stop(
+                EndReason::Hung,
+                &format!("Webots gave no sign of life for {} seconds", silence.as_secs()),
+            );
         } else if silence > hangs_after && !self.hanging {
             self.hanging = true;
             self.log(Level::Warn, &format!("no sign of life for {} s", silence.as_secs()));
@@ -184,7 +205,14 @@ impl Webots {
         if self.stopped_for.is_some() {
             return;
         }
-        self.log(if kind == EndReason::Limit { Level::Warn } else { Level::Info }, &format!("ending: {why}"));
+        self.log(
+            if kind == EndReason::Limit {
+                Level::Warn
+            } else {
+                Level::Info
+            },
+            &format!("ending: {why}"),
+        );
         self.stopped_for = Some((kind, why.to_owned()));
         self.spec.slot.lease.update(|one| one.stage = Stage::Stopping);
         if kind == EndReason::Limit {
@@ -223,7 +251,10 @@ impl Webots {
 
     /// Logs an event with the port, and records it without: a client that has only a token must not learn the port.
     fn log(&self, level: Level, event: &str) {
-        self.spec.slot.lease.log(level, &format!("port {}: {event}", self.spec.slot.port), event);
+        self.spec
+            .slot
+            .lease
+            .log(level, &format!("port {}: {event}", self.spec.slot.port), event);
     }
 }
 
@@ -231,7 +262,11 @@ impl Drop for Webots {
     /// Notifies the session of the end, even after a panic.
     fn drop(&mut self) {
         let why = "The server has lost this simulation".to_owned();
-        let exit = self.exit.take().unwrap_or(WebotsExit { clean: false, own: true, why });
+        let exit = self.exit.take().unwrap_or(WebotsExit {
+            clean: false,
+            own: true,
+            why,
+        });
         self.send(WebotsEvent::Exited(exit));
     }
 }
