@@ -147,9 +147,9 @@ impl fmt::Display for Table {
             }
             for (column, (cell, width)) in row.iter().zip(&widths).enumerate() {
                 if column == 0 {
-                    write!(out, "| {cell:<width$} |")?
+                    write!(out, "| {cell:<width$} |")?;
                 } else {
-                    write!(out, " {cell:>width$} |")?
+                    write!(out, " {cell:>width$} |")?;
                 }
             }
             if number == 0 {

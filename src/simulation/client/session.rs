@@ -183,9 +183,9 @@ impl Session {
     fn exited(&mut self, WebotsExit { clean, own, why }: &WebotsExit, ctx: &mut Context<Self>) {
         if *own {
             return if self.url.is_some() {
-                self.refer(why, ctx)
+                self.refer(why, ctx);
             } else {
-                self.fail_own(why, ctx)
+                self.fail_own(why, ctx);
             };
         }
         let words = if *clean {

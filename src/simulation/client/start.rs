@@ -53,9 +53,9 @@ impl Session {
             Err(why) => {
                 self.count("refused");
                 return if self.server.takes_nobody() {
-                    self.refer(&why, ctx)
+                    self.refer(&why, ctx);
                 } else {
-                    self.give_up(&why, ctx)
+                    self.give_up(&why, ctx);
                 };
             }
         };

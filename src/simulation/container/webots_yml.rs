@@ -314,9 +314,9 @@ mod tests {
             );
             assert_eq!(found.project_type, None);
             if file.is_dir() {
-                std::fs::remove_dir(&file).unwrap()
+                std::fs::remove_dir(&file).unwrap();
             } else {
-                std::fs::remove_file(&file).unwrap()
+                std::fs::remove_file(&file).unwrap();
             }
         };
         nix::unistd::mkfifo(&file, nix::sys::stat::Mode::S_IRWXU).unwrap();

@@ -191,7 +191,7 @@ mod tests {
             monitor.publish(Machine {
                 cpu,
                 ..Machine::default()
-            })
+            });
         };
         let table = [
             (10.0, 10.0),
