@@ -95,8 +95,9 @@ fn yardstick() -> f64 {
     std::thread::scope(|scope| {
         for part in servers.chunks_mut((CLIENTS / 2).div_ceil(cores)) {
             scope.spawn(|| {
-                part.iter_mut()
-                    .for_each(|one| one.write_all(&[TEXT[0], TEXT[1], b'1']).expect("sent"));
+                for one in part.iter_mut() {
+                    one.write_all(&[TEXT[0], TEXT[1], b'1']).expect("sent");
+                }
             });
         }
     });
