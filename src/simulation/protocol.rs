@@ -17,6 +17,7 @@
 //! | `loading: TEXT` | progress |
 //! | `loading: Error: TEXT` | why the simulation failed; the connection is closed, except after `reset controller` |
 //! | `shutdownTimeout: SECONDS` | Webots was launched, and will be ended after this many seconds |
+//! | `kind: w3d` or `kind: x3d` | the 3D scene that this Webots streams: the message with which a viewer requests it |
 //! | `webots:URL` | Webots is ready there |
 //! | `absence: SECONDS` | how long the simulation waits for its client once the connection is broken |
 //! | `resume: TOKEN` | the token to resume the simulation with |
@@ -76,6 +77,15 @@ pub enum Mode {
     W3d,
     /// A video.
     Mjpeg,
+}
+
+/// The 3D scene that a Webots streams. It does not answer a viewer that requests the other.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum SceneKind {
+    /// Until R2023b.
+    X3d,
+    /// Since R2025a.
+    W3d,
 }
 
 /// Why a message is invalid. The message is for the client.
@@ -204,6 +214,14 @@ pub fn ended(why: Option<&str>) -> String {
 /// Why a connection is closed: another one has used its token.
 pub fn taken_over() -> String {
     error("this simulation was taken over elsewhere")
+}
+
+/// The scene that viewers request from this Webots.
+pub fn kind(kind: SceneKind) -> &'static str {
+    match kind {
+        SceneKind::X3d => "kind: x3d",
+        SceneKind::W3d => "kind: w3d",
+    }
 }
 
 /// The URL of Webots, which is ready.

@@ -1,7 +1,7 @@
 //! Requests of clients and pages, and their answers.
 
 use super::scene::stages;
-use crate::support::{Client, arm, arm_at, demo_server, http, instances_below, until, world};
+use crate::support::{Client, WORLD, Webots, arm, arm_at, demo_server, http, instances_below, server_of, until, world};
 
 #[actix_rt::test]
 async fn a_message_that_is_none_is_answered_in_words() {
@@ -177,4 +177,33 @@ async fn pages_tell_what_they_should() {
     assert!(status["machine"]["memory"].is_number() && status["host"]["threads"].as_u64() > Some(0));
     let page = server.monitor().await;
     assert!(page.contains("github.com/lab/arm") && page.contains("idle"), "{page}");
+}
+
+#[actix_rt::test]
+async fn a_client_receives_the_kind_of_the_scene_right_before_its_url() {
+    let webots = Webots::launcher();
+    let resources = webots.path().with_file_name("resources");
+    let server = server_of(webots, 1).set("timing.heartbeat", 0.2).start().await;
+    let old = WORLD.replace("R2025a", "R2023b");
+    server.forge().commit("lab/arm", "old", &[("worlds/a.wbt", &old)]);
+    // An installed Webots opens worlds of other releases too.
+    for (installed, reference, kind) in [
+        (None, "main", "kind: w3d"),
+        (None, "old", "kind: x3d"),
+        (Some("R2025a\n"), "old", "kind: w3d"),
+        (Some("R2022b revision 1\n"), "main", "kind: x3d"),
+    ] {
+        if let Some(release) = installed {
+            std::fs::create_dir_all(&resources).unwrap();
+            std::fs::write(resources.join("version.txt"), release).unwrap();
+        }
+        let mut client = Client::start(&server, &arm_at(reference)).await;
+        client.until("webots:").await;
+        let [.., before, _] = &client.heard[..] else {
+            panic!("{:?}", client.heard)
+        };
+        assert_eq!(before, kind, "{installed:?} {reference}");
+        client.leave().await;
+        until("it is gone", async || stages(&server).await.is_empty()).await;
+    }
 }

@@ -51,12 +51,10 @@ async fn who_comes_back_finds_the_simulation_as_it_runs_at_each_level() {
             heard[0],
             format!("session: {}", server.simulations().await[0]["id"].as_str().unwrap())
         );
-        assert_eq!(
-            heard[2..4],
-            [&format!("webots:ws://localhost:{}", server.port + 1), "absence: 60"]
-        );
+        let url = format!("webots:ws://localhost:{}", server.port + 1);
+        assert_eq!(heard[2..5], ["kind: w3d", &url, "absence: 60"]);
         let rest: u64 = heard[1]["shutdownTimeout: ".len()..].parse().unwrap();
-        assert!((7000..=7200).contains(&rest) && heard.len() == 5, "{heard:?}");
+        assert!((7000..=7200).contains(&rest) && heard.len() == 6, "{heard:?}");
         assert_ne!(first, second);
         let mut viewer = Client::connect(&stream).await;
         viewer.send("x3d;broadcast").await;

@@ -54,9 +54,12 @@ impl Session {
         }
     }
 
-    /// Sends the client the URL of Webots and, if the session is resumable, a token to return with.
+    /// Sends the client the kind of the scene, the URL of Webots and, if the session is resumable, a token to return with.
     pub(super) fn offer(&mut self, ctx: &mut Context<Self>) {
         let Some(url) = &self.url else { return };
+        if let Some(kind) = self.kind {
+            self.text(protocol::kind(kind).to_owned());
+        }
         self.text(protocol::webots(url));
         if self.resumable {
             let register = || self.server.sessions.register(ctx.address().recipient());

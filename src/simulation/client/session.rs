@@ -17,7 +17,7 @@ use crate::shared::run::closing;
 use crate::simulation::checkout::Project;
 use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::ends::{EndReason, Taken};
-use crate::simulation::protocol::{self, Mode};
+use crate::simulation::protocol::{self, Mode, SceneKind};
 use crate::simulation::sessions::{ClientAction, Connection, ToClient, Token};
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::slots::{Slot, SlotEvent, SlotLease};
@@ -39,6 +39,8 @@ pub struct Session {
     pub(super) project: Weak<Project>,
     /// How it is shown.
     pub(super) mode: Mode,
+    /// The 3D scene that its Webots streams, once that is known; `None` for a video.
+    pub(super) kind: Option<SceneKind>,
     /// Whether its client may resume it.
     pub(super) resumable: bool,
     /// The last token that the client got; `None` before it can return.
@@ -103,6 +105,7 @@ impl Session {
                 state: State::Over,
                 project: Weak::new(),
                 mode: request.mode.unwrap_or_default(),
+                kind: None,
                 token: None,
                 launched: None,
                 texts: Vec::new(),

@@ -12,10 +12,11 @@ use crate::simulation::checkout::Project;
 use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::ends::EndReason;
 use crate::simulation::machine::sensors::Gpu;
+use crate::simulation::protocol::{self, Mode, SceneKind};
+use crate::simulation::readiness;
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::slots::{Slot, SlotLease};
-use crate::simulation::webots::{LaunchSpec, Webots, WebotsEvent};
-use crate::simulation::{protocol, readiness};
+use crate::simulation::webots::{LaunchSpec, Release, Webots, WebotsEvent};
 
 impl Session {
     /// Counts a request for a simulation, for `/metrics`.
@@ -113,6 +114,10 @@ impl Session {
         );
         let version = project.world.version.clone();
         slot.lease.update(|one| one.version = Some(version));
+        if self.mode != Mode::Mjpeg {
+            let release = Release::of_simulation(&program, &project.world.version);
+            self.kind = Some(SceneKind::of(release));
+        }
         self.text(protocol::loading("webots is starting"));
         let gpu = self.take_gpu(&slot.lease);
         let project = Arc::new(project);

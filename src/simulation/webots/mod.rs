@@ -5,9 +5,11 @@ mod idleness;
 mod launch_spec;
 mod launched;
 mod output;
+mod release;
 mod webots;
 
 pub use event::{WebotsEvent, WebotsExit};
 pub use idleness::Keep;
 pub use launch_spec::LaunchSpec;
+pub use release::Release;
 pub use webots::{Stop, Webots};
