@@ -2,6 +2,7 @@
 
 use super::load::Load;
 use super::project_url::ProjectUrl;
+use super::reason::{Failure, Reason};
 use super::url_prefix::UrlPrefix;
 
 /// The admission rules of a server.
@@ -43,6 +44,17 @@ pub enum AdmissionError<'world> {
         /// Percent.
         threshold: f64,
     },
+}
+
+impl From<AdmissionError<'_>> for Failure {
+    fn from(error: AdmissionError<'_>) -> Self {
+        let reason = match error {
+            AdmissionError::Blocked(_) => Reason::RepositoryBlocked,
+            AdmissionError::NotAllowed(_) | AdmissionError::NotShared(_) => Reason::RepositoryNotAllowed,
+            AdmissionError::Busy { .. } => Reason::NoIdleTime,
+        };
+        Self::new(reason, error.to_string())
+    }
 }
 
 impl<Prefixes: AsRef<[UrlPrefix]>> AdmissionRules<Prefixes> {

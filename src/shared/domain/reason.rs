@@ -37,35 +37,40 @@ pub enum Retry {
 
 /// Defines the reasons, and derives everything from this one table.
 macro_rules! reasons {
-    ($($(#[$doc:meta])+ $name:ident = $code:literal, $blame:ident, $retry:ident;)+) => {
+    ($(
+        $(#[$group_doc:meta])+
+        $group:ident { $($(#[$doc:meta])+ $name:ident = $code:literal, $blame:ident, $retry:ident;)+ }
+    )+) => {
         /// Why a request was refused, a start has failed, or a simulation has ended.
         #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
         pub enum Reason {
-            $($(#[$doc])+ $name,)+
+            $($($(#[$doc])+ $name,)+)+
         }
 
         impl Reason {
+            $($(#[$group_doc])+ pub const $group: &[Self] = &[$(Self::$name,)+];)+
+
             /// All reasons.
-            pub const ALL: &[Self] = &[$(Self::$name,)+];
+            pub const ALL: &[Self] = &[$($(Self::$name,)+)+];
 
             /// Its code, which stays the same in all later versions.
             pub fn code(self) -> &'static str {
                 match self {
-                    $(Self::$name => $code,)+
+                    $($(Self::$name => $code,)+)+
                 }
             }
 
             /// Who is to blame.
             pub fn blame(self) -> Blame {
                 match self {
-                    $(Self::$name => Blame::$blame,)+
+                    $($(Self::$name => Blame::$blame,)+)+
                 }
             }
 
             /// Whether the same request may succeed.
             pub fn retry(self) -> Retry {
                 match self {
-                    $(Self::$name => Retry::$retry,)+
+                    $($(Self::$name => Retry::$retry,)+)+
                 }
             }
         }
@@ -73,97 +78,101 @@ macro_rules! reasons {
 }
 
 reasons! {
-    // A request is refused.
-    /// A message that is no request of the protocol, or has wrong values.
-    InvalidRequest = "invalid-request", User, No;
-    /// Too many requests of one address or on one connection.
-    TooManyRequests = "too-many-requests", User, Later;
-    /// The URL of the world has not the form that it must have.
-    InvalidWorld = "invalid-world", User, No;
-    /// The repository is not one of those whose worlds may run.
-    RepositoryNotAllowed = "repository-not-allowed", User, No;
-    /// The repository is one of those whose worlds may not run.
-    RepositoryBlocked = "repository-blocked", User, No;
-    /// Worlds of other repositories run only while the load is low (`shareIdleTime`), and it is not.
-    NoIdleTime = "no-idle-time", Fleet, Later;
-    /// No simulation server can take a client.
-    NoServerAvailable = "no-server-available", Fleet, Later;
-    /// All slots of this server are taken, and as many clients wait as may.
-    QueueFull = "queue-full", Fleet, Later;
-    /// The client's address or user has as many slots and waits for as many as it may.
-    ShareUsed = "share-used", User, Later;
-    /// The server takes no new clients, because it is about to end.
-    Draining = "draining", Server, Elsewhere;
-    /// The server can start no simulation: Webots, its display, its disk or its Docker is missing or fails.
-    NotReady = "not-ready", Server, Elsewhere;
-    /// Nothing can be reset: no simulation runs, or the controller's file does not exist.
-    NothingToReset = "nothing-to-reset", User, No;
-
-    // A start fails.
-    /// The repository does not exist, or is not public.
-    RepositoryNotFound = "repository-not-found", User, No;
-    /// The repository was renamed or moved.
-    RepositoryMoved = "repository-moved", User, No;
-    /// The repository has no such branch, tag or commit.
-    CommitNotFound = "commit-not-found", User, No;
-    /// The commit has no such world, or the world can't be used.
-    WorldNotFound = "world-not-found", User, No;
-    /// The project has more bytes or files than it may (`projectSize`).
-    ProjectTooLarge = "project-too-large", Project, No;
-    /// The checkout has taken longer than it may (`timing.checkout`).
-    CheckoutTimeout = "checkout-timeout", Project, Later;
-    /// The Git host does not answer, or answers with an error.
-    RemoteFailed = "remote-failed", Project, Later;
-    /// The project's `webots.yml` or another of its files can't be used.
-    InvalidProject = "invalid-project", Project, No;
-    /// The image of the project could not be built.
-    BuildFailed = "build-failed", Project, No;
-    /// The build of the project's image has taken longer than it may (`timing.build`).
-    BuildTimeout = "build-timeout", Project, No;
-    /// The image of the project is larger than it may be, or its build has filled the disk.
-    ImageTooLarge = "image-too-large", Project, No;
-    /// Webots has listened, and has ended before its world was ready.
-    LoadFailed = "load-failed", Project, No;
-    /// The world was not ready in time (`timing.launch`).
-    LoadTimeout = "load-timeout", Project, Here;
-    /// Webots, or a program that starts it, could not be started, or has ended before it listened.
-    LaunchFailed = "launch-failed", Server, Elsewhere;
-    /// The disk of the server is full.
-    DiskFull = "disk-full", Server, Elsewhere;
-    /// The Docker of the server does not answer, or has stopped.
-    DockerUnavailable = "docker-unavailable", Server, Elsewhere;
-    /// An error of the server, which its log has.
-    ServerFault = "server-fault", Server, Elsewhere;
-
-    // A simulation ends.
-    /// Its client has left.
-    Left = "left", User, Here;
-    /// Its client was away for too long (`timing.absence`), or never opened its stream (`timing.arrival`).
-    Away = "away", User, Here;
-    /// Another connection of its client has taken it over.
-    TakenOver = "taken-over", User, No;
-    /// Webots has ended by itself, without an error.
-    Finished = "finished", Project, Here;
-    /// It has reached its time limit (`timeout`).
-    TimeLimit = "time-limit", User, Here;
-    /// It was paused for too long (`idleTimeout`).
-    Idle = "idle", User, Here;
-    /// An administrator has stopped it.
-    StoppedByAdministrator = "stopped-by-administrator", User, No;
-    /// The server was stopped.
-    ServerStopped = "server-stopped", Server, Elsewhere;
-    /// Webots was ready, and has ended with an error.
-    Crashed = "crashed", Project, Here;
-    /// Webots has given no sign of life for too long (`hangLimit`).
-    Hung = "hung", Project, Here;
-    /// It has taken more memory than it may (`limits.memory`).
-    MemoryLimit = "memory-limit", Project, Here;
-    /// It has written more than it may (`limits.disk`), or has grown most when the disk was full (`diskReserve`).
-    DiskLimit = "disk-limit", Project, Here;
-    /// The server has lost it by an error of its own.
-    Lost = "lost", Server, Here;
-    /// It has ended before its client came back; how is not known any more.
-    Ended = "ended", User, Here;
+    /// The reasons for which a request is refused.
+    REFUSALS {
+        /// A message that is no request of the protocol, or has wrong values.
+        InvalidRequest = "invalid-request", User, No;
+        /// Too many requests of one address or on one connection.
+        TooManyRequests = "too-many-requests", User, Later;
+        /// The URL of the world has not the form that it must have.
+        InvalidWorld = "invalid-world", User, No;
+        /// The repository is not one of those whose worlds may run.
+        RepositoryNotAllowed = "repository-not-allowed", User, No;
+        /// The repository is one of those whose worlds may not run.
+        RepositoryBlocked = "repository-blocked", User, No;
+        /// Worlds of other repositories run only while the load is low (`shareIdleTime`), and it is not.
+        NoIdleTime = "no-idle-time", Fleet, Later;
+        /// No simulation server can take a client.
+        NoServerAvailable = "no-server-available", Fleet, Later;
+        /// All slots of this server are taken, and as many clients wait as may.
+        QueueFull = "queue-full", Fleet, Later;
+        /// The client's address or user has as many slots and waits for as many as it may.
+        ShareUsed = "share-used", User, Later;
+        /// The server takes no new clients, because it is about to end.
+        Draining = "draining", Server, Elsewhere;
+        /// The server can start no simulation: Webots, its display, its disk or its Docker is missing or fails.
+        NotReady = "not-ready", Server, Elsewhere;
+        /// Nothing can be reset: no simulation runs, or the controller's file does not exist.
+        NothingToReset = "nothing-to-reset", User, No;
+    }
+    /// The reasons for which a start fails.
+    FAILED_STARTS {
+        /// The repository does not exist, or is not public.
+        RepositoryNotFound = "repository-not-found", User, No;
+        /// The repository was renamed or moved.
+        RepositoryMoved = "repository-moved", User, No;
+        /// The repository has no such branch, tag or commit.
+        CommitNotFound = "commit-not-found", User, No;
+        /// The commit has no such world, or the world can't be used.
+        WorldNotFound = "world-not-found", User, No;
+        /// The project has more bytes or files than it may (`projectSize`).
+        ProjectTooLarge = "project-too-large", Project, No;
+        /// The checkout has taken longer than it may (`timing.checkout`).
+        CheckoutTimeout = "checkout-timeout", Project, Later;
+        /// The Git host does not answer, or answers with an error.
+        RemoteFailed = "remote-failed", Project, Later;
+        /// The project's `webots.yml` or another of its files can't be used.
+        InvalidProject = "invalid-project", Project, No;
+        /// The image of the project could not be built.
+        BuildFailed = "build-failed", Project, No;
+        /// The build of the project's image has taken longer than it may (`timing.build`).
+        BuildTimeout = "build-timeout", Project, No;
+        /// The image of the project is larger than it may be, or its build has filled the disk.
+        ImageTooLarge = "image-too-large", Project, No;
+        /// Webots has listened, and has ended before its world was ready.
+        LoadFailed = "load-failed", Project, No;
+        /// The world was not ready in time (`timing.launch`).
+        LoadTimeout = "load-timeout", Project, Here;
+        /// Webots, or a program that starts it, could not be started, or has ended before it listened.
+        LaunchFailed = "launch-failed", Server, Elsewhere;
+        /// The disk of the server is full.
+        DiskFull = "disk-full", Server, Elsewhere;
+        /// The Docker of the server does not answer, or has stopped.
+        DockerUnavailable = "docker-unavailable", Server, Elsewhere;
+        /// An error of the server, which its log has.
+        ServerFault = "server-fault", Server, Elsewhere;
+    }
+    /// The reasons for which a simulation ends.
+    ENDS {
+        /// Its client has left.
+        Left = "left", User, Here;
+        /// Its client was away for too long (`timing.absence`), or never opened its stream (`timing.arrival`).
+        Away = "away", User, Here;
+        /// Another connection of its client has taken it over.
+        TakenOver = "taken-over", User, No;
+        /// Webots has ended by itself, without an error.
+        Finished = "finished", Project, Here;
+        /// It has reached its time limit (`timeout`).
+        TimeLimit = "time-limit", User, Here;
+        /// It was paused for too long (`idleTimeout`).
+        Idle = "idle", User, Here;
+        /// An administrator has stopped it.
+        StoppedByAdministrator = "stopped-by-administrator", User, No;
+        /// The server was stopped.
+        ServerStopped = "server-stopped", Server, Elsewhere;
+        /// Webots was ready, and has ended with an error.
+        Crashed = "crashed", Project, Here;
+        /// Webots has given no sign of life for too long (`hangLimit`).
+        Hung = "hung", Project, Here;
+        /// It has taken more memory than it may (`limits.memory`).
+        MemoryLimit = "memory-limit", Project, Here;
+        /// It has written more than it may (`limits.disk`), or has grown most when the disk was full (`diskReserve`).
+        DiskLimit = "disk-limit", Project, Here;
+        /// The server has lost it by an error of its own.
+        Lost = "lost", Server, Here;
+        /// It has ended before its client came back; how is not known any more.
+        Ended = "ended", User, Here;
+    }
 }
 
 impl fmt::Display for Reason {
