@@ -5,19 +5,25 @@ import tempfile
 import urllib.parse
 
 from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import sync_playwright
-
 from fleet import SOON
+from playwright.sync_api import sync_playwright
 
 # Debian's headless build of Chromium takes half of the processor time.
 SHELL = "/usr/bin/chromium-headless-shell"
 CHROMIUM = os.environ.get("CHROMIUM") or (SHELL if os.path.exists(SHELL) else "/usr/bin/chromium")
-# The browser itself must not call home either. It draws scenes with software rendering, and pages without, which would take
-# twice as much processor time.
+# The browser itself must not call home either. It draws scenes with software rendering, and pages without, which would
+# take twice as much processor time.
 SWITCHES = [
-    "--no-sandbox", "--disable-background-networking", "--disable-component-update", "--disable-sync", "--no-first-run",
-    "--disable-features=Translate,OptimizationHints,MediaRouter", "--use-gl=angle", "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader", "--disable-gpu-compositing",
+    "--no-sandbox",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--no-first-run",
+    "--disable-features=Translate,OptimizationHints,MediaRouter",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-gpu-compositing",
 ]
 # A warning about its own speed is not an error of the page.
 OWN_SPEED = "GL Driver Message (OpenGL, Performance"
@@ -40,7 +46,8 @@ class Browser:
 
     def page(self, scheme="light", width=1280, height=900, javascript=True, **options):
         context = self.chromium.new_context(
-            color_scheme=scheme, viewport={"width": width, "height": height}, java_script_enabled=javascript, **options)
+            color_scheme=scheme, viewport={"width": width, "height": height}, java_script_enabled=javascript, **options
+        )
         context.set_default_timeout(1000 * SOON)
         return Page(context)
 

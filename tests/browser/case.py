@@ -3,10 +3,9 @@
 import sys
 import unittest
 
-from playwright.sync_api import expect
-
 from browser import Browser
 from fleet import SOON, Fleet, until
+from playwright.sync_api import expect
 
 expect.set_options(timeout=1000 * SOON)
 

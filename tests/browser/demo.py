@@ -38,8 +38,11 @@ class Demo:
         self.servers = 1
         self.session, self.simulation = f"localhost:{port}", f"localhost:{port + 1}"
         # Other load on this machine must not make the servers full.
-        self.configure("session", "demo", {
-            "port": port, "simulationServers": [self.simulation], "loadThreshold": 1000, **(session or {})})
+        self.configure(
+            "session",
+            "demo",
+            {"port": port, "simulationServers": [self.simulation], "loadThreshold": 1000, **(session or {})},
+        )
         self.configure("simulation", "demo", {"port": port + 1, **(simulation or {})})
         if user:
             subprocess.run(["chown", "--recursive", f"{user}:{user}", self.temporary], check=True)
@@ -68,8 +71,14 @@ class Demo:
     def server_sh(self, *arguments):
         """Runs server.sh, which must succeed; returns its output."""
         done = subprocess.run(
-            [*self.become, self.folder / "server.sh", *arguments], env={**os.environ, "FLEET_BIN": str(BIN)}, timeout=LIMIT,
-            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+            [*self.become, self.folder / "server.sh", *arguments],
+            check=False,
+            env={**os.environ, "FLEET_BIN": str(BIN)},
+            timeout=LIMIT,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+        )
         if done.returncode != 0:
             raise AssertionError(f"server.sh {arguments}: {done.returncode}\n{done.stdout}{done.stderr}{self.logs()}")
         return done.stdout

@@ -2,15 +2,13 @@
 
 import contextlib
 import http.server
-import pathlib
 import re
 import shutil
 import subprocess
 import threading
 
 import trustme
-
-from fleet import BIN, ROOT, Fleet, free_ports, until
+from fleet import ROOT, Fleet, free_ports, until
 
 # On Debian, web servers are in /usr/sbin, which only root has in its PATH.
 NGINX = shutil.which("nginx") or "/usr/sbin/nginx"
@@ -46,8 +44,10 @@ def adapted(text, **changes):
 
 
 class OneDoor(Fleet):
-    """A fleet of two machines, 127.0.0.2 and 127.0.0.3, behind one https door where visitors sign in. Streams are relayed, so
-    that only the simulation servers' own ports are forwarded."""
+    """A fleet of two machines, 127.0.0.2 and 127.0.0.3, behind one https door where visitors sign in.
+
+    Streams are relayed, so that only the simulation servers' own ports are forwarded.
+    """
 
     def __init__(self, places, session=None, simulation=None):
         self.exits = contextlib.ExitStack()
@@ -63,7 +63,14 @@ class OneDoor(Fleet):
         public = {"publicUrl": f"wss://{self.host}/{{host}}/{{port}}"}
         super().__init__(
             {**public, "port": inside, **(session or {})},
-            {**public, "maxConnections": places, "streaming": "relay", "userHeader": "X-Forwarded-User", **(simulation or {})})
+            {
+                **public,
+                "maxConnections": places,
+                "streaming": "relay",
+                "userHeader": "X-Forwarded-User",
+                **(simulation or {}),
+            },
+        )
         try:
             self._open(plain, sign_in.server_port)
         except BaseException:
@@ -82,9 +89,12 @@ class OneDoor(Fleet):
         certificate.cert_chain_pems[0].write_to_path(folder / "chain.pem")
         certificate.private_key_pem.write_to_path(folder / "key.pem")
         users = adapted(
-            (ROOT / "deploy/nginx-users.conf").read_text(), sign_in=("127.0.0.1:4180", f"127.0.0.1:{sign_in}"),
+            (ROOT / "deploy/nginx-users.conf").read_text(),
+            sign_in=("127.0.0.1:4180", f"127.0.0.1:{sign_in}"),
             # The session server connects to simulation servers directly, and visitors come from this machine.
-            unsigned=("allow 127.0.0.1;", ""), ports=(r"2000\|3000", "|".join(str(port) for _, port in self.hosts)))
+            unsigned=("allow 127.0.0.1;", ""),
+            ports=(r"2000\|3000", "|".join(str(port) for _, port in self.hosts)),
+        )
         (folder / "users.conf").write_text(users)
         servers = "|".join(str(port) for _, port in self.hosts)
         site = adapted(
@@ -100,17 +110,28 @@ class OneDoor(Fleet):
             # As the comment at the top of the file says for relayed streams, removes the location of Webots' own ports.
             streams=(r'  # Only for simulation servers with "streaming": "direct".*?\n  }\n', ""),
             servers=(r"\(\?<fleet_port>2000\)", f"(?<fleet_port>{servers})"),
-            users=("  proxy_set_header X-Forwarded-User \"\";\n",
-                   f"  proxy_set_header X-Forwarded-User \"\";\n  include {folder}/users.conf;\n"),
-            log=("/var/log/nginx/access.log", f"{folder}/access.log"), errors=("/var/log/nginx/error.log", f"{folder}/error.log"))
+            users=(
+                '  proxy_set_header X-Forwarded-User "";\n',
+                f'  proxy_set_header X-Forwarded-User "";\n  include {folder}/users.conf;\n',
+            ),
+            log=("/var/log/nginx/access.log", f"{folder}/access.log"),
+            errors=("/var/log/nginx/error.log", f"{folder}/error.log"),
+        )
         (folder / "site.conf").write_text(site)
-        temporary = "".join(f"{name}_temp_path {folder}/{name};\n" for name in ("client_body", "proxy", "fastcgi", "uwsgi", "scgi"))
+        temporary = "".join(
+            f"{name}_temp_path {folder}/{name};\n" for name in ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
+        )
         (folder / "nginx.conf").write_text(
             f"user root;\ndaemon off;\nworker_processes 1;\npid {folder}/pid;\nerror_log {folder}/error.log warn;\n"
-            f"events {{ worker_connections 1024; }}\nhttp {{\n{temporary}include {folder}/site.conf;\n}}\n")
+            f"events {{ worker_connections 1024; }}\nhttp {{\n{temporary}include {folder}/site.conf;\n}}\n"
+        )
         with (folder / "output.txt").open("w") as output:
             nginx = subprocess.Popen(
-                [NGINX, "-e", folder / "error.log", "-c", folder / "nginx.conf"], stdin=subprocess.DEVNULL, stdout=output, stderr=output)
+                [NGINX, "-e", folder / "error.log", "-c", folder / "nginx.conf"],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+            )
         self.exits.callback(nginx.wait)
         self.exits.callback(nginx.terminate)
         until("nginx runs", lambda: (folder / "pid").exists() or nginx.poll() is not None)

@@ -61,8 +61,13 @@ class Server:
         folder.mkdir(parents=True, exist_ok=True)
         self.file = folder / "config.json"
         self.config = {
-            "server": "127.0.0.1", "bind": "127.0.0.1", "ssl": False, "portRewrite": False, "debug": True,
-            "logDir": str(folder / "log"), **config,
+            "server": "127.0.0.1",
+            "bind": "127.0.0.1",
+            "ssl": False,
+            "portRewrite": False,
+            "debug": True,
+            "logDir": str(folder / "log"),
+            **config,
         }
         self.write()
         self.log = folder / "output.txt"
@@ -70,7 +75,8 @@ class Server:
         environment.pop("WEBOTS_HOME", None)
         with self.log.open("a") as log:
             self.process = subprocess.Popen(
-                [BIN / program, self.file], stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment)
+                [BIN / program, self.file], stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment
+            )
         until(f"{program} answers", self.answers)
 
     def write(self):
@@ -132,10 +138,13 @@ class Client:
 
     def __init__(self, server, address, message):
         self.socket = socket.create_connection(("127.0.0.1", server.port))
-        self.socket.sendall((
-            f"GET /client HTTP/1.1\r\nHost: {server.address}\r\nX-Forwarded-For: {address}\r\nUpgrade: websocket\r\n"
-            "Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
-        ).encode())
+        self.socket.sendall(
+            (
+                f"GET /client HTTP/1.1\r\nHost: {server.address}\r\nX-Forwarded-For: {address}\r\n"
+                "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+                "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
+            ).encode()
+        )
         if b" 101 " not in self.socket.recv(4096):
             raise AssertionError("it is no WebSocket")
         text = json.dumps(message).encode()
@@ -156,20 +165,31 @@ class Fleet:
         try:
             self.forge = self._forge()
             simulation = simulation or {}
-            self.simulation = self._simulation("one", {"title": "Demonstration", "description": (
-                "A simulation server that shows two small worlds."), **simulation})
+            self.simulation = self._simulation(
+                "one",
+                {
+                    "title": "Demonstration",
+                    "description": ("A simulation server that shows two small worlds."),
+                    **simulation,
+                },
+            )
             self.other = self._simulation("two", {"title": "The other one", **simulation})
-            self.session = self.start("session-server", "session", {
-                "port": free_ports(1),
-                "simulationServers": [self.simulation.address, self.other.address, *strangers],
-                # Other load on this machine must not make the servers full.
-                "loadRefresh": 0.2, "loadThreshold": 1000,
-                "examples": [
-                    {"title": "Playground", "url": WORLD.format("playground")},
-                    {"title": "Carousel", "url": WORLD.format("carousel")},
-                ],
-                **(session or {}),
-            })
+            self.session = self.start(
+                "session-server",
+                "session",
+                {
+                    "port": free_ports(1),
+                    "simulationServers": [self.simulation.address, self.other.address, *strangers],
+                    # Other load on this machine must not make the servers full.
+                    "loadRefresh": 0.2,
+                    "loadThreshold": 1000,
+                    "examples": [
+                        {"title": "Playground", "url": WORLD.format("playground")},
+                        {"title": "Carousel", "url": WORLD.format("carousel")},
+                    ],
+                    **(session or {}),
+                },
+            )
             until("a simulation server is available", lambda: self.session.status()["available"])
         except BaseException:
             self.close()
@@ -201,14 +221,20 @@ class Fleet:
     def _simulation(self, name, more):
         places = more.get("maxConnections", 4)
         port = more.get("port") or free_ports(places + 12)
-        return self.start("simulation-server", name, {
-            "port": port, "maxConnections": places, "webots": str(BIN / "demo-simulator"),
-            "environment": "DEMO_SIMULATOR_BIND",
-            "cacheDir": str(self.folder / name / "cache"),
-            "allowedRepositories": ["https://github.com/demo"],
-            "gitMirrors": {"https://github.com/": f"file:{self.forge}"},
-            **more,
-        })
+        return self.start(
+            "simulation-server",
+            name,
+            {
+                "port": port,
+                "maxConnections": places,
+                "webots": str(BIN / "demo-simulator"),
+                "environment": "DEMO_SIMULATOR_BIND",
+                "cacheDir": str(self.folder / name / "cache"),
+                "allowedRepositories": ["https://github.com/demo"],
+                "gitMirrors": {"https://github.com/": f"file:{self.forge}"},
+                **more,
+            },
+        )
 
     def start(self, program, name, config):
         """Starts a server, which is stopped with the fleet."""
@@ -222,7 +248,9 @@ class Fleet:
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def logs(self):
-        return "\n".join(f"--- {server.program} {server.address} ---\n{server.log.read_text()}" for server in self.servers)
+        return "\n".join(
+            f"--- {server.program} {server.address} ---\n{server.log.read_text()}" for server in self.servers
+        )
 
     def __enter__(self):
         return self

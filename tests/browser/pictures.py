@@ -1,7 +1,7 @@
 """Takes the screenshots of README.md and docs: pictures.py FOLDER [rehearsal | pages | class]
 
-`rehearsal` is the output of `rehearse`. `pages` show the demo at work: two simulation servers and one that is down, with
-clients that came and went while the charts filled. `class` shows twelve students, and a list of 200.
+`rehearsal` is the output of `rehearse`. `pages` show the demo at work: two simulation servers and one that is down,
+with clients that came and went while the charts filled. `class` shows twelve students, and a list of 200.
 """
 
 import base64
@@ -12,11 +12,10 @@ import subprocess
 import sys
 import urllib.request
 
-from playwright.sync_api import expect
-
 from browser import Browser
 from demo import Demo
 from fleet import BIN, SOON, until
+from playwright.sync_api import expect
 from students import NAMES, start_all
 
 # The time span of the charts, in seconds.
@@ -26,12 +25,13 @@ WIDTH = 1200
 HIGHEST = 720
 PASSWORD = "open sesame"
 PLAYGROUND = "https://github.com/webots-fleet/demo/blob/main/worlds/playground.wbt"
-REHEARSAL = [
-    "--world", PLAYGROUND,
-    "--clients", "30", "--over", "5s", "--stay", "20s", "--patience", "12s"]
+REHEARSAL = ["--world", PLAYGROUND, "--clients", "30", "--over", "5s", "--stay", "20s", "--patience", "12s"]
 TERMINAL = """
     <!doctype html><meta charset="utf-8">
-    <style>body { margin: 0; background: #16202a } pre { margin: 24px; color: #e8eef2; font: 15px/1.4 monospace }</style>
+    <style>
+    body { margin: 0; background: #16202a }
+    pre { margin: 24px; color: #e8eef2; font: 15px/1.4 monospace }
+    </style>
     <pre>%s</pre>"""
 
 
@@ -65,15 +65,26 @@ def shoot(page, folder, name, hosts, part=None, margin=16, whole=True):
     x, y, width, height = page.tab.evaluate("[0, scrollY, innerWidth, innerHeight]")
     if part:
         box = part.bounding_box()
-        x, y, width, height = box["x"] - margin, box["y"] - margin, box["width"] + 2 * margin, box["height"] + 2 * margin
+        x, y, width, height = (
+            box["x"] - margin,
+            box["y"] - margin,
+            box["width"] + 2 * margin,
+            box["height"] + 2 * margin,
+        )
         height = min(height, HIGHEST)
     elif whole:
         height = page.tab.evaluate("document.documentElement.scrollHeight")
     chromium = page.context.new_cdp_session(page.tab)
     # Playwright itself does not support WebP, which takes half the size of PNG.
-    taken = chromium.send("Page.captureScreenshot", {
-        "format": "webp", "quality": 90, "captureBeyondViewport": True,
-        "clip": {"x": x, "y": y, "width": width, "height": height, "scale": 1}})
+    taken = chromium.send(
+        "Page.captureScreenshot",
+        {
+            "format": "webp",
+            "quality": 90,
+            "captureBeyondViewport": True,
+            "clip": {"x": x, "y": y, "width": width, "height": height, "scale": 1},
+        },
+    )
     (folder / f"{name}.webp").write_bytes(base64.b64decode(taken["data"]))
     if page.complaints or page.hosts() != hosts:
         raise AssertionError(f"{name}: {page.complaints} {page.hosts()}")
@@ -82,7 +93,9 @@ def shoot(page, folder, name, hosts, part=None, margin=16, whole=True):
 def rehearsal(browser, demo, folder):
     """Takes a picture of the output of `rehearse` in a terminal."""
     command = ["rehearse", f"http://{demo.session}", *REHEARSAL]
-    done = subprocess.run([BIN / command[0], *command[1:]], stdout=subprocess.PIPE, timeout=10 * SOON, text=True, check=True)
+    done = subprocess.run(
+        [BIN / command[0], *command[1:]], stdout=subprocess.PIPE, timeout=10 * SOON, text=True, check=True
+    )
     page = browser.page(width=900, height=100)
     shown = " ".join(command).replace(" --world", " \\\n    --world").replace(" --clients", " \\\n    --clients")
     page.tab.set_content(TERMINAL % html.escape(f"$ {shown}\n{done.stdout}"))
@@ -166,12 +179,16 @@ def phone(browser, demo, folder, credentials, hosts):
     page = browser.page(width=390, height=844, http_credentials=credentials)
     page.tab.goto(f"http://{demo.simulation}/sign-in")
     row = page.tab.locator("#simulations tr").first
-    known = page.tab.locator("#simulations tr").evaluate_all("rows => rows.map((row) => [row.dataset.key, row.innerHTML])")
+    known = page.tab.locator("#simulations tr").evaluate_all(
+        "rows => rows.map((row) => [row.dataset.key, row.innerHTML])"
+    )
     many = []
     for number in range(200):
         key, html = known[number % len(known)]
         name = f"{key.rsplit('-', 1)[0]}-{number + 1}"
-        many.append({"key": name, "html": html.replace(key, name).replace(" at desk ", f" at desk {number // len(known) + 1}.")})
+        many.append(
+            {"key": name, "html": html.replace(key, name).replace(" at desk ", f" at desk {number // len(known) + 1}.")}
+        )
     event = "data: " + json.dumps({"tables": {"simulations": many}}) + "\n\n"
     page.tab.route("**/events", lambda route: route.fulfill(content_type="text/event-stream", body=event))
     page.tab.reload()

@@ -1,8 +1,37 @@
 """A class: its students, and one page that starts the simulations of all students who need no page of their own."""
 
 NAMES = [
-    "anna", "ben", "chloe", "dora", "emil", "fay", "gus", "hana", "ivan", "jane", "kofi", "lena", "milo", "nora", "omar", "pia", "quinn",
-    "rosa", "sami", "tess", "uma", "vera", "will", "xena", "yara", "zeno", "amir", "bela", "carl", "dana"]
+    "anna",
+    "ben",
+    "chloe",
+    "dora",
+    "emil",
+    "fay",
+    "gus",
+    "hana",
+    "ivan",
+    "jane",
+    "kofi",
+    "lena",
+    "milo",
+    "nora",
+    "omar",
+    "pia",
+    "quinn",
+    "rosa",
+    "sami",
+    "tess",
+    "uma",
+    "vera",
+    "will",
+    "xena",
+    "yara",
+    "zeno",
+    "amir",
+    "bela",
+    "carl",
+    "dana",
+]
 # Run in a page: requests a simulation server, starts a world there, and keeps the connection open.
 START = """
     async ([world, name]) => {
@@ -29,7 +58,10 @@ START = """
 
 
 def start_all(page, names, become, world):
-    """Starts a simulation for each of these names; `become` signs in as another user. Returns the URLs of the streams."""
+    """Starts a simulation for each of these names; `become` signs in as another user.
+
+    Returns the URLs of the streams.
+    """
     for name in names:
         become(name)
         page.tab.evaluate(START, [world, label(name)])

@@ -4,11 +4,10 @@ import json
 import unittest
 import urllib.parse
 
-from playwright.sync_api import expect
-
 from browser import Page
 from case import BrowserTest
 from fleet import until
+from playwright.sync_api import expect
 
 PASSWORD = "open sesame"
 LABEL = "Anna <img src=x onerror=\"document.title='evil'\">"
@@ -21,7 +20,8 @@ class Administrator(BrowserTest):
     def page_with_password(self, url, **options):
         context = self.browser.chromium.new_context(
             http_credentials={"username": "teacher", "password": PASSWORD},
-            viewport={"width": options.get("width", 1280), "height": options.get("height", 900)})
+            viewport={"width": options.get("width", 1280), "height": options.get("height", 900)},
+        )
         context.set_default_timeout(60_000)
         page = Page(context)
         self.addCleanup(page.close)
@@ -93,7 +93,8 @@ class Administrator(BrowserTest):
         teacher.tab.get_by_role("button", name="Announce").click()
         # Characters of markup are replaced, so that no page can interpret the text as markup.
         expect(viewer.tab.locator("#announcement")).to_have_text(
-            text.replace("<", "\u2039").replace(">", "\u203a"), timeout=2000)
+            text.replace("<", "\u2039").replace(">", "\u203a"), timeout=2000
+        )
         expect(stranger.tab.locator("#announcement")).to_contain_text(text, timeout=3000)
         for page in (viewer, stranger):
             self.assertEqual(page.tab.locator("#announcement b").count(), 0)
@@ -112,19 +113,32 @@ class Administrator(BrowserTest):
             window.line = document.querySelector('#charts polyline').getAttribute('points');
         }""")
         self.assertGreater(page.tab.evaluate("labels.filter(one => one.textContent === 'now').length"), 3)
-        until("another sample has come", lambda: page.tab.evaluate(
-            "document.querySelector('#charts polyline').getAttribute('points') !== line"))
-        self.assertTrue(page.tab.evaluate("labels.filter(one => one.textContent === 'now').every(one => one.isConnected)"))
+        until(
+            "another sample has come",
+            lambda: page.tab.evaluate("document.querySelector('#charts polyline').getAttribute('points') !== line"),
+        )
+        self.assertTrue(
+            page.tab.evaluate("labels.filter(one => one.textContent === 'now').every(one => one.isConnected)")
+        )
 
     def test_two_hundred_rows_can_be_filtered_and_sorted_on_a_phone(self):
         def row(number, state):
             name = f"student{number:03}.wbt"
-            return {"key": f"2026-{number}", "html": (
-                f'<th role="rowheader" scope="row" data-value="{name}"><a href="https://example.org">{name}</a><small>github.com/lab/arm</small></th>'
-                f'<td role="cell" data-label="State" data-value="{state}"><span class="state {state}">{state}</span></td>'
-                f'<td role="cell" data-label="Since" data-value="{number}">12:00</td><td role="cell" data-label="Time left" data-value="1">1 h</td>'
-                f'<td role="cell" data-label="CPU" data-value="{number}">{number} %</td><td role="cell" data-label="Memory" data-value="1">90 MiB</td>'
-                f'<td role="cell" data-label="Port" data-value="{number}">{number}</td><td role="cell" data-label="Output">Last lines</td>')}
+            link = f'<a href="https://example.org">{name}</a><small>github.com/lab/arm</small>'
+            cells = [
+                ("State", state, f'<span class="state {state}">{state}</span>'),
+                ("Since", number, "12:00"),
+                ("Time left", 1, "1 h"),
+                ("CPU", number, f"{number} %"),
+                ("Memory", 1, "90 MiB"),
+                ("Port", number, number),
+                ("Output", "", "Last lines"),
+            ]
+            head = f'<th role="rowheader" scope="row" data-value="{name}">{link}</th>'
+            rest = [
+                f'<td role="cell" data-label="{label}" data-value="{value}">{text}</td>' for label, value, text in cells
+            ]
+            return {"key": f"2026-{number}", "html": "".join([head, *rest])}
 
         more = []
 

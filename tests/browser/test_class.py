@@ -1,14 +1,13 @@
-"""A class of thirty on two machines behind one door: who is who, watching, stopping, announcing, and a prank that fails."""
+"""A class of thirty on two machines behind one door: names, watching, stopping, announcing, and a prank that fails."""
 
 import re
 import unittest
-
-from playwright.sync_api import expect
 
 from browser import Page
 from case import BrowserTest
 from door import COOKIE, OneDoor
 from fleet import SOON, WORLD, until
+from playwright.sync_api import expect
 from students import NAMES, label, start_all
 
 PASSWORD = "open sesame"
@@ -40,7 +39,9 @@ class AClass(BrowserTest):
 
     def visit(self, name, path, **options):
         """A page in a separate browser profile, signed in at the door under this name."""
-        context = self.browser.chromium.new_context(ignore_https_errors=True, viewport={"width": 1000, "height": 700}, **options)
+        context = self.browser.chromium.new_context(
+            ignore_https_errors=True, viewport={"width": 1000, "height": 700}, **options
+        )
         context.set_default_timeout(1000 * SOON)
         context.add_cookies([{"name": COOKIE, "value": name, "url": self.fleet.url("")}])
         page = Page(context)
@@ -91,7 +92,10 @@ class AClass(BrowserTest):
         # The other simulations are not affected.
         for machine in machines:
             machine.tab.get_by_label("Filter").fill("")
-        until("the others run on", lambda: sum(one.tab.locator("#simulations tr").count() for one in machines) == len(NAMES) - 1)
+        until(
+            "the others run on",
+            lambda: sum(one.tab.locator("#simulations tr").count() for one in machines) == len(NAMES) - 1,
+        )
         expect(students["ben"].tab.locator("#problem")).to_be_hidden()
         for page in [fleet, *machines, *students.values()]:
             self.keeps_to_the_rules(page)
@@ -144,7 +148,12 @@ class AClass(BrowserTest):
         server = next(one for one in (self.fleet.simulation, self.fleet.other) if f"/{one.config['server']}/" in base)
         elsewhere = next(url for url in streams if not url.startswith(base))
         ports = [base.replace(f"/{server.port}", f"/{port}") + "/" for port in range(server.port + 1, server.port + 17)]
-        tokens = [one["id"] for one in status["simulations"]] + [token[:-1], token.upper() + "0", "0" * len(token), elsewhere.rsplit("/", 1)[1]]
+        tokens = [one["id"] for one in status["simulations"]] + [
+            token[:-1],
+            token.upper() + "0",
+            "0" * len(token),
+            elsewhere.rsplit("/", 1)[1],
+        ]
         complaints = len(prankster.complaints)
         for url in ports + [f"{base}/stream/{one}/" for one in tokens]:
             self.assertFalse(prankster.tab.evaluate(PRANK, url), url)
@@ -176,7 +185,9 @@ class AClass(BrowserTest):
         dialog.get_by_label("Reason").fill("Please come to my desk")
         dialog.get_by_role("button", name="Stop it").click()
         expect(dialog).to_be_hidden()
-        expect(student.tab.locator("#problem")).to_contain_text("Your teacher has stopped this simulation: Please come to my desk")
+        expect(student.tab.locator("#problem")).to_contain_text(
+            "Your teacher has stopped this simulation: Please come to my desk"
+        )
         expect(machine.tab.locator("#ends tr").first).to_contain_text("anna@school.example")
 
 

@@ -4,10 +4,9 @@ import json
 import re
 import unittest
 
-from playwright.sync_api import expect
-
 from case import Running, seconds
-from fleet import ROOT, WORLD, Client, free_ports, until
+from fleet import ROOT, WORLD, free_ports, until
+from playwright.sync_api import expect
 
 
 class ComingBack(Running):
@@ -49,7 +48,9 @@ class ComingBack(Running):
         other = self.browser.page()
         self.addCleanup(other.close)
         # Like a tab that the browser has duplicated.
-        other.tab.add_init_script(f"sessionStorage.getItem('simulation') ?? sessionStorage.setItem('simulation', {json.dumps(kept)})")
+        other.tab.add_init_script(
+            f"sessionStorage.getItem('simulation') ?? sessionStorage.setItem('simulation', {json.dumps(kept)})"
+        )
         other.tab.goto(self.fleet.session.url("viewer"))
         self.goes_on(other, server, pid, 0)
         expect(page.tab.locator("#problem-text")).to_contain_text("taken over elsewhere")
@@ -128,7 +129,10 @@ class ComingBack(Running):
         until("it is told", lambda: "error" in heard())
         self.assertIsNone(tab.evaluate("sessionStorage.getItem('simulation')"))
         tab.evaluate(begin, [*arguments[:2], "https://github.com/stranger/worlds/blob/main/worlds/a.wbt"])
-        until("it is refused", lambda: tab.evaluate("window.heard.some(([kind, more]) => kind === 'error' && /accepts/.test(more))"))
+        until(
+            "it is refused",
+            lambda: tab.evaluate("window.heard.some(([kind, more]) => kind === 'error' && /accepts/.test(more))"),
+        )
 
 
 class Busy(Running):
@@ -137,8 +141,8 @@ class Busy(Running):
     simulation = {"maxConnections": 1, "waitingLine": 0}
 
     def test_who_finds_all_servers_busy_waits_and_starts_by_itself_or_stops_waiting(self):
-        first, one = self.running()
-        second, other = self.running()
+        first, _ = self.running()
+        second, _ = self.running()
         third = self.open(self.fleet.session.url("viewer"))
         expect(third.tab.locator("#light")).not_to_contain_text("Connecting")
         third.tab.get_by_role("button", name="Playground").click()

@@ -2,11 +2,10 @@
 
 import unittest
 
-from playwright.sync_api import expect
-
 from case import BrowserTest, picture
 from demo import Demo
 from fleet import until
+from playwright.sync_api import expect
 
 
 def clock(page):

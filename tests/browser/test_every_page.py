@@ -4,10 +4,9 @@ import itertools
 import unittest
 import urllib.request
 
-from playwright.sync_api import expect
-
 from case import BrowserTest
 from fleet import SOON, free_ports, until
+from playwright.sync_api import expect
 
 
 class EveryPage(BrowserTest):
@@ -91,7 +90,8 @@ class Crowded(BrowserTest):
     def test_a_fleet_of_no_servers_says_so_until_there_is_one(self):
         # Other load on this machine must not make the server full.
         empty = self.fleet.start(
-            "session-server", "empty", {"port": free_ports(1), "simulationServers": [], "loadThreshold": 1000})
+            "session-server", "empty", {"port": free_ports(1), "simulationServers": [], "loadThreshold": 1000}
+        )
         page = self.open(empty.url("monitor"))
         words = page.tab.get_by_text("None is known")
         expect(page.tab.locator("#live")).to_have_text("Live")

@@ -6,10 +6,9 @@ import signal
 import tempfile
 import unittest
 
-from playwright.sync_api import expect
-
 from case import BrowserTest
 from fleet import BIN, Fleet, until
+from playwright.sync_api import expect
 
 
 class LeavingServers(BrowserTest):
@@ -71,7 +70,7 @@ class Failing(LeavingServers):
         cls.addClassCleanup(shutil.rmtree, folder)
         cls.repaired = folder / "repaired"
         webots = folder / "webots"
-        webots.write_text(f"#!/bin/sh\n[ -e {cls.repaired} ] || exit 3\nexec \"{BIN / 'demo-simulator'}\" \"$@\"\n")
+        webots.write_text(f'#!/bin/sh\n[ -e {cls.repaired} ] || exit 3\nexec "{BIN / "demo-simulator"}" "$@"\n')
         webots.chmod(0o755)
         return Fleet(simulation={"webots": str(webots), "isolation": "none"})
 

@@ -6,14 +6,20 @@ import unittest
 import urllib.error
 import urllib.request
 
-from playwright.sync_api import expect
-
 from case import BrowserTest
 from fleet import SOON, Server
-
+from playwright.sync_api import expect
 
 COLUMNS = [
-    "Address", "State", "Load", "Effective load", "Instances", "Repositories", "Version", "Latency", "Since",
+    "Address",
+    "State",
+    "Load",
+    "Effective load",
+    "Instances",
+    "Repositories",
+    "Version",
+    "Latency",
+    "Since",
 ]
 
 
@@ -39,7 +45,8 @@ class Monitors(BrowserTest):
         self.fleet.other.kill()
         expect(row.locator(".state")).to_have_text("down")
         red, green, blue = page.tab.evaluate(
-            "state => getComputedStyle(state).color.match(/\\d+/g).map(Number)", row.locator(".state").element_handle())
+            "state => getComputedStyle(state).color.match(/\\d+/g).map(Number)", row.locator(".state").element_handle()
+        )
         self.assertTrue(red > 2 * green and red > 2 * blue, "it is red")
         expect(row.locator(".why")).to_contain_text("no connection")
         expect(page.tab.locator("#glance")).to_contain_text("1 down")
@@ -86,7 +93,10 @@ class Monitors(BrowserTest):
         page = self.open(self.fleet.simulation.url("monitor"))
         expect(page.tab.get_by_role("heading", name="Demonstration")).to_be_visible()
         expect(page.tab.get_by_text("A simulation server that shows two small worlds.")).to_be_visible()
-        facts = {one.locator("dt").inner_text(): one.locator("dd").inner_text() for one in page.tab.locator(".facts > div").all()}
+        facts = {
+            one.locator("dt").inner_text(): one.locator("dd").inner_text()
+            for one in page.tab.locator(".facts > div").all()
+        }
         host = self.fleet.simulation.status()["host"]
         self.assertEqual(facts["Host"], host["name"])
         self.assertEqual(facts["Operating system"], host["system"])
@@ -104,8 +114,12 @@ class Monitors(BrowserTest):
         expect(row.locator("th")).to_contain_text("playground.wbt")
         expect(row.locator("th")).to_contain_text("github.com/demo/worlds")
         for name, pattern in [
-            ("State", "idle"), ("Since", r"\d+:\d\d"), ("Time left", r"1 h 59 min"), ("CPU", r"\d+ %"),
-            ("Memory", r"\d+(\.\d)? MiB"), ("Port", str(server.status()["simulations"][0]["port"])),
+            ("State", "idle"),
+            ("Since", r"\d+:\d\d"),
+            ("Time left", r"1 h 59 min"),
+            ("CPU", r"\d+ %"),
+            ("Memory", r"\d+(\.\d)? MiB"),
+            ("Port", str(server.status()["simulations"][0]["port"])),
         ]:
             expect(cell(name)).to_have_text(re.compile(pattern))
         viewer.close()
@@ -113,8 +127,17 @@ class Monitors(BrowserTest):
     def test_charts_have_all_series_and_tell_values(self):
         page = self.open(self.fleet.simulation.url("monitor"))
         series = [
-            "Webots running", "Webots idle", "CPU load", "CPU memory", "GPU load compute", "GPU load memory",
-            "GPU memory", "Swap", "Disk", "Network sent", "Network received",
+            "Webots running",
+            "Webots idle",
+            "CPU load",
+            "CPU memory",
+            "GPU load compute",
+            "GPU load memory",
+            "GPU memory",
+            "Swap",
+            "Disk",
+            "Network sent",
+            "Network received",
         ]
         for name in series:
             expect(page.tab.get_by_label(name)).to_be_checked()

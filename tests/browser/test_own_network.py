@@ -5,11 +5,10 @@ import pathlib
 import shutil
 import unittest
 
-from playwright.sync_api import expect
-
 from case import BrowserTest, picture
 from demo import Demo
 from fleet import BIN, until
+from playwright.sync_api import expect
 from test_demo import clock
 
 NOBODY = 65534

@@ -3,10 +3,9 @@
 import re
 import unittest
 
-from playwright.sync_api import expect
-
 from case import BrowserTest, picture
 from fleet import until
+from playwright.sync_api import expect
 
 
 class Relayed(BrowserTest):
@@ -15,7 +14,9 @@ class Relayed(BrowserTest):
     def test_a_simulation_is_steered_through_the_server_and_watched(self):
         student, server = self.start_world()
         streams = [url for url in student.asked if "/stream/" in url]
-        self.assertTrue(all(url.startswith(f"ws://{server.address}/stream/") for url in streams) and streams, student.asked)
+        self.assertTrue(
+            all(url.startswith(f"ws://{server.address}/stream/") for url in streams) and streams, student.asked
+        )
         student.tab.get_by_role("button", name="Play", exact=True).click()
         expect(student.tab.locator("#mode")).to_have_text("real time")
         expect(student.tab.locator("#watched")).to_be_hidden()

@@ -2,10 +2,9 @@
 
 import unittest
 
-from playwright.sync_api import expect
-
 from case import BrowserTest, picture
 from fleet import WORLD, until
+from playwright.sync_api import expect
 
 
 class Viewing(BrowserTest):
@@ -38,7 +37,11 @@ class Viewing(BrowserTest):
 
     def test_a_failure_is_told_in_words_with_what_to_do(self):
         table = [
-            ("https://github.com/stranger/worlds/blob/main/worlds/a.wbt", "No simulation server accepts", "monitor page"),
+            (
+                "https://github.com/stranger/worlds/blob/main/worlds/a.wbt",
+                "No simulation server accepts",
+                "monitor page",
+            ),
             ("https://github.com/demo/worlds/blob/main/a.wbt", "worlds", "Copy the address"),
             (WORLD.format("missing"), "missing.wbt", "Look whether"),
             ("https://github.com/demo/nothing/blob/main/worlds/a.wbt", "nothing", "Look whether"),

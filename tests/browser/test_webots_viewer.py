@@ -5,11 +5,10 @@ import re
 import tempfile
 import unittest
 
-from playwright.sync_api import expect
-
 from case import BrowserTest
 from door import COOKIE, OneDoor
-from fleet import WORLD, until
+from fleet import WORLD
+from playwright.sync_api import expect
 
 # Like the real one, it links a style sheet of another site and adds a script to the page.
 COMPONENT = """

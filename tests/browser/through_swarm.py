@@ -1,8 +1,8 @@
 """A visit through the door of a fleet on Docker Swarm: through_swarm.py http://HOST/viewer [--kill SERVICE]
 
-Waits until the door answers, and prints when the scene moves, in milliseconds since boot. With --kill it then kills the container
-of the chosen simulation server, which belongs to SERVICE, and prints when it did so, when the page reported it, and when the scene
-moves again after a click. The certificate is not checked.
+Waits until the door answers, and prints when the scene moves, in milliseconds since boot. With --kill it then kills the
+container of the chosen simulation server, which belongs to SERVICE, and prints when it did so, when the page reported
+it, and when the scene moves again after a click. The certificate is not checked.
 """
 
 import json
@@ -11,10 +11,9 @@ import sys
 import time
 import urllib.parse
 
-from playwright.sync_api import Error, expect
-
 from browser import Browser, Page
 from fleet import SOON, until
+from playwright.sync_api import Error, expect
 
 
 def say(what):
@@ -42,7 +41,9 @@ def connect_until_it_moves(tab):
 def container_of(tab, service):
     """The container of the simulation server that was chosen: ws://HOST/ADDRESS/PORT."""
     address = urllib.parse.urlsplit(tab.locator("[data-step=server] small").inner_text()).path.split("/")[1]
-    docker = lambda *arguments: subprocess.run(["docker", *arguments], check=True, capture_output=True, text=True).stdout
+    docker = lambda *arguments: (
+        subprocess.run(["docker", *arguments], check=True, capture_output=True, text=True).stdout
+    )
     names = docker("ps", "--quiet", "--filter", f"label=com.docker.swarm.service.name={service}").split()
     networks = {one["Id"]: one["NetworkSettings"]["Networks"].values() for one in json.loads(docker("inspect", *names))}
     return next(name for name, ours in networks.items() if any(one["IPAddress"] == address for one in ours))
@@ -68,7 +69,11 @@ def visit(browser, url, service):
         say("again")
     # The page has sent all its requests to the door, with the scheme with which it was loaded.
     origin = urllib.parse.urlsplit(url)
-    ways = {(one.scheme, one.netloc) for one in map(urllib.parse.urlsplit, page.asked) if one.scheme not in ("data", "blob", "about")}
+    ways = {
+        (one.scheme, one.netloc)
+        for one in map(urllib.parse.urlsplit, page.asked)
+        if one.scheme not in ("data", "blob", "about")
+    }
     assert ways == {(origin.scheme, origin.netloc), (origin.scheme.replace("http", "ws"), origin.netloc)}, ways
     # If the page were merely closed, its simulation would wait for it.
     tab.get_by_role("button", name="Disconnect").click()

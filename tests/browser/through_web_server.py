@@ -1,17 +1,17 @@
-"""A visit through a web server, from the first click to the end: through_web_server.py https://HOST/viewer [--own-origin]
+"""A visit through a web server, from the first click to the end: through_web_server.py URL [--own-origin]
 
-The session server behind it offers a world called Arm. The certificate is not checked here, but in the tests of the web
-servers. --own-origin says that the web server sandboxes Webots' files, so that they have an opaque origin.
+URL is that of the viewer. The session server behind it offers a world called Arm. The certificate is not checked here,
+but in the tests of the web servers. --own-origin says that the web server sandboxes Webots' files, so that they have an
+opaque origin.
 """
 
 import re
 import sys
 import urllib.parse
 
-from playwright.sync_api import expect
-
 from browser import Browser, Page
 from fleet import SOON, until
+from playwright.sync_api import expect
 
 
 def cannot_read_what_is_the_administrators(context, webots):

@@ -1,9 +1,10 @@
 """Connects two machines: cable.py PROCESS ADDRESS/BITS PROCESS ADDRESS/BITS
 
-Each machine is a network namespace, given by a process in it, and gets an interface with an address. Packets sent on one
-arrive at the other until this program ends.
+Each machine is a network namespace, given by a process in it, and gets an interface with an address. Packets sent on
+one arrive at the other until this program ends.
 """
 
+import contextlib
 import ctypes
 import fcntl
 import os
@@ -35,11 +36,9 @@ def main(one, its_address, other, others_address):
     while True:
         for ready in select.select(ends, [], [])[0]:
             packet = os.read(ready, LONGEST)
-            try:
+            # The interface of a stopping machine goes down first; the packet is lost.
+            with contextlib.suppress(OSError):
                 os.write(ends[1 - ends.index(ready)], packet)
-            except OSError:
-                # The interface of a stopping machine goes down first; the packet is lost.
-                pass
 
 
 main(*sys.argv[1:])

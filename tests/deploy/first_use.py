@@ -1,20 +1,21 @@
 """First use of new simulation servers on Docker Swarm: docker inspect CONTAINER... | first_use.py VISITS BEGAN OLD...
 
-VISITS is the JSON file of rehearse, BEGAN its start time, OLD are the containers from before. Prints the time from the start of
-each new container to its first client; fails if one had none within LIMIT seconds.
+VISITS is the JSON file of rehearse, BEGAN its start time, OLD are the containers from before. Prints the time from the
+start of each new container to its first client; fails if one had none within LIMIT seconds.
 
-The goal is five seconds. On two cores with other load, 1.3 to 4 were measured. The limit is higher because Docker is slow on
-a busy machine.
+The goal is five seconds. On two cores with other load, 1.3 to 4 were measured. The limit is higher because Docker is
+slow on a busy machine.
 """
 
 import datetime
 import json
+import pathlib
 import re
 import sys
 
 LIMIT = 8.0
 
-visits = json.load(open(sys.argv[1]))["visits"]
+visits = json.loads(pathlib.Path(sys.argv[1]).read_text())["visits"]
 began, old = float(sys.argv[2]), tuple(sys.argv[3:])
 first = {}
 for visit in visits:

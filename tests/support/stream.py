@@ -1,5 +1,6 @@
 """Hands connections on from the port that Webots is given to another one: --port=N, and the other port last."""
 
+import contextlib
 import socket
 import sys
 import threading
@@ -12,10 +13,8 @@ def copy(source, target):
     except OSError:
         pass
     for one in (source, target):
-        try:
+        with contextlib.suppress(OSError):
             one.shutdown(socket.SHUT_RDWR)
-        except OSError:
-            pass
 
 
 def serve(near):

@@ -13,15 +13,18 @@ import traceback
 
 # Output that Webots has not read yet must fit into a pipe.
 LONGEST_COMPLAINT = 8000
-PROGRAM = os.path.join(os.path.dirname(os.path.abspath(__file__)), 'participant', 'participant.py')
+PROGRAM = os.path.join(os.path.dirname(os.path.abspath(__file__)), "participant", "participant.py")
 
 
 def connect():
-    """Connects to Webots; libController ends this process if that fails. A program's own Robot shares the connection."""
+    """Connects to Webots; libController ends this process if that fails.
+
+    A program's own Robot shares the connection.
+    """
     # libController asks for these when it connects.
-    os.environ.update(WEBOTS_STDOUT_REDIRECT='1', WEBOTS_STDERR_REDIRECT='1')
-    home = os.environ.get('WEBOTS_HOME', '/usr/local/webots')
-    library = ctypes.CDLL(os.path.join(home, 'lib', 'controller', 'libController.so'))
+    os.environ.update(WEBOTS_STDOUT_REDIRECT="1", WEBOTS_STDERR_REDIRECT="1")
+    home = os.environ.get("WEBOTS_HOME", "/usr/local/webots")
+    library = ctypes.CDLL(os.path.join(home, "lib", "controller", "libController.so"))
     library.wb_robot_get_basic_time_step.restype = ctypes.c_double
     library.wb_robot_init()
     return library
@@ -39,15 +42,15 @@ def run(program):
     sys.argv = [program]
     sys.path[0] = folder
     try:
-        runpy.run_path(program, run_name='__main__')
+        runpy.run_path(program, run_name="__main__")
     except SystemExit as end:
         if end.code not in (None, 0):
-            complain(f'The controller has ended: {end.code}')
+            complain(f"The controller has ended: {end.code}")
     except BaseException as error:  # pylint: disable=broad-except
         trace = error.__traceback__
         while trace and trace.tb_frame.f_code.co_filename != program:
             trace = trace.tb_next
-        complain(''.join(traceback.format_exception(type(error), error, trace)))
+        complain("".join(traceback.format_exception(type(error), error, trace)))
     sys.stdout.flush()
 
 
@@ -58,10 +61,10 @@ def main():
     if os.path.isfile(PROGRAM):
         run(PROGRAM)
     else:
-        complain('There is no participant/participant.py.')
+        complain("There is no participant/participant.py.")
     while library.wb_robot_step(step) != -1:
         pass
 
 
-if __name__ == '__main__':
+if __name__ == "__main__":
     main()

@@ -21,9 +21,11 @@ heading = rotation.getSFRotation()[3]
 
 while robot.step(int(robot.getBasicTimeStep())) != -1:
     angle = heading + SPEED / RADIUS * robot.getTime()
-    translation.setSFVec3f([
-        x + RADIUS * (math.sin(angle) - math.sin(heading)),
-        y - RADIUS * (math.cos(angle) - math.cos(heading)),
-        z,
-    ])
+    translation.setSFVec3f(
+        [
+            x + RADIUS * (math.sin(angle) - math.sin(heading)),
+            y - RADIUS * (math.cos(angle) - math.cos(heading)),
+            z,
+        ]
+    )
     rotation.setSFRotation([0, 0, 1, angle])
