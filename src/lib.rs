@@ -49,10 +49,10 @@
 //!   routes ----------- Pick, GetStatus ------------> Registry --- Notice --> mailer --> SMTP
 //!     | one per WebSocket                             ^  |  | one per simulation server
 //!   WebClient ---------- Pick ------------------------'  |  v
-//!     |  ^                                               | monitor -- GET /status, /load --> simulation server
+//!     |  ^                                               | ServerMonitor -- GET /status, /load --> simulation server
 //!     |  '- availability (watch channel) -- Registry     '-- ProbeResult --> Registry
 //!
-//!   Monitors and mailers are tasks. The monitors share a thread of their own, so that clients never wait for them.
+//!   Mailers are tasks. The monitors share a thread of their own, so that clients never wait for them.
 //!
 //! simulation server
 //!
@@ -79,14 +79,14 @@
 //! | actor or task | ends by itself | after a panic |
 //! |---|---|---|
 //! | Registry, `LoadMonitor` | never | the server logs it and exits with code 1: the service manager restarts it |
-//! | monitor | when its server is removed from the configuration, or no name resolves to that server any more | it is restarted |
+//! | `ServerMonitor` | when its server is removed from the configuration, or no name resolves to that server any more | the registry starts a new one |
 //! | mailer | never | it is restarted; the notices that it held are lost |
 //! | `WebClient` | with its connection | its connection closes, and its session is notified |
 //! | `Session` | with its simulation, or its client | its lease is released, and its client is notified |
 //! | Webots | with its process tree; it is never restarted, its client is notified | its process tree is killed at once, its directory removed, its slot released |
 //!
 //! The `SlotPool` is not an actor: a mutex guards it. [`shared::run::permanent::restarted`] restarts the tasks; after
-//! more than five panics of one task within a minute the server exits with code 1.
+//! more than five panics of one task, or of all monitors together, within a minute the server exits with code 1.
 //!
 //! # Facts about actix 0.13 that this relies on
 //!

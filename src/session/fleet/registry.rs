@@ -76,7 +76,7 @@ pub struct Registry {
 
 /// Pause between two lookups of the names.
 const LOOKUP_INTERVAL: Duration = Duration::from_secs(1);
-/// Interval between checks of what changes without a report: placements that expire.
+/// Interval between checks of what changes without a report: placements that expire, and monitors that have panicked.
 const TICK: Duration = Duration::from_millis(250);
 
 impl Registry {
@@ -184,7 +184,10 @@ impl Actor for Registry {
         // The requests and reports of a whole fleet may arrive at the same moment.
         ctx.set_mailbox_capacity(4096);
         self.servers.apply(&self.config);
-        ctx.run_interval(TICK, |registry, _| registry.publish());
+        ctx.run_interval(TICK, |registry, _| {
+            registry.servers.restart_monitors(&registry.config);
+            registry.publish();
+        });
         self.look_up_names(ctx);
     }
 }

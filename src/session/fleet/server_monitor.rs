@@ -1,13 +1,15 @@
-//! Task: probes one simulation server.
+//! Actor: probes one simulation server.
 //!
-//! Started by the registry for each simulation server. Every `loadRefresh` it requests the server's state, one request
-//! at a time, and sends the result to the registry. If the registry's mailbox is full, the result is dropped: the next
-//! probe replaces it. The task ends when the registry drops its channel, and restarts after a panic.
+//! Created by the registry for each simulation server, in the thread of all monitors. Every `loadRefresh` it requests the
+//! server's state, one request at a time, and sends the result to its parent. If the parent's mailbox is full, the result
+//! is dropped: the next probe replaces it. It ends when it receives [`Stop`]; after a panic its parent starts a new one.
 //!
 //! It requests `/status`, or `/load` if the server has no `/status`, as the original. No answer is trusted: the whole
 //! probe has a timeout, the answer a size limit, and the load must be plausible.
 
+use std::cell::Cell;
 use std::fmt::Display;
+use std::rc::Rc;
 use std::sync::{Arc, LazyLock};
 use std::time::{Duration, Instant};
 
@@ -17,9 +19,8 @@ use actix_web::web::Bytes;
 use awc::error::{ConnectError, SendRequestError};
 use awc::http::StatusCode;
 use awc::http::header::CONTENT_LENGTH;
-use futures_util::FutureExt;
 use rustls::ClientConfig;
-use tokio::time::{MissedTickBehavior, interval_at};
+use tokio::time::{sleep_until, timeout};
 
 use super::resolver::HostResolver;
 use crate::session::config::SessionConfig;
@@ -79,60 +80,139 @@ fn client(interval: Duration, tls: Option<Arc<ClientConfig>>) -> awc::Client {
         .finish()
 }
 
-/// Probes a server now, and then every `loadRefresh` until the registry stops. The slot is random: reports of all
-/// servers in the same slot would delay the requests of clients.
-pub async fn monitor(
+/// Ends the monitor.
+#[derive(Message)]
+#[rtype(result = "()")]
+pub struct Stop;
+
+/// The actor.
+pub struct ServerMonitor {
     server: PublicAddress,
-    config: &SessionConfig,
-    tls: Option<Arc<ClientConfig>>,
+    target: Rc<Target>,
+    /// When the probe after the immediate one is due; the others follow every `interval`.
+    first: Instant,
+    interval: Duration,
     results: Recipient<ProbeResult>,
-) {
-    let (interval, timeout) = (config.load_refresh, config.timing.answer);
-    let (client, url) = (client(interval, tls), server.http_url(config.ssl));
-    let first = (BEGIN.elapsed() + interval.mul_f64(rand::random()))
-        .div_duration_f64(SLOT)
-        .ceil();
-    let mut times = interval_at((*BEGIN + SLOT.mul_f64(first)).into(), interval);
-    times.set_missed_tick_behavior(MissedTickBehavior::Skip);
-    // When the server was last found to have no `/status`.
-    let mut without_status = None;
-    loop {
-        let begun = Instant::now();
-        let answer = actix_rt::time::timeout(timeout, probe(&client, &url, &mut without_status)).await;
-        let answer = answer.unwrap_or_else(|_| Err(format!("no answer within {} s", timeout.as_secs_f64())));
-        match results.try_send(ProbeResult {
-            server: server.clone(),
-            latency: begun.elapsed(),
-            answer,
-        }) {
-            Ok(()) => {}
-            Err(SendError::Full(_)) => log::warn!("{server}: a report is lost, too many are waiting"),
-            // The registry has stopped, and the server with it.
-            Err(SendError::Closed(_)) => return,
+}
+
+/// What a probe needs.
+struct Target {
+    client: awc::Client,
+    url: String,
+    /// Time limit of a probe.
+    limit: Duration,
+    /// When the server was last found to have no `/status`.
+    without_status: Cell<Option<Instant>>,
+}
+
+impl ServerMonitor {
+    /// The monitor of a server. It must be created in the thread in which it runs.
+    pub fn new(
+        server: PublicAddress,
+        config: &SessionConfig,
+        tls: Option<Arc<ClientConfig>>,
+        results: Recipient<ProbeResult>,
+    ) -> Self {
+        let interval = config.load_refresh;
+        // The slot is random: reports of all servers in the same slot would delay the requests of clients.
+        let slot = (BEGIN.elapsed() + interval.mul_f64(rand::random()))
+            .div_duration_f64(SLOT)
+            .ceil();
+        Self {
+            target: Rc::new(Target {
+                client: client(interval, tls),
+                url: server.http_url(config.ssl),
+                limit: config.timing.answer,
+                without_status: Cell::new(None),
+            }),
+            server,
+            first: *BEGIN + SLOT.mul_f64(slot),
+            interval,
+            results,
         }
-        // Skips a tick that passed during the probe.
-        times.tick().now_or_never();
-        times.tick().await;
+    }
+
+    /// Probes the server at this time, sends the result, and continues with the next probe.
+    fn probe_at(&self, due: Instant, ctx: &mut Context<Self>) {
+        let target = Rc::clone(&self.target);
+        let probe = async move {
+            sleep_until(due.into()).await;
+            let begun = Instant::now();
+            let answer = timeout(target.limit, target.probe()).await;
+            let late = |_| Err(format!("no answer within {} s", target.limit.as_secs_f64()));
+            (answer.unwrap_or_else(late), begun.elapsed())
+        };
+        let finish = |(answer, latency), monitor: &mut Self, ctx: &mut Context<Self>| {
+            monitor.send(answer, latency, ctx);
+            monitor.probe_at(monitor.next(Instant::now()), ctx);
+        };
+        probe.into_actor(self).map(finish).spawn(ctx);
+    }
+
+    /// When the next probe is due. Times that passed during a probe are skipped.
+    fn next(&self, now: Instant) -> Instant {
+        let Some(passed) = now.checked_duration_since(self.first) else {
+            return self.first;
+        };
+        self.first
+            + self
+                .interval
+                .mul_f64(passed.div_duration_f64(self.interval).floor() + 1.0)
+    }
+
+    fn send(&self, answer: Result<ServerReport, String>, latency: Duration, ctx: &mut Context<Self>) {
+        let result = ProbeResult {
+            server: self.server.clone(),
+            latency,
+            answer,
+        };
+        match self.results.try_send(result) {
+            Ok(()) => {}
+            Err(SendError::Full(_)) => log::warn!("{}: a report is lost, too many are waiting", self.server),
+            // The registry has stopped, and the server with it.
+            Err(SendError::Closed(_)) => ctx.stop(),
+        }
     }
 }
 
-/// Requests the report of a server. `without_status` is when it was last found to have no `/status`.
-async fn probe(client: &awc::Client, url: &str, without_status: &mut Option<Instant>) -> Result<ServerReport, String> {
-    let may_have_status = without_status.is_none_or(|found| found.elapsed() >= LOAD_ONLY);
-    if may_have_status && let Some((body, _)) = get(client, &format!("{url}/status")).await? {
-        return usable(ServerReport::parse(&body).map_err(bad_answer)?);
+impl Actor for ServerMonitor {
+    type Context = Context<Self>;
+
+    fn started(&mut self, ctx: &mut Self::Context) {
+        self.probe_at(Instant::now(), ctx);
     }
-    let body = get(client, &format!("{url}/load")).await?;
-    let (bytes, length) = body.ok_or_else(|| bad_answer("it has neither /status nor /load"))?;
-    // awc takes the end of the connection for the end of the body: 95.5 may arrive as 9. Truncated JSON is not valid.
-    if length != Some(bytes.len()) {
-        return Err(bad_answer("an answer that does not end as its Content-Length says"));
+}
+
+impl Handler<Stop> for ServerMonitor {
+    type Result = ();
+
+    fn handle(&mut self, _: Stop, ctx: &mut Self::Context) {
+        ctx.stop();
     }
-    let report = usable(ServerReport::load_only(Load::parse(&bytes).map_err(bad_answer)?))?;
-    if may_have_status {
-        *without_status = Some(Instant::now());
+}
+
+impl Target {
+    /// Requests the report of the server.
+    async fn probe(&self) -> Result<ServerReport, String> {
+        let may_have_status = self
+            .without_status
+            .get()
+            .is_none_or(|found| found.elapsed() >= LOAD_ONLY);
+        if may_have_status && let Some((body, _)) = get(&self.client, &format!("{}/status", self.url)).await? {
+            return usable(ServerReport::parse(&body).map_err(bad_answer)?);
+        }
+        let body = get(&self.client, &format!("{}/load", self.url)).await?;
+        let (bytes, length) = body.ok_or_else(|| bad_answer("it has neither /status nor /load"))?;
+        // awc takes the end of the connection for the end of the body: 95.5 may arrive as 9. Truncated JSON is not valid.
+        if length != Some(bytes.len()) {
+            return Err(bad_answer("an answer that does not end as its Content-Length says"));
+        }
+        let report = usable(ServerReport::load_only(Load::parse(&bytes).map_err(bad_answer)?))?;
+        if may_have_status {
+            self.without_status.set(Some(Instant::now()));
+        }
+        Ok(report)
     }
-    Ok(report)
 }
 
 /// Returns the body of a page and its `Content-Length`, `None` if the server has no such page.

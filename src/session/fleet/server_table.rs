@@ -6,16 +6,15 @@ use std::sync::Arc;
 
 use actix::prelude::*;
 use rustls::ClientConfig;
-use tokio::sync::oneshot;
 
 use super::name_table::NameTable;
-use super::server_monitor::{ProbeResult, monitor};
+use super::server_monitor::{ProbeResult, ServerMonitor, Stop};
 use super::server_record::ServerRecord;
 use crate::session::config::SessionConfig;
 use crate::session::placement::LoadBalancer;
 use crate::shared::domain::PublicAddress;
 use crate::shared::http::tls;
-use crate::shared::run::permanent;
+use crate::shared::run::permanent::PanicCounter;
 
 /// All servers and names, with the servers' monitors.
 pub struct ServerTable {
@@ -23,8 +22,10 @@ pub struct ServerTable {
     pub names: NameTable,
     /// What is known of placing clients on the servers.
     pub fleet: LoadBalancer<PublicAddress>,
-    /// The tasks that probe the servers: each ends when its sender is dropped.
-    monitors: HashMap<PublicAddress, oneshot::Sender<()>>,
+    /// The actors that probe the servers, one for each.
+    monitors: HashMap<PublicAddress, Addr<ServerMonitor>>,
+    /// Counts the panics of all of them.
+    panics: PanicCounter,
     /// What is known of each server.
     pub records: HashMap<PublicAddress, ServerRecord>,
     /// In the order of the configuration.
@@ -42,6 +43,7 @@ impl ServerTable {
             names: NameTable::default(),
             fleet: LoadBalancer::new(config.policy()),
             monitors: HashMap::new(),
+            panics: PanicCounter::default(),
             records: HashMap::new(),
             listed: Vec::new(),
             tls: None,
@@ -76,30 +78,106 @@ impl ServerTable {
         }
         for server in before.into_keys() {
             log::info!("{server}: no longer watched");
-            self.monitors.remove(&server);
+            if let Some(monitor) = self.monitors.remove(&server) {
+                monitor.do_send(Stop);
+            }
             self.fleet.remove(&server);
         }
     }
 
     /// Starts the monitor of a server, replacing one that runs.
     fn start_monitor(&mut self, server: PublicAddress, config: &Arc<SessionConfig>) {
-        let (sender, stopped) = oneshot::channel();
-        self.monitors.insert(server.clone(), sender);
-        let (config, tls, results) = (Arc::clone(config), self.tls.clone(), self.results.clone());
-        self.thread.spawn_fn(move || {
-            actix_rt::spawn(async move {
-                let name = format!("monitor of server {server}");
-                let probe = async || monitor(server.clone(), &config, tls.clone(), results.clone()).await;
-                tokio::select! {
-                    () = permanent::restarted(&name, probe) => {}
-                    _ = stopped => {}
-                }
-            });
+        let key = server.clone();
+        let config = Arc::clone(config);
+        let tls = self.tls.clone();
+        let results = self.results.clone();
+        let monitor = ServerMonitor::start_in_arbiter(&self.thread.handle(), move |_| {
+            ServerMonitor::new(server, &config, tls, results)
         });
+        if let Some(before) = self.monitors.insert(key, monitor) {
+            before.do_send(Stop);
+        }
+    }
+
+    /// Starts a new monitor for each server whose monitor has panicked: actix does not restart it.
+    pub fn restart_monitors(&mut self, config: &Arc<SessionConfig>) {
+        let is_gone =
+            |(server, monitor): (&PublicAddress, &Addr<ServerMonitor>)| (!monitor.connected()).then(|| server.clone());
+        let gone: Vec<PublicAddress> = self.monitors.iter().filter_map(is_gone).collect();
+        for server in gone {
+            self.panics.count(&format!("monitor of server {server}"));
+            self.start_monitor(server, config);
+        }
     }
 
     /// What is known of all servers, in the order of the configuration.
     pub fn in_order(&self) -> impl Iterator<Item = &ServerRecord> {
         self.listed.iter().filter_map(|server| self.records.get(server))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+
+    /// A monitor that receives this panics.
+    #[derive(Message)]
+    #[rtype(result = "()")]
+    struct Panic;
+
+    impl Handler<Panic> for ServerMonitor {
+        type Result = ();
+
+        fn handle(&mut self, _: Panic, _: &mut Self::Context) {
+            // Panics without printing.
+            std::panic::resume_unwind(Box::new("a test has asked for it"));
+        }
+    }
+
+    /// Takes the results of the monitors.
+    struct Parent(tokio::sync::mpsc::UnboundedSender<PublicAddress>);
+
+    impl Actor for Parent {
+        type Context = Context<Self>;
+    }
+
+    impl Handler<ProbeResult> for Parent {
+        type Result = ();
+
+        fn handle(&mut self, result: ProbeResult, _: &mut Self::Context) {
+            self.0.send(result.server).unwrap();
+        }
+    }
+
+    #[actix_rt::test]
+    async fn a_monitor_that_panics_is_started_again_and_disturbs_no_other() {
+        let (sender, mut probed) = tokio::sync::mpsc::unbounded_channel();
+        // Nothing listens there, which is a result, too.
+        let config: SessionConfig =
+            serde_json::from_str(r#"{"simulationServers": ["127.0.0.1:1", "127.0.0.1:2"], "loadRefresh": 0.1}"#)
+                .unwrap();
+        let config = Arc::new(config);
+        let mut table = ServerTable::new(&config, Parent(sender).start().recipient());
+        table.apply(&config);
+        let first: PublicAddress = "127.0.0.1:1".parse().unwrap();
+        let second: PublicAddress = "127.0.0.1:2".parse().unwrap();
+        let mut until_probed = async |server: &PublicAddress| {
+            let found = async { while probed.recv().await.unwrap() != *server {} };
+            tokio::time::timeout(Duration::from_secs(20), found).await.unwrap();
+        };
+        until_probed(&first).await;
+        let old = table.monitors[&first].clone();
+        let other = table.monitors[&second].clone();
+        old.send(Panic).await.unwrap_err();
+        assert!(!old.connected(), "a panic ends the actor");
+        table.restart_monitors(&config);
+        // Its first probe, and one of its schedule.
+        until_probed(&first).await;
+        until_probed(&second).await;
+        until_probed(&first).await;
+        assert!(table.monitors[&first].connected());
+        assert!(table.monitors[&second] == other && other.connected());
     }
 }

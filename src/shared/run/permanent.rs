@@ -8,8 +8,41 @@ use futures_util::FutureExt;
 
 /// Interval between two checks of an actor, and between the end of a task and its next start.
 const INTERVAL: Duration = Duration::from_millis(500);
-/// Limit of panics of a task within a minute: after more of them, another restart would not help.
+/// Limit of panics of a kind within a minute: after more of them, another restart would not help.
 const MAX_PANICS: u32 = 5;
+
+/// Counts the panics of one kind of actor or task, whose owner starts a new one after each.
+#[derive(Debug)]
+pub struct PanicCounter {
+    /// When the first of the counted panics happened, or the counter was created.
+    since: Instant,
+    panics: u32,
+}
+
+impl Default for PanicCounter {
+    fn default() -> Self {
+        Self {
+            since: Instant::now(),
+            panics: 0,
+        }
+    }
+}
+
+impl PanicCounter {
+    /// Counts and logs a panic of the actor or task `name`. More than [`MAX_PANICS`] within a minute end the server with
+    /// exit code 1, so that its service manager restarts it.
+    pub fn count(&mut self, name: &str) {
+        if self.since.elapsed() > Duration::from_mins(1) {
+            *self = Self::default();
+        }
+        self.panics += 1;
+        if self.panics > MAX_PANICS {
+            log::error!("{name} has panicked, and its kind more than {MAX_PANICS} times in a minute");
+            std::process::exit(1);
+        }
+        log::error!("{name} has panicked, a new one is started");
+    }
+}
 
 /// Waits until an actor has stopped, and returns a message about it. Such an actor has panicked, which is a bug in this
 /// program.
@@ -23,20 +56,11 @@ pub async fn stopped<A: Actor>(name: &str, actor: Addr<A>) -> String {
     format!("the actor {name} is gone")
 }
 
-/// Runs a task, and restarts it after each panic. More than [`MAX_PANICS`] within a minute end the server with
-/// exit code 1, so that its service manager restarts it.
+/// Runs a task, and restarts it after each panic, which a [`PanicCounter`] of its own counts.
 pub async fn restarted(name: &str, mut task: impl AsyncFnMut()) {
-    let (mut since, mut panics) = (Instant::now(), 0);
+    let mut panics = PanicCounter::default();
     while AssertUnwindSafe(task()).catch_unwind().await.is_err() {
-        if since.elapsed() > Duration::from_mins(1) {
-            (since, panics) = (Instant::now(), 0);
-        }
-        panics += 1;
-        if panics > MAX_PANICS {
-            log::error!("{name} has panicked more than {MAX_PANICS} times in a minute");
-            std::process::exit(1);
-        }
-        log::error!("{name} has panicked, a new one is started");
+        panics.count(name);
         actix_rt::time::sleep(INTERVAL).await;
     }
 }
