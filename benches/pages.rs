@@ -30,7 +30,9 @@ use support::git::{Forge, world};
 use support::program::{Server, session_server, simulation_server};
 use support::webots::Webots;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use webots_fleet::session::fleet::{FleetStatus, ServerRecord, ServerState, ServerStatus, StateChange};
+use webots_fleet::session::fleet::{
+    Answer, FleetStatus, Intake, ServerRecord, ServerState, ServerStatus, StateChange, StateName,
+};
 use webots_fleet::session::web::pages::{self, Monitor};
 use webots_fleet::shared::domain::ClientUrls;
 
@@ -99,17 +101,17 @@ fn fleet() -> FleetStatus {
     };
     let servers = (0..SERVERS).map(|number| ServerStatus {
         record: ServerRecord {
-            state: if number % 10 == 0 {
-                ServerState::Full
-            } else {
-                ServerState::Up
+            state: ServerState::Answering {
+                answer: Answer {
+                    report: Arc::new(serde_json::from_value(report.clone()).unwrap()),
+                    at: Instant::now(),
+                    latency: Duration::from_millis(3),
+                },
+                intake: if number % 10 == 0 { Intake::Full } else { Intake::Up },
             },
-            report: Some(Arc::new(serde_json::from_value(report.clone()).unwrap())),
-            latency: Some(Duration::from_millis(3)),
-            answered: Some(Instant::now()),
             ..ServerRecord::new(address(number))
         },
-        error: None,
+        failure: None,
         effective_load: Some(44.5),
         in_flight: 1,
         client_cost: Some(1.0),
@@ -117,7 +119,7 @@ fn fleet() -> FleetStatus {
     let change = |number| StateChange {
         at: String::new(),
         server: address(number).to_string(),
-        state: ServerState::Down,
+        state: StateName::Down,
         why: "no answer within 3 s".to_owned(),
     };
     let changes: VecDeque<StateChange> = (0..50).map(change).collect();

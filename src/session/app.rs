@@ -9,11 +9,11 @@ use actix_web::{App, web};
 use tokio::sync::watch;
 
 use super::config::SessionConfig;
-use super::state::AppState;
+use super::state::{AppState, PLACED};
 use crate::session::fleet::{GetStatus, Reconfigure, Registry};
 use crate::session::web::configure;
 use crate::shared::config;
-use crate::shared::domain::ClientUrls;
+use crate::shared::domain::{ClientUrls, Reason};
 use crate::shared::http::server::{self, HttpServerOptions};
 use crate::shared::http::{BasicAuth, ConnectionLimiter, LiveUpdates, Metrics};
 use crate::shared::run::{
@@ -28,8 +28,14 @@ const FILES_PER_SERVER: usize = 2;
 /// Timeout for closing open connections at shutdown, which takes at most five seconds in all.
 const STOP_TIMEOUT: Duration = Duration::from_secs(4);
 
-/// Values of the metric's label `outcome`. All of them are exported from the start.
-const OUTCOMES: [&str; 4] = ["placed", "unavailable", "not_accepted", "wrong_url"];
+/// The reasons for which no simulation server is chosen. The metric of each is exported from the start.
+const REFUSALS: [Reason; 5] = [
+    Reason::NoServerAvailable,
+    Reason::NoIdleTime,
+    Reason::RepositoryNotAllowed,
+    Reason::RepositoryBlocked,
+    Reason::InvalidWorld,
+];
 
 /// Runs the server until a signal stops it. SIGHUP reads the configuration `file` again.
 ///
@@ -119,7 +125,7 @@ fn assemble(
         "Requests for a simulation server",
         "outcome",
     )?;
-    for outcome in OUTCOMES {
+    for outcome in REFUSALS.map(Reason::code).into_iter().chain([PLACED]) {
         picks.with_label_values(&[outcome]).reset();
     }
     let (available_sender, available) = watch::channel(false);

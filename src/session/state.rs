@@ -9,10 +9,13 @@ use actix_web::error::ErrorServiceUnavailable;
 use tokio::sync::watch;
 
 use super::config::SessionConfig;
-use crate::session::fleet::{FleetStatus, GetStatus, Pick, PickError, Registry};
-use crate::shared::domain::{ClientUrls, ProjectUrl};
+use crate::session::fleet::{FleetStatus, GetStatus, Pick, Registry};
+use crate::shared::domain::{ClientUrls, Failure, ProjectUrl, PublicAddress, Reason};
 use crate::shared::http::{BasicAuth, ConnectionKind, ConnectionLimiter, LiveUpdates, Metrics};
 use crate::shared::run::Phase;
+
+/// The label of requests for which a simulation server is chosen; the label of the others is the code of their reason.
+pub const PLACED: &str = "placed";
 
 /// The shared state.
 pub struct AppState {
@@ -30,7 +33,7 @@ pub struct AppState {
     pub connections: ConnectionLimiter,
     /// Counters for `/metrics`.
     pub metrics: Metrics,
-    /// Counts requests for a simulation server, by outcome.
+    /// Counts requests for a simulation server, by outcome: [`PLACED`] or a reason.
     pub picks: prometheus::IntCounterVec,
     /// The open monitor pages.
     pub live: LiveUpdates,
@@ -64,25 +67,20 @@ impl AppState {
     ///
     /// # Errors
     /// Why no server is available.
-    pub async fn pick(&self, world: Option<&str>, from: Option<IpAddr>) -> Result<String, PickError> {
-        let picked = async {
-            let world = world
-                .filter(|text| !text.is_empty())
-                .map(ProjectUrl::parse)
-                .transpose()?;
-            self.registry
-                .send(Pick { world, from })
-                .await
-                .unwrap_or(Err(PickError::Unavailable))
-        };
-        let picked = picked.await;
-        let outcome = match &picked {
-            Ok(_) => "placed",
-            Err(PickError::Unavailable) => "unavailable",
-            Err(PickError::NotAccepted(_)) => "not_accepted",
-            Err(PickError::InvalidWorld(_)) => "wrong_url",
-        };
+    pub async fn pick(&self, world: Option<&str>, from: Option<IpAddr>) -> Result<String, Failure> {
+        let picked = self.pick_address(world, from).await;
+        let outcome = picked.as_ref().map_or_else(|failure| failure.reason.code(), |_| PLACED);
         self.picks.with_label_values(&[outcome]).inc();
         picked.map(|address| self.client_urls.websocket_url(&address))
+    }
+
+    async fn pick_address(&self, world: Option<&str>, from: Option<IpAddr>) -> Result<PublicAddress, Failure> {
+        let named = world.filter(|text| !text.is_empty());
+        let world = named.map(ProjectUrl::parse).transpose().map_err(|error| {
+            let text = error.to_string();
+            Failure::new(Reason::InvalidWorld, text.trim_end_matches('.'))
+        })?;
+        let stopping = |_| Err(Failure::new(Reason::Draining, "the session server stops"));
+        self.registry.send(Pick { world, from }).await.unwrap_or_else(stopping)
     }
 }

@@ -11,44 +11,24 @@ use actix::prelude::*;
 use tokio::sync::watch;
 
 use super::name_table::look_up_all;
+use super::refusal::refusal;
 use super::server_monitor::ProbeResult;
-use super::server_record::{FleetStatus, ServerRecord, ServerState, ServerStatus, is_refused};
+use super::server_record::{Answer, FleetStatus, Intake, ServerRecord, ServerState, ServerStatus};
 use super::server_table::ServerTable;
 use super::state_history::StateHistory;
 use crate::session::config::SessionConfig;
-use crate::shared::domain::{Load, ProjectUrl, ProjectUrlError, PublicAddress, ServerReport};
+use crate::session::placement::LoadBalancer;
+use crate::shared::domain::{Failure, Load, ProjectUrl, PublicAddress, Reason, ServerReport};
 use crate::shared::http::AddressQuota;
-use crate::shared::text::client_text;
 
 /// Requests the least loaded simulation server that accepts this world.
 #[derive(Message, Debug)]
-#[rtype(result = "Result<PublicAddress, PickError>")]
+#[rtype(result = "Result<PublicAddress, Failure>")]
 pub struct Pick {
     /// The world, if the client named one.
     pub world: Option<ProjectUrl>,
     /// The client's address, if it is known.
     pub from: Option<IpAddr>,
-}
-
-/// Why no simulation server is picked. The texts are those of the protocol.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum PickError {
-    /// No server has room.
-    #[error("Error: no simulation server available at the moment.")]
-    Unavailable,
-    /// No server accepts worlds of this repository.
-    #[error("Error: no simulation server accepts {0}.")]
-    NotAccepted(String),
-    /// The URL does not name a world.
-    #[error("Error: {0}")]
-    InvalidWorld(#[from] ProjectUrlError),
-}
-
-impl PickError {
-    /// The message for the client, safe to show.
-    pub fn for_client(&self) -> String {
-        client_text(&self.to_string())
-    }
 }
 
 /// Requests the status of the fleet.
@@ -105,51 +85,69 @@ impl Registry {
     }
 
     /// Records the result of a probe.
-    fn record(&mut self, server: &PublicAddress, latency: Duration, answer: Result<ServerReport, String>) {
+    fn record(&mut self, server: &PublicAddress, latency: Duration, answer: Result<ServerReport, Failure>) {
         let ServerTable { records, fleet, .. } = &mut self.servers;
         let Some(record) = records.get_mut(server) else { return };
-        record.latency = Some(latency);
         let change = match answer {
             Ok(report) => {
-                let (report, now) = (Arc::new(report), Instant::now());
+                let now = Instant::now();
+                let report = Arc::new(report);
                 let limit = fleet.limit(server).unwrap_or(self.config.load_threshold);
-                let change = record.succeeded(Arc::clone(&report), now, limit);
+                let answer = Answer {
+                    report: Arc::clone(&report),
+                    at: now,
+                    latency,
+                };
+                let change = record.answered(answer, limit);
+                let is_draining = matches!(
+                    record.state,
+                    ServerState::Answering {
+                        intake: Intake::Draining,
+                        ..
+                    }
+                );
                 let was_ejected = fleet.is_ejected(server);
-                fleet.report(server, now, &report, record.state != ServerState::Draining);
+                fleet.report(server, now, &report, !is_draining);
                 if fleet.is_ejected(server) && !was_ejected {
                     log::warn!("{server}: {}", ejected(report.failed_starts));
                 }
                 change
             }
-            Err(error) => {
+            Err(failure) => {
                 fleet.lose(server);
-                record.failed(error)
+                record.failed(failure, latency)
             }
         };
-        if let Some((change, event)) = change {
-            self.changes.add(record, change, event);
+        if let Some(change) = change {
+            self.changes.add(change);
         }
     }
 
     /// Chooses a server for a client of this address.
-    fn pick(&mut self, world: Option<&ProjectUrl>, from: Option<IpAddr>) -> Result<PublicAddress, PickError> {
+    fn pick(&mut self, world: Option<&ProjectUrl>, from: Option<IpAddr>) -> Result<PublicAddress, Failure> {
         let ServerTable { records, fleet, .. } = &mut self.servers;
-        let accepts = |address: &PublicAddress, world| records.get(address)?.accepts(world);
-        let eligible = |address: &PublicAddress| world.is_none_or(|world| accepts(address, world) == Some(true));
-        fleet
-            .pick(Instant::now(), self.quota.take(from, true), eligible)
-            .ok_or_else(|| match world {
-                Some(world) if is_refused(records.values(), world) => PickError::NotAccepted(world.repository()),
-                _ => PickError::Unavailable,
-            })
+        let admits = |address: &PublicAddress, world: &ProjectUrl| {
+            let answer = records.get(address).and_then(|record| record.state.last_answer());
+            answer.is_some_and(|answer| answer.report.check(world, answer.report.load).is_ok())
+        };
+        let eligible = |address: &PublicAddress| world.is_none_or(|world| admits(address, world));
+        let picked = fleet.pick(Instant::now(), self.quota.take(from, true), eligible);
+        picked.ok_or_else(|| {
+            let servers = records.values();
+            refusal(
+                servers.map(|record| (record, effective_load(fleet, &record.address))),
+                world,
+            )
+        })
     }
 
     fn status_of(&self, record: &ServerRecord) -> ServerStatus {
-        let (fleet, address) = (&self.servers.fleet, &record.address);
-        let failed = record.current().map_or(0, |report| report.failed_starts);
-        let error = record.error().map(str::to_owned);
+        let fleet = &self.servers.fleet;
+        let address = &record.address;
+        let failed_starts = record.state.report().map_or(0, |report| report.failed_starts);
+        let failure = record.state.failure().cloned();
         ServerStatus {
-            error: error.or_else(|| fleet.is_ejected(address).then(|| ejected(failed))),
+            failure: failure.or_else(|| fleet.is_ejected(address).then(|| ejected(failed_starts))),
             effective_load: fleet.effective_load(address),
             in_flight: fleet.in_flight(address),
             client_cost: fleet.client_cost(address),
@@ -172,9 +170,17 @@ impl Registry {
     }
 }
 
-/// The reason why a server is ejected, as text.
-fn ejected(failed: u32) -> String {
-    format!("its last {failed} starts failed for a reason of its own; others are preferred for a while")
+/// Why a server is ejected.
+fn ejected(failed: u32) -> Failure {
+    Failure::new(
+        Reason::StartsFail,
+        format!("its last {failed} starts failed for a reason of its own; others are preferred for a while"),
+    )
+}
+
+/// The load of a server with the clients that its last report does not show; `None` if it is down.
+fn effective_load(fleet: &LoadBalancer<PublicAddress>, server: &PublicAddress) -> Option<Load> {
+    Load::try_from(fleet.effective_load(server)?).ok()
 }
 
 impl Actor for Registry {
@@ -210,7 +216,7 @@ impl Handler<ProbeResult> for Registry {
 }
 
 impl Handler<Pick> for Registry {
-    type Result = Result<PublicAddress, PickError>;
+    type Result = Result<PublicAddress, Failure>;
 
     fn handle(&mut self, Pick { world, from }: Pick, _: &mut Self::Context) -> Self::Result {
         let answer = self.pick(world.as_ref(), from);
@@ -227,7 +233,7 @@ impl Handler<GetStatus> for Registry {
             .servers
             .records
             .values()
-            .filter_map(|record| Some(record.current()?.load));
+            .filter_map(|record| Some(record.state.report()?.load));
         MessageResult(Arc::new(FleetStatus {
             available: *self.available.borrow(),
             mean_load: Load::mean(loads).map(Load::percent),

@@ -24,7 +24,7 @@ use tokio::time::{sleep_until, timeout};
 
 use super::resolver::HostResolver;
 use crate::session::config::SessionConfig;
-use crate::shared::domain::{Load, PublicAddress, ServerReport};
+use crate::shared::domain::{Failure, Load, PublicAddress, Reason, ServerReport};
 use crate::shared::http::tls;
 use crate::shared::text::excerpt;
 
@@ -36,8 +36,8 @@ pub struct ProbeResult {
     pub server: PublicAddress,
     /// Duration of the probe.
     pub latency: Duration,
-    /// The server's report, or why the probe failed, for the log and the pages.
-    pub answer: Result<ServerReport, String>,
+    /// The server's report, or why the probe failed.
+    pub answer: Result<ServerReport, Failure>,
 }
 
 /// Size limit of an answer, in bytes.
@@ -51,7 +51,7 @@ const SLOT: Duration = Duration::from_millis(10);
 /// The start of the first of these slots.
 static BEGIN: LazyLock<Instant> = LazyLock::new(Instant::now);
 /// Longest text of a server that is kept, in characters.
-const MAX_REASON_LENGTH: usize = 500;
+const MAX_TEXT_LENGTH: usize = 500;
 /// Time for which only `/load` is requested from a server without `/status`.
 const LOAD_ONLY: Duration = Duration::from_mins(1);
 
@@ -139,7 +139,8 @@ impl ServerMonitor {
             sleep_until(due.into()).await;
             let begun = Instant::now();
             let answer = timeout(target.limit, target.probe()).await;
-            let late = |_| Err(format!("no answer within {} s", target.limit.as_secs_f64()));
+            let limit = target.limit.as_secs_f64();
+            let late = |_| Err(Failure::new(Reason::NoAnswer, format!("no answer within {limit} s")));
             (answer.unwrap_or_else(late), begun.elapsed())
         };
         let finish = |(answer, latency), monitor: &mut Self, ctx: &mut Context<Self>| {
@@ -160,7 +161,7 @@ impl ServerMonitor {
                 .mul_f64(passed.div_duration_f64(self.interval).floor() + 1.0)
     }
 
-    fn send(&self, answer: Result<ServerReport, String>, latency: Duration, ctx: &mut Context<Self>) {
+    fn send(&self, answer: Result<ServerReport, Failure>, latency: Duration, ctx: &mut Context<Self>) {
         let result = ProbeResult {
             server: self.server.clone(),
             latency,
@@ -193,21 +194,17 @@ impl Handler<Stop> for ServerMonitor {
 
 impl Target {
     /// Requests the report of the server.
-    async fn probe(&self) -> Result<ServerReport, String> {
+    async fn probe(&self) -> Result<ServerReport, Failure> {
         let may_have_status = self
             .without_status
             .get()
             .is_none_or(|found| found.elapsed() >= LOAD_ONLY);
-        if may_have_status && let Some((body, _)) = get(&self.client, &format!("{}/status", self.url)).await? {
+        if may_have_status && let Some(body) = get(&self.client, &format!("{}/status", self.url)).await? {
             return usable(ServerReport::parse(&body).map_err(bad_answer)?);
         }
         let body = get(&self.client, &format!("{}/load", self.url)).await?;
-        let (bytes, length) = body.ok_or_else(|| bad_answer("it has neither /status nor /load"))?;
-        // awc takes the end of the connection for the end of the body: 95.5 may arrive as 9. Truncated JSON is not valid.
-        if length != Some(bytes.len()) {
-            return Err(bad_answer("an answer that does not end as its Content-Length says"));
-        }
-        let report = usable(ServerReport::load_only(Load::parse(&bytes).map_err(bad_answer)?))?;
+        let body = body.ok_or_else(|| bad_answer("it has neither /status nor /load"))?;
+        let report = usable(ServerReport::load_only(Load::parse(&body).map_err(bad_answer)?))?;
         if may_have_status {
             self.without_status.set(Some(Instant::now()));
         }
@@ -215,11 +212,11 @@ impl Target {
     }
 }
 
-/// Returns the body of a page and its `Content-Length`, `None` if the server has no such page.
+/// Returns the body of a page, `None` if the server has no such page.
 ///
 /// # Errors
-/// When no valid answer arrives.
-async fn get(client: &awc::Client, url: &str) -> Result<Option<(Bytes, Option<usize>)>, String> {
+/// When no valid answer arrives, or one that is cut off.
+async fn get(client: &awc::Client, url: &str) -> Result<Option<Bytes>, Failure> {
     let answer = match client.get(url).send().await {
         // The server may have closed an idle connection, which is not a failure: retry once.
         Err(error) if is_broken(&error) => client.get(url).send().await,
@@ -237,8 +234,13 @@ async fn get(client: &awc::Client, url: &str) -> Result<Option<(Bytes, Option<us
         .headers()
         .get(CONTENT_LENGTH)
         .and_then(|value| value.to_str().ok()?.parse::<usize>().ok());
-    let bytes = answer.timeout(NEVER).body().limit(MAX_ANSWER_SIZE).await;
-    Ok(Some((bytes.map_err(bad_answer)?, length)))
+    let body = answer.timeout(NEVER).body().limit(MAX_ANSWER_SIZE).await;
+    let body = body.map_err(bad_answer)?;
+    // awc takes the end of the connection for the end of the body: 95.5 may arrive as 9.
+    if length != Some(body.len()) {
+        return Err(bad_answer("it does not end as its Content-Length says"));
+    }
+    Ok(Some(body))
 }
 
 /// Whether an established connection broke.
@@ -246,29 +248,29 @@ fn is_broken(error: &SendRequestError) -> bool {
     !matches!(error, SendRequestError::Connect(reason) if !matches!(reason, ConnectError::Disconnected))
 }
 
-fn no_answer(error: SendRequestError) -> String {
-    let reason = match error {
+fn no_answer(error: SendRequestError) -> Failure {
+    let cause = match error {
         SendRequestError::Connect(ConnectError::Disconnected) => "it was closed without an answer".to_owned(),
-        error => tls::reason(&error).unwrap_or_else(|| excerpt(&error.to_string(), MAX_REASON_LENGTH)),
+        error => tls::reason(&error).unwrap_or_else(|| excerpt(&error.to_string(), MAX_TEXT_LENGTH)),
     };
-    format!("no connection: {reason}")
+    Failure::new(Reason::NoAnswer, format!("no connection: {cause}"))
 }
 
 /// Refuses the report of a server that can't start simulations, or whose load is not plausible.
-fn usable(report: ServerReport) -> Result<ServerReport, String> {
+fn usable(report: ServerReport) -> Result<ServerReport, Failure> {
+    if report.load.percent() > MAX_LOAD {
+        return Err(bad_answer(format!("a load of {} %", report.load)));
+    }
     match &report.problem {
-        _ if report.load.percent() > MAX_LOAD => Err(bad_answer(format!("a load of {} %", report.load))),
-        Some(problem) => Err(format!(
-            "it can start no simulation: {}",
-            excerpt(problem, MAX_REASON_LENGTH)
-        )),
+        Some(problem) => {
+            let failure = Failure::new(Reason::NotReady, "it can start no simulation");
+            Err(failure.with_output(excerpt(problem, MAX_TEXT_LENGTH)))
+        }
         None => Ok(report),
     }
 }
 
-fn bad_answer(reason: impl Display) -> String {
-    format!(
-        "an answer that makes no sense: {}",
-        excerpt(&reason.to_string(), MAX_REASON_LENGTH)
-    )
+fn bad_answer(cause: impl Display) -> Failure {
+    let cause = excerpt(&cause.to_string(), MAX_TEXT_LENGTH);
+    Failure::new(Reason::InvalidAnswer, format!("an answer that makes no sense: {cause}"))
 }

@@ -1,29 +1,74 @@
 //! What the registry knows of one simulation server, and which of its changes are mailed. Part of the registry.
 
 use std::collections::VecDeque;
+use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 
-use crate::session::mail::NoticeKind;
-use crate::shared::domain::{ProjectUrl, PublicAddress, ServerReport};
+use crate::session::mail::{Notice, NoticeKind};
+use crate::shared::domain::{Failure, PublicAddress, ServerReport};
 use crate::shared::run::timestamp;
 
-/// The state of a simulation server.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "lowercase")]
+/// What is known of a simulation server.
+#[derive(Debug, Clone)]
 pub enum ServerState {
-    /// Its last probe failed.
-    Down,
     /// It was not probed yet.
     Unknown,
-    /// It accepts no new clients: it drains itself, or the configuration drains it.
-    Draining,
-    /// Its load leaves no room for one more client, or it has no free slot.
-    Full,
+    /// Its last probe failed.
+    Down {
+        /// Why.
+        failure: Failure,
+        /// Duration of the failed probe.
+        latency: Duration,
+        /// Its last answer before, if it ever gave one.
+        last_answer: Option<Answer>,
+    },
+    /// Its last probe was answered.
+    Answering {
+        /// The answer.
+        answer: Answer,
+        /// Whether it takes clients, by this answer.
+        intake: Intake,
+    },
+}
+
+/// A simulation server's answer to a probe.
+#[derive(Debug, Clone)]
+pub struct Answer {
+    /// What it reports.
+    pub report: Arc<ServerReport>,
+    /// When the answer arrived.
+    pub at: Instant,
+    /// Duration of the probe.
+    pub latency: Duration,
+}
+
+/// Whether a simulation server that answers takes clients.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Intake {
     /// It accepts clients.
     Up,
+    /// Its load leaves no room for one more client, or it has no free slot.
+    Full,
+    /// It accepts no new clients: it drains itself, or the configuration drains it.
+    Draining,
+}
+
+/// The name of a state in pages, `/status`, metrics and the log.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum StateName {
+    /// See [`ServerState::Unknown`].
+    Unknown,
+    /// See [`Intake::Up`].
+    Up,
+    /// See [`Intake::Full`].
+    Full,
+    /// See [`Intake::Draining`].
+    Draining,
+    /// See [`ServerState::Down`].
+    Down,
 }
 
 /// One simulation server.
@@ -33,18 +78,10 @@ pub struct ServerRecord {
     pub address: PublicAddress,
     /// Whether it is listed in `drainedServers`.
     pub drained: bool,
-    /// Its state, as of its last probe.
+    /// What is known of it, as of its last probe.
     pub state: ServerState,
-    /// When it entered that state, as text.
+    /// When its state got its present name, as text.
     pub since: String,
-    /// Its last report; kept when it is down.
-    pub report: Option<Arc<ServerReport>>,
-    /// The last error; kept after the server has answered again.
-    pub last_error: Option<String>,
-    /// Duration of the last probe.
-    pub latency: Option<Duration>,
-    /// Time of its last valid answer.
-    pub answered: Option<Instant>,
 }
 
 /// A simulation server has changed its state.
@@ -55,18 +92,94 @@ pub struct StateChange {
     /// The simulation server's address.
     pub server: String,
     /// Its new state.
-    pub state: ServerState,
+    pub state: StateName,
     /// The reason, as text.
     pub why: String,
 }
 
 /// A change of a server's state, and the notice of it to the administrator, if any.
-pub type ServerChange = (StateChange, Option<NoticeKind>);
+#[derive(Debug)]
+pub struct ServerChange {
+    /// The change.
+    pub change: StateChange,
+    /// The notice.
+    pub notice: Option<Notice>,
+}
+
+impl StateName {
+    /// All names.
+    pub const ALL: [Self; 5] = [Self::Unknown, Self::Up, Self::Full, Self::Draining, Self::Down];
+
+    /// The name as text.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Unknown => "unknown",
+            Self::Up => "up",
+            Self::Full => "full",
+            Self::Draining => "draining",
+            Self::Down => "down",
+        }
+    }
+}
+
+impl fmt::Display for StateName {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.write_str(self.as_str())
+    }
+}
+
+impl Serialize for StateName {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(self.as_str())
+    }
+}
 
 impl ServerState {
-    /// The name of the state in pages and metrics.
-    pub fn word(self) -> String {
-        format!("{self:?}").to_lowercase()
+    /// Its name.
+    pub fn name(&self) -> StateName {
+        match self {
+            Self::Unknown => StateName::Unknown,
+            Self::Down { .. } => StateName::Down,
+            Self::Answering { intake, .. } => match intake {
+                Intake::Up => StateName::Up,
+                Intake::Full => StateName::Full,
+                Intake::Draining => StateName::Draining,
+            },
+        }
+    }
+
+    /// The report of a server that answers.
+    pub fn report(&self) -> Option<&ServerReport> {
+        match self {
+            Self::Answering { answer, .. } => Some(&answer.report),
+            Self::Unknown | Self::Down { .. } => None,
+        }
+    }
+
+    /// The last answer; of a server that is down, the one before.
+    pub fn last_answer(&self) -> Option<&Answer> {
+        match self {
+            Self::Unknown => None,
+            Self::Down { last_answer, .. } => last_answer.as_ref(),
+            Self::Answering { answer, .. } => Some(answer),
+        }
+    }
+
+    /// Why the last probe failed, if it did.
+    pub fn failure(&self) -> Option<&Failure> {
+        match self {
+            Self::Down { failure, .. } => Some(failure),
+            Self::Unknown | Self::Answering { .. } => None,
+        }
+    }
+
+    /// Duration of the last probe.
+    pub fn latency(&self) -> Option<Duration> {
+        match self {
+            Self::Unknown => None,
+            Self::Down { latency, .. } => Some(*latency),
+            Self::Answering { answer, .. } => Some(answer.latency),
+        }
     }
 }
 
@@ -78,96 +191,89 @@ impl ServerRecord {
             drained: false,
             state: ServerState::Unknown,
             since: timestamp(SystemTime::now()),
-            report: None,
-            last_error: None,
-            latency: None,
-            answered: None,
         }
     }
 
-    /// Records a report that arrived at this time. From a load of `limit` percent the server counts as full. Returns
-    /// what has changed.
-    pub fn succeeded(&mut self, report: Arc<ServerReport>, at: Instant, limit: f64) -> Option<ServerChange> {
-        let load = report.load.percent();
-        let full = report
-            .instances
-            .filter(|instances| instances.present() >= instances.places);
-        let (state, reason) = if self.drained {
-            (ServerState::Draining, " (drained by drainedServers)".to_owned())
-        } else if report.draining {
-            (ServerState::Draining, " (it drains itself)".to_owned())
-        } else if let Some(full) = full {
-            (
-                ServerState::Full,
-                format!(", {} clients in {} places", full.present(), full.places),
-            )
-        } else if load >= limit {
-            (ServerState::Full, format!(" of {limit:.1} %"))
-        } else {
-            (ServerState::Up, String::new())
-        };
-        (self.report, self.answered) = (Some(report), Some(at));
-        self.enter(state, || format!("load {load:.1} %{reason}"))
+    /// Records an answer. From a load of `limit` percent the server counts as full. Returns what has changed.
+    pub fn answered(&mut self, answer: Answer, limit: f64) -> Option<ServerChange> {
+        let load = answer.report.load.percent();
+        let (intake, why) = self.intake(&answer.report, limit);
+        self.enter(ServerState::Answering { answer, intake }, || {
+            format!("load {load:.1} %{why}")
+        })
     }
 
     /// Records that a probe has failed. Returns what has changed.
-    pub fn failed(&mut self, error: String) -> Option<ServerChange> {
-        self.last_error = Some(error.clone());
-        self.enter(ServerState::Down, || error)
+    pub fn failed(&mut self, failure: Failure, latency: Duration) -> Option<ServerChange> {
+        let why = failure.in_full();
+        let last_answer = self.state.last_answer().cloned();
+        let state = ServerState::Down {
+            failure,
+            latency,
+            last_answer,
+        };
+        self.enter(state, || why)
     }
 
-    /// Why the last probe failed, if it did.
-    pub fn error(&self) -> Option<&str> {
-        self.last_error.as_deref().filter(|_| self.state == ServerState::Down)
-    }
-
-    /// The last report, unless the server is down.
-    pub fn current(&self) -> Option<&ServerReport> {
-        self.report.as_deref().filter(|_| self.state != ServerState::Down)
-    }
-
-    /// Whether the server accepts a world, by its last report; `None` if it never answered.
-    pub fn accepts(&self, world: &ProjectUrl) -> Option<bool> {
-        self.report.as_ref().map(|report| report.accepts(world))
+    /// Whether the server takes clients by this report, and the reason if it does not, as the end of a text.
+    fn intake(&self, report: &ServerReport, limit: f64) -> (Intake, String) {
+        let full = report
+            .instances
+            .filter(|instances| instances.present() >= instances.places);
+        if self.drained {
+            (Intake::Draining, " (drained by drainedServers)".to_owned())
+        } else if report.draining {
+            (Intake::Draining, " (it drains itself)".to_owned())
+        } else if let Some(full) = full {
+            let why = format!(", {} clients in {} places", full.present(), full.places);
+            (Intake::Full, why)
+        } else if report.load.percent() >= limit {
+            (Intake::Full, format!(" of {limit:.1} %"))
+        } else {
+            (Intake::Up, String::new())
+        }
     }
 
     fn enter(&mut self, state: ServerState, why: impl FnOnce() -> String) -> Option<ServerChange> {
         let before = std::mem::replace(&mut self.state, state);
-        if before == state {
+        let name = self.state.name();
+        if before.name() == name {
             return None;
         }
         self.since = timestamp(SystemTime::now());
+        let server = self.address.to_string();
+        let notice = event(&before, &self.state).map(|(event, failure)| Notice {
+            server: server.clone(),
+            event,
+            // The last known one: a server that does not answer reports none.
+            load: self.state.last_answer().map(|answer| answer.report.load),
+            failure: failure.cloned(),
+            at: self.since.clone(),
+        });
         let change = StateChange {
             at: self.since.clone(),
-            server: self.address.to_string(),
-            state,
+            server,
+            state: name,
             why: why(),
         };
-        // The four events of the original.
-        let event = match (before, state) {
-            (_, ServerState::Down) => Some(NoticeKind::NotResponding),
-            (ServerState::Down, _) => Some(NoticeKind::WorkingAgain),
-            (_, ServerState::Full) => Some(NoticeKind::MaximumLoad),
-            (ServerState::Full, ServerState::Up) => Some(NoticeKind::AvailableAgain),
-            _ => None,
-        };
-        Some((change, event))
+        Some(ServerChange { change, notice })
     }
 }
 
-/// Whether some server refuses a world, no other accepts it, and all have been probed. A server that has never answered
-/// does not count, because it may never answer.
-pub fn is_refused<'a>(servers: impl Iterator<Item = &'a ServerRecord>, world: &ProjectUrl) -> bool {
-    let mut refused = false;
-    for server in servers {
-        match server.accepts(world) {
-            Some(true) => return false,
-            Some(false) => refused = true,
-            None if server.state == ServerState::Unknown => return false,
-            None => {}
-        }
+/// The event that a change of state is to the administrator, if any, with the failure that begins or ends with it. These
+/// are the four events of the original.
+fn event<'a>(before: &'a ServerState, after: &'a ServerState) -> Option<(NoticeKind, Option<&'a Failure>)> {
+    if let Some(failure) = after.failure() {
+        return Some((NoticeKind::NotResponding, Some(failure)));
     }
-    refused
+    if let Some(failure) = before.failure() {
+        return Some((NoticeKind::WorkingAgain, Some(failure)));
+    }
+    match (before.name(), after.name()) {
+        (_, StateName::Full) => Some((NoticeKind::MaximumLoad, None)),
+        (StateName::Full, StateName::Up) => Some((NoticeKind::AvailableAgain, None)),
+        _ => None,
+    }
 }
 
 /// Everything that is known of the fleet.
@@ -186,12 +292,16 @@ pub struct FleetStatus {
 }
 
 impl FleetStatus {
-    /// Number of simulation servers in this state.
-    pub fn count(&self, state: ServerState) -> usize {
-        self.servers
-            .iter()
-            .filter(|server| server.record.state == state)
-            .count()
+    /// Number of simulation servers in a state of this name.
+    pub fn count(&self, state: StateName) -> usize {
+        let names = self.servers.iter().map(|server| server.record.state.name());
+        names.filter(|name| *name == state).count()
+    }
+
+    /// Number of simulation servers that answer.
+    pub fn answering(&self) -> usize {
+        let reports = self.servers.iter().map(|server| server.record.state.report());
+        reports.flatten().count()
     }
 }
 
@@ -212,7 +322,7 @@ pub struct ServerStatus {
     /// What its probes have shown.
     pub record: ServerRecord,
     /// Why the last probe failed, if it did, or why others are preferred to it, if they are.
-    pub error: Option<String>,
+    pub failure: Option<Failure>,
     /// The reported load plus that of the clients that it does not show yet, in percent.
     pub effective_load: Option<f64>,
     /// Number of clients that were sent there and have not arrived yet.
@@ -224,24 +334,33 @@ pub struct ServerStatus {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::shared::domain::Load;
+    use crate::shared::domain::{Load, Reason};
 
-    fn report(load: f64) -> ServerReport {
-        ServerReport::load_only(Load::try_from(load).unwrap())
+    fn answer(load: f64) -> Answer {
+        Answer {
+            report: Arc::new(ServerReport::load_only(Load::try_from(load).unwrap())),
+            at: Instant::now(),
+            latency: Duration::ZERO,
+        }
     }
 
     /// The notice after each step, if any. A step is a load, or `None` for a failure.
-    fn events(steps: &[Option<f64>]) -> Vec<Option<NoticeKind>> {
+    fn notices(steps: &[Option<f64>]) -> Vec<Option<Notice>> {
         let mut record = ServerRecord::new("host:2000".parse().unwrap());
         let change = |step: &Option<f64>| match step {
-            Some(load) => record.succeeded(Arc::new(report(*load)), Instant::now(), 95.0),
-            None => record.failed(String::new()),
+            Some(load) => record.answered(answer(*load), 95.0),
+            None => record.failed(Failure::new(Reason::NoAnswer, "broken"), Duration::ZERO),
         };
         steps
             .iter()
             .map(change)
-            .map(|change| change.and_then(|(_, event)| event))
+            .map(|change| change.and_then(|change| change.notice))
             .collect()
+    }
+
+    fn events(steps: &[Option<f64>]) -> Vec<Option<NoticeKind>> {
+        let notices = notices(steps).into_iter();
+        notices.map(|notice| notice.map(|notice| notice.event)).collect()
     }
 
     #[test]
@@ -268,5 +387,20 @@ mod tests {
             events(&[Some(96.0), None, Some(1.0)]),
             [Some(MaximumLoad), Some(NotResponding), Some(WorkingAgain)]
         );
+    }
+
+    #[test]
+    fn a_notice_has_the_last_load_and_the_failure_that_begins_or_ends() {
+        let notices = notices(&[Some(3.0), None, Some(4.0)]);
+        let [None, Some(down), Some(up)] = notices.as_slice() else {
+            panic!("{notices:?}");
+        };
+        for (notice, load) in [(down, 3.0), (up, 4.0)] {
+            assert_eq!(notice.load.map(Load::percent), Some(load));
+            assert_eq!(
+                notice.failure.as_ref().map(|failure| failure.reason),
+                Some(Reason::NoAnswer)
+            );
+        }
     }
 }

@@ -5,9 +5,9 @@ use std::collections::VecDeque;
 
 use tokio::sync::mpsc::UnboundedSender;
 
-use super::server_record::{ServerRecord, ServerState, StateChange};
+use super::server_record::{ServerChange, StateChange, StateName};
 use crate::session::config::SessionConfig;
-use crate::session::mail::{self, Notice, NoticeKind};
+use crate::session::mail::{self, Notice};
 
 /// The last changes, and the mailers that notify the administrator.
 pub struct StateHistory {
@@ -29,26 +29,15 @@ impl StateHistory {
         }
     }
 
-    /// Adds and logs a change, and notifies the administrator of `event`. `record` is the server's record after it.
-    pub fn add(&mut self, record: &ServerRecord, change: StateChange, event: Option<NoticeKind>) {
-        let StateChange { at, server, state, why } = &change;
-        let level = if *state == ServerState::Down {
+    /// Adds and logs a change, and notifies the administrator.
+    pub fn add(&mut self, ServerChange { change, notice }: ServerChange) {
+        let level = if change.state == StateName::Down {
             log::Level::Warn
         } else {
             log::Level::Info
         };
-        log::log!(level, "{server}: {}: {why}", state.word());
-        if let Some(event) = event {
-            // The last known values: a server that does not answer reports no load, and one that works again no error.
-            let load = record.report.as_ref().map(|report| report.load);
-            let error = record.last_error.clone().filter(|_| !event.is_about_load());
-            let notice = Notice {
-                server: server.clone(),
-                event,
-                load,
-                error,
-                at: at.clone(),
-            };
+        log::log!(level, "{}: {}: {}", change.server, change.state, change.why);
+        if let Some(notice) = notice {
             for mailer in &self.mailers {
                 // Without a receiver the server stops.
                 mailer.send(notice.clone()).ok();

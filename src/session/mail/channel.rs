@@ -37,11 +37,10 @@ impl Channel {
     /// When a key that mail requires is not set.
     pub fn mail(config: &SessionConfig) -> Result<Self, String> {
         let relay = SmtpRelay::new(config).map_err(|key| format!("no mail is sent: {key} is not set"))?;
-        let (server, transport) = (relay.server(), Transport::Smtp(Box::new(relay)));
         Ok(Self {
             name: "mail",
-            server,
-            transport,
+            server: relay.server(),
+            transport: Transport::Smtp(Box::new(relay)),
             time_limit: config.timing.mail_answer,
         })
     }
@@ -51,12 +50,11 @@ impl Channel {
         let webhook = config.webhook.clone()?;
         let url = url::Url::parse(webhook.reveal()).ok()?;
         let server = format!("{}:{}", url.host_str()?, url.port_or_known_default()?);
-        let (transport, time_limit) = (Transport::Webhook(webhook), config.timing.mail_answer);
         Some(Self {
             name: "webhook",
             server,
-            transport,
-            time_limit,
+            transport: Transport::Webhook(webhook),
+            time_limit: config.timing.mail_answer,
         })
     }
 

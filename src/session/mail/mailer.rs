@@ -17,10 +17,12 @@ use crate::shared::run::permanent;
 /// Starts a mailer for each channel that is configured. Returns the senders for their notices.
 pub fn start(config: &SessionConfig) -> Vec<UnboundedSender<Notice>> {
     let mail = Channel::mail(config).inspect_err(|why| log::info!("{why}"));
-    let (signature, timing) = (signature(config), config.timing.clone());
+    let signature = signature(config);
+    let timing = config.timing.clone();
     let start = |channel: Channel| {
         let (sender, mut notices) = unbounded_channel();
-        let (signature, timing) = (signature.clone(), timing.clone());
+        let signature = signature.clone();
+        let timing = timing.clone();
         actix_rt::spawn(async move {
             let name = format!("mailer of notices by {}", channel.name);
             let send = async || send_all(&channel, &signature, Outbox::new(&timing), &mut notices).await;
@@ -51,7 +53,9 @@ async fn send_all(channel: &Channel, signature: &str, mut outbox: Outbox, notice
 
 /// Reports the outcome of sending a batch to the outbox and the log.
 fn handle_outcome(channel: &Channel, outbox: &mut Outbox, batch: Vec<WaitingNotice>, sent: Result<String, String>) {
-    let (now, subject, name) = (Instant::now(), summary(&batch), channel.name);
+    let now = Instant::now();
+    let subject = summary(&batch);
+    let name = channel.name;
     match sent {
         Ok(answer) => {
             log::info!("{name} sent by {} ({subject}): {answer}", channel.server);

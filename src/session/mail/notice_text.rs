@@ -31,17 +31,19 @@ pub fn test_text(signature: &str) -> String {
 }
 
 fn paragraph(notice: &Notice) -> String {
-    let (server, event, time) = (excerpt(&notice.server, MAX_LETTERS), notice.event.words(), &notice.at);
+    let server = excerpt(&notice.server, MAX_LETTERS);
+    let event = notice.event.words();
     let load = notice
         .load
         .map(|load| format!("  Load:       {:.1}%\n", load.percent()))
         .unwrap_or_default();
-    let error = notice
-        .error
-        .as_ref()
-        .map(|error| format!("  Last error: {}\n", excerpt(error, MAX_LETTERS)));
+    let error = notice.failure.as_ref().map(|failure| {
+        let text = excerpt(&failure.in_full(), MAX_LETTERS);
+        format!("  Last error: {text}\n  Reason:     {}\n", failure.reason)
+    });
     format!(
-        "{server}: {event}\n  Time:       {time}\n{load}{}\n",
+        "{server}: {event}\n  Time:       {}\n{load}{}\n",
+        notice.at,
         error.unwrap_or_default()
     )
 }

@@ -12,7 +12,7 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use crate::session::config::Timing;
-use crate::shared::domain::Load;
+use crate::shared::domain::{Failure, Load};
 
 /// A change of a simulation server that is mailed to the administrator.
 #[derive(Debug, Clone, PartialEq)]
@@ -23,8 +23,8 @@ pub struct Notice {
     pub event: NoticeKind,
     /// Its load, if known.
     pub load: Option<Load>,
-    /// The last error, if any; untrusted text.
-    pub error: Option<String>,
+    /// The failed probe that begins or ends with it, if any.
+    pub failure: Option<Failure>,
     /// When it happened, as text.
     pub at: String,
 }
@@ -109,9 +109,10 @@ impl Outbox {
 
     /// Adds a notice. It replaces one about the same topic.
     pub fn add(&mut self, notice: Notice, now: Instant) {
-        let (gathered, expires) = (now + self.timing.gather, now + self.timing.mail_patience);
+        let gather_until = now + self.timing.gather;
+        let expires = now + self.timing.mail_patience;
         let topic = self.topic(&notice);
-        let gathered = topic.waiting.as_ref().map_or(gathered, |older| older.gathered);
+        let gathered = topic.waiting.as_ref().map_or(gather_until, |older| older.gathered);
         topic.waiting = Some(WaitingNotice {
             notice,
             gathered,
@@ -141,7 +142,8 @@ impl Outbox {
 
     /// Records that a batch was sent.
     pub fn succeeded(&mut self, batch: &[WaitingNotice], now: Instant) {
-        (self.delay, self.retry_at) = (self.timing.mail_retry, None);
+        self.delay = self.timing.mail_retry;
+        self.retry_at = None;
         for WaitingNotice { notice, .. } in batch {
             self.topic(notice).held_until = Some(now + self.timing.flapping);
         }
@@ -174,7 +176,7 @@ mod tests {
             server: format!("host:{port}"),
             event,
             load: None,
-            error: None,
+            failure: None,
             at: String::new(),
         }
     }

@@ -1,17 +1,10 @@
 //! The Prometheus metrics of `/metrics` that follow from the status of the fleet. Counters are in `app`.
 
-use crate::session::fleet::{FleetStatus, NameStatus, ServerState, ServerStatus};
+use crate::session::fleet::{FleetStatus, NameStatus, ServerStatus, StateName};
 use crate::shared::http::Gauge;
 
 /// The gauges of `/metrics`.
 pub fn gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> {
-    let all = [
-        ServerState::Unknown,
-        ServerState::Up,
-        ServerState::Full,
-        ServerState::Draining,
-        ServerState::Down,
-    ];
     let of_servers = |name, help, value: &dyn Fn(&ServerStatus) -> Option<f64>| {
         let value = |server: &ServerStatus| Some((vec![server.record.address.to_string()], value(server)?));
         Gauge {
@@ -46,25 +39,20 @@ pub fn gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> 
             name: "webots_session_servers",
             help: "Simulation servers by state",
             labels: &["state"],
-            values: all
+            values: StateName::ALL
                 .iter()
-                .map(|state| (vec![state.word()], number(status.count(*state))))
+                .map(|state| (vec![state.to_string()], number(status.count(*state))))
                 .collect(),
         },
         of_servers(
             "webots_session_server_up",
             "1 while a simulation server gives good answers",
-            &|server| {
-                Some(f64::from(u8::from(!matches!(
-                    server.record.state,
-                    ServerState::Down | ServerState::Unknown
-                ))))
-            },
+            &|server| Some(f64::from(u8::from(server.record.state.report().is_some()))),
         ),
         of_servers(
             "webots_session_server_load_percent",
             "Load that a simulation server reported last",
-            &|server| server.record.current().map(|report| report.load.percent()),
+            &|server| server.record.state.report().map(|report| report.load.percent()),
         ),
         of_servers(
             "webots_session_server_effective_load_percent",
@@ -79,7 +67,7 @@ pub fn gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> 
         of_servers(
             "webots_session_server_latency_seconds",
             "Time in which a simulation server answered last",
-            &|server| server.record.latency.map(|latency| latency.as_secs_f64()),
+            &|server| server.record.state.latency().map(|latency| latency.as_secs_f64()),
         ),
         of_names(
             "webots_session_lookup_up",

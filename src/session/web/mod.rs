@@ -3,6 +3,7 @@
 mod metrics;
 mod page_routes;
 pub mod pages;
+mod refusal;
 mod routes;
 mod status;
 mod web_client;

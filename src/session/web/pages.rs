@@ -6,7 +6,7 @@ use std::time::Duration;
 use askama::Template;
 
 use crate::session::config::Example;
-use crate::session::fleet::{FleetStatus, ServerState, ServerStatus, StateChange};
+use crate::session::fleet::{FleetStatus, ServerStatus, StateChange, StateName};
 use crate::shared::domain::{ClientUrls, Instances, ServerReport};
 use crate::shared::http::{PageView, TableRow};
 use crate::shared::text::one_line;
@@ -89,7 +89,7 @@ pub fn view(
         let monitor = format!("{}/monitor", urls.http_url(&server.record.address));
         let html = ServerRow {
             server,
-            report: server.record.current(),
+            report: server.record.state.report(),
             monitor,
         }
         .render()?;
@@ -122,7 +122,7 @@ impl<'status> Glance<'status> {
         let instances: Vec<_> = status
             .servers
             .iter()
-            .filter_map(|one| one.record.current()?.instances)
+            .filter_map(|one| one.record.state.report()?.instances)
             .collect();
         // Numbers that another server reports may be arbitrarily large.
         let sum = |part: fn(&Instances) -> u32| instances.iter().map(|one| u64::from(part(one))).sum();

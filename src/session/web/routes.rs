@@ -9,10 +9,10 @@ use actix_web::{HttpRequest, HttpResponse, Result, web};
 use percent_encoding::percent_decode_str;
 use serde::Deserialize;
 
+use super::refusal::{self, REASON_HEADER};
 use super::status::status_page;
 use super::web_client::WebClient;
 use super::{metrics, page_routes};
-use crate::session::fleet::PickError;
 use crate::session::state::AppState;
 use crate::shared::http::routing::{self, GET, POST, READ, json_body, path, retry_after};
 use crate::shared::http::{CONTENT_TYPE, ConnectionKind, refuse_action, websocket};
@@ -25,6 +25,8 @@ struct Announcement {
     text: String,
 }
 
+/// The content type of an answer of `/session`.
+const TEXT: &str = "text/plain; charset=utf-8";
 /// Longest announcement, in characters.
 const MAX_ANNOUNCEMENT: usize = 300;
 
@@ -70,21 +72,20 @@ async fn session(request: HttpRequest, stream: web::Payload, server: web::Data<A
     }
     let from = server.config.trusted_proxies.peer(&request).rate_limit_key();
     let world = wanted_world(request.query_string());
-    let picked = server.pick(world.as_deref(), from).await;
-    let status = match &picked {
-        Ok(_) => StatusCode::OK,
-        // As the Python server answers: clients such as PHP's `file_get_contents` read no body with another status.
-        Err(_) if world.is_none() => StatusCode::OK,
-        Err(PickError::Unavailable) => StatusCode::SERVICE_UNAVAILABLE,
-        Err(PickError::NotAccepted(_)) => StatusCode::FORBIDDEN,
-        Err(PickError::InvalidWorld(_)) => StatusCode::BAD_REQUEST,
+    let failure = match server.pick(world.as_deref(), from).await {
+        Ok(url) => return Ok(HttpResponse::Ok().content_type(TEXT).body(url)),
+        Err(failure) => failure,
     };
+    // Without a world, as the Python server answers: clients such as PHP's `file_get_contents` read no body with another
+    // status.
+    let status = world.map_or(StatusCode::OK, |_| refusal::status(failure.reason));
     let mut response = HttpResponse::build(status);
     if status == StatusCode::SERVICE_UNAVAILABLE {
         response.insert_header(retry_after());
     }
-    let text = picked.unwrap_or_else(|error| error.for_client());
-    Ok(response.content_type("text/plain; charset=utf-8").body(text))
+    response.insert_header((REASON_HEADER, failure.reason.code()));
+    response.insert_header((header::ACCESS_CONTROL_EXPOSE_HEADERS, REASON_HEADER));
+    Ok(response.content_type(TEXT).body(refusal::sentence(&failure)))
 }
 
 /// The world of a query. `webots.js` does not percent-encode it, so everything after `url=` is the world: a plus sign

@@ -6,7 +6,7 @@ use serde_json::{Value, json};
 
 use crate::session::fleet::{FleetStatus, ServerStatus};
 use crate::session::state::AppState;
-use crate::shared::domain::ClientUrls;
+use crate::shared::domain::{ClientUrls, Failure};
 
 /// The page `/status`. Loads are in percent, times in seconds; unknown values are `null`.
 pub fn status_page(server: &AppState, status: &FleetStatus) -> Value {
@@ -23,11 +23,13 @@ pub fn status_page(server: &AppState, status: &FleetStatus) -> Value {
 }
 
 fn server_status(server: &ServerStatus, urls: &ClientUrls) -> Value {
-    let (record, report) = (&server.record, server.record.current());
+    let record = &server.record;
+    let state = &record.state;
+    let report = state.report();
     json!({
         "address": record.address,
         "monitor": format!("{}/monitor", urls.http_url(&record.address)),
-        "state": record.state,
+        "state": state.name(),
         "since": record.since,
         "load": report.map(|report| report.load),
         "effectiveLoad": server.effective_load,
@@ -37,8 +39,9 @@ fn server_status(server: &ServerStatus, urls: &ClientUrls) -> Value {
         "allowedRepositories": report.map(|report| report.allowed_repositories.as_slice()).unwrap_or_default(),
         "version": report.map(|report| report.version.as_str()).unwrap_or_default(),
         // Since the last good answer.
-        "age": record.answered.map(|answered| answered.elapsed().as_secs_f64()),
-        "latency": record.latency.as_ref().map(Duration::as_secs_f64),
-        "error": server.error,
+        "age": state.last_answer().map(|answer| answer.at.elapsed().as_secs_f64()),
+        "latency": state.latency().as_ref().map(Duration::as_secs_f64),
+        "error": server.failure.as_ref().map(Failure::in_full),
+        "reason": server.failure.as_ref().map(|failure| failure.reason),
     })
 }

@@ -11,8 +11,10 @@ use bytestring::ByteString;
 use futures_util::StreamExt;
 use futures_util::stream::{self, Stream};
 use serde::Deserialize;
+use serde_json::Value;
 use tokio::sync::watch;
 
+use super::refusal;
 use crate::session::state::AppState;
 use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::websocket::wrong_message;
@@ -54,27 +56,58 @@ impl WebClient {
 
     fn pick(&self, text: &str, ctx: &mut Context) {
         let server = Arc::clone(&self.server);
-        let (wanted, from) = (wanted_world(text), self.peer.rate_limit_key());
-        let picked = async move { server.pick(wanted.as_deref(), from).await };
+        let request = ServerRequest::parse(text);
+        let from = self.peer.rate_limit_key();
+        let picked = async move {
+            let picked = server.pick(request.world.as_deref(), from).await;
+            (picked, request.wants_reason)
+        };
         // The actor handles nothing else until then, so that answers keep the order of the texts and precede a close.
         picked
             .into_actor(self)
-            .map(|picked, _, ctx| ctx.text(picked.unwrap_or_else(|error| error.for_client())))
+            .map(|(picked, wants_reason), _, ctx| match picked {
+                Ok(url) => ctx.text(url),
+                Err(failure) => {
+                    if wants_reason {
+                        ctx.text(refusal::reason_text(failure.reason));
+                    }
+                    ctx.text(refusal::sentence(&failure));
+                }
+            })
             .wait(ctx);
     }
 }
 
-/// The world that a message names, as a URL or `{"url": ...}`; `None` if it names none.
-fn wanted_world(text: &str) -> Option<String> {
-    #[derive(Deserialize)]
-    struct Wanted {
-        url: serde_json::Value,
+/// A client's text: a request for a simulation server.
+#[derive(Debug, PartialEq)]
+struct ServerRequest {
+    /// The URL of its world, if it names one.
+    world: Option<String>,
+    /// Whether it understands a text with the reason before that of an error.
+    wants_reason: bool,
+}
+
+impl ServerRequest {
+    /// Reads a URL or `{"url": ...}`; anything else names no world.
+    fn parse(text: &str) -> Self {
+        #[derive(Deserialize)]
+        struct Wanted {
+            url: Value,
+            #[serde(default)]
+            reason: Value,
+        }
+        let text = text.trim();
+        match serde_json::from_str(text) {
+            Ok(Wanted { url, reason }) => Self {
+                world: Some(url.as_str().map_or_else(|| url.to_string(), str::to_owned)),
+                wants_reason: reason == true,
+            },
+            Err(_) => Self {
+                world: text.contains("://").then(|| text.to_owned()),
+                wants_reason: false,
+            },
+        }
     }
-    let text = text.trim();
-    if let Ok(Wanted { url }) = serde_json::from_str(text) {
-        return Some(url.as_str().map_or_else(|| url.to_string(), str::to_owned));
-    }
-    text.contains("://").then(|| text.to_owned())
 }
 
 impl Actor for WebClient {
@@ -172,7 +205,21 @@ mod tests {
             ("http://no.world", Some("http://no.world")),
         ];
         for (text, expected) in table {
-            assert_eq!(wanted_world(text).as_deref(), expected, "{text:?}");
+            let request = ServerRequest::parse(text);
+            assert_eq!(request.world.as_deref(), expected, "{text:?}");
+            assert!(!request.wants_reason, "{text:?}");
+        }
+    }
+
+    #[test]
+    fn only_a_client_that_asks_for_the_reason_gets_it() {
+        for (text, expected) in [
+            (r#"{"url": "x", "reason": true}"#, true),
+            (r#"{"url": "x", "reason": false}"#, false),
+            (r#"{"url": "x", "reason": "true"}"#, false),
+            (r#"{"reason": true}"#, false),
+        ] {
+            assert_eq!(ServerRequest::parse(text).wants_reason, expected, "{text}");
         }
     }
 }

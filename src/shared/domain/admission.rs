@@ -18,71 +18,53 @@ pub struct AdmissionRules<Prefixes = Vec<UrlPrefix>> {
     pub share_idle_time: f64,
 }
 
-/// Why a world may not run, as text for the client. It is formatted only on demand, because a session server checks the
-/// rules of every server.
-#[derive(Debug, PartialEq, thiserror::Error)]
-pub enum AdmissionError<'world> {
-    /// Its repository is blocked.
-    #[error("Cannot run simulation from blocked repository: {}", .0.repository())]
-    Blocked(&'world ProjectUrl),
-    /// Its repository is not allowed, and the server does not run containers.
-    #[error(
-        "Docker not enabled: cannot host simulations from repositories outside of those that this simulation server allows, and {} is not one of them",
-        .0.repository()
-    )]
-    NotAllowed(&'world ProjectUrl),
-    /// Its repository is not allowed, and the server does not share idle time.
-    #[error("This simulation server is not configured to share idle time: it does not allow {}", .0.repository())]
-    NotShared(&'world ProjectUrl),
-    /// Its repository is allowed only at a lower load.
-    #[error(
-        "Cannot share idle time when current load is above threshold: {load:.0} % are more than {threshold} %. Try again later"
-    )]
-    Busy {
-        /// Percent.
-        load: f64,
-        /// Percent.
-        threshold: f64,
-    },
-}
-
-impl From<AdmissionError<'_>> for Failure {
-    fn from(error: AdmissionError<'_>) -> Self {
-        let reason = match error {
-            AdmissionError::Blocked(_) => Reason::RepositoryBlocked,
-            AdmissionError::NotAllowed(_) | AdmissionError::NotShared(_) => Reason::RepositoryNotAllowed,
-            AdmissionError::Busy { .. } => Reason::NoIdleTime,
-        };
-        Self::new(reason, error.to_string())
-    }
-}
-
 impl<Prefixes: AsRef<[UrlPrefix]>> AdmissionRules<Prefixes> {
     /// Whether a world may run at this load. A world of a blocked repository never may; the original checks the blocked
     /// repositories only for worlds that are not allowed.
     ///
     /// # Errors
     /// Why it may not.
-    pub fn admit<'world>(&self, world: &'world ProjectUrl, load: Load) -> Result<(), AdmissionError<'world>> {
-        if self.blocked.as_ref().iter().any(|prefix| prefix.covers(world)) {
-            return Err(AdmissionError::Blocked(world));
+    pub fn admit(&self, world: &ProjectUrl, load: Load) -> Result<(), Failure> {
+        self.check(world, load)
+            .map_err(|reason| self.failure(reason, world, load))
+    }
+
+    /// As [`Self::admit`], without a text: a session server checks the rules of every server.
+    ///
+    /// # Errors
+    /// Why it may not.
+    pub fn check(&self, world: &ProjectUrl, load: Load) -> Result<(), Reason> {
+        let covered = |prefixes: &Prefixes| prefixes.as_ref().iter().any(|prefix| prefix.covers(world));
+        if covered(&self.blocked) {
+            Err(Reason::RepositoryBlocked)
+        } else if covered(&self.allowed) {
+            Ok(())
+        } else if !self.docker || self.share_idle_time <= 0.0 {
+            Err(Reason::RepositoryNotAllowed)
+        } else if load.percent() > self.share_idle_time {
+            Err(Reason::NoIdleTime)
+        } else {
+            Ok(())
         }
-        if self.allowed.as_ref().iter().any(|prefix| prefix.covers(world)) {
-            return Ok(());
-        }
-        if !self.docker {
-            return Err(AdmissionError::NotAllowed(world));
-        }
-        if self.share_idle_time <= 0.0 {
-            return Err(AdmissionError::NotShared(world));
-        }
-        if load.percent() > self.share_idle_time {
-            return Err(AdmissionError::Busy {
-                load: load.percent(),
-                threshold: self.share_idle_time,
-            });
-        }
-        Ok(())
+    }
+
+    fn failure(&self, reason: Reason, world: &ProjectUrl, load: Load) -> Failure {
+        let repository = world.repository();
+        let threshold = self.share_idle_time;
+        let message = match reason {
+            Reason::RepositoryBlocked => format!("Cannot run simulation from blocked repository: {repository}"),
+            Reason::NoIdleTime => format!(
+                "Cannot share idle time when current load is above threshold: {:.0} % are more than {threshold} %. Try \
+                 again later",
+                load.percent()
+            ),
+            _ if !self.docker => format!(
+                "Docker not enabled: cannot host simulations from repositories outside of those that this simulation \
+                 server allows, and {repository} is not one of them"
+            ),
+            _ => format!("This simulation server is not configured to share idle time: it does not allow {repository}"),
+        };
+        Failure::new(reason, message)
     }
 }
 

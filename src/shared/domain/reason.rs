@@ -105,6 +105,15 @@ reasons! {
         /// Nothing can be reset: no simulation runs, or the controller's file does not exist.
         NothingToReset = "nothing-to-reset", User, No;
     }
+    /// The reasons for which a simulation server gets no clients, or only if no other has room.
+    SERVER_FAILURES {
+        /// The simulation server does not answer a probe in time, or closes the connection.
+        NoAnswer = "no-answer", Server, Elsewhere;
+        /// What the simulation server answers to a probe is no report.
+        InvalidAnswer = "invalid-answer", Server, Elsewhere;
+        /// The last starts on the simulation server have failed by its own fault.
+        StartsFail = "starts-fail", Server, Elsewhere;
+    }
     /// The reasons for which a start fails.
     FAILED_STARTS {
         /// The repository does not exist, or is not public.
@@ -206,6 +215,14 @@ impl Failure {
             reason,
             message: message.into(),
             output: None,
+        }
+    }
+
+    /// The message, and what others have printed, for people.
+    pub fn in_full(&self) -> String {
+        match &self.output {
+            Some(output) => format!("{}: {output}", self.message),
+            None => self.message.clone(),
         }
     }
 

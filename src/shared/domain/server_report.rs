@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 use super::admission::AdmissionRules;
 use super::load::Load;
 use super::project_url::ProjectUrl;
+use super::reason::Reason;
 use super::url_prefix::UrlPrefix;
 use crate::shared::text::one_line;
 
@@ -106,11 +107,14 @@ impl ServerReport {
         }
     }
 
-    /// Whether the server accepts this world, by this report.
+    /// Whether the server accepts this world at this load, by this report.
     ///
     /// A report without `docker` comes from a Python server. The Python session server expects such a server to run
     /// every world that its report does not exclude, and so does this one.
-    pub fn accepts(&self, world: &ProjectUrl) -> bool {
+    ///
+    /// # Errors
+    /// Why it does not.
+    pub fn check(&self, world: &ProjectUrl, load: Load) -> Result<(), Reason> {
         let is_open = self.allowed_repositories.is_empty() || self.share_idle_time > 0.0;
         let share_idle_time = match self.docker {
             Some(_) => self.share_idle_time,
@@ -123,7 +127,7 @@ impl ServerReport {
             docker: self.docker.unwrap_or(true),
             share_idle_time,
         };
-        rules.admit(world, self.load).is_ok()
+        rules.check(world, load)
     }
 }
 
@@ -171,11 +175,8 @@ mod tests {
         ];
         for (text, runs_lab, runs_other, why) in table {
             let status: ServerReport = serde_json::from_str(text).unwrap();
-            assert_eq!(
-                (status.accepts(&lab), status.accepts(&other)),
-                (runs_lab, runs_other),
-                "{why}"
-            );
+            let runs = |world| status.check(world, status.load).is_ok();
+            assert_eq!((runs(&lab), runs(&other)), (runs_lab, runs_other), "{why}");
         }
     }
 }
