@@ -170,7 +170,7 @@ fn a_report_is_a_load_and_short_lines_whatever_a_server_answers() {
             assert!(instances.present() >= instances.running, "{report:?}");
         }
         // It returns, whatever rules were reported.
-        std::hint::black_box(report.check(&world, report.load));
+        std::hint::black_box(report.check(&world, report.load).is_ok());
         let again = serde_json::to_vec(&report).unwrap();
         assert!(ServerReport::parse(&again).is_ok(), "{report:?}");
     });

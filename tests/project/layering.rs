@@ -80,7 +80,7 @@ fn imports() -> BTreeMap<String, BTreeSet<String>> {
         "imports are found"
     );
     assert!(
-        imports["session::web::routes"].contains("session::fleet"),
+        imports["session::web::status"].contains("session::fleet"),
         "imports are found"
     );
     imports

@@ -44,13 +44,18 @@ async fn a_client_is_led_to_the_simulation_server_that_is_there() {
         (200, None),
         "as the Python server answers"
     );
+    assert_eq!(answer.header("webots-reason"), Some("no-server-available"));
     // `Retry-After` varies, so that the clients of a class retry at different times.
     let mut seconds = BTreeSet::new();
     for _ in 0..20 {
         let answer = http::get(&session.url(&format!("/session?url={url}"))).await;
         assert_eq!(answer.text(), "Error: no simulation server available at the moment.");
         assert_eq!(answer.status, 503);
-        assert_eq!(answer.header("access-control-expose-headers"), Some("Retry-After"));
+        assert_eq!(
+            answer.header("access-control-expose-headers"),
+            Some("Retry-After, Webots-Reason")
+        );
+        assert_eq!(answer.header("webots-reason"), Some("no-server-available"));
         seconds.insert(answer.header("retry-after").unwrap().parse::<u32>().unwrap());
     }
     assert!(

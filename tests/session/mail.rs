@@ -40,6 +40,7 @@ async fn every_kind_of_failure_is_mailed_and_so_is_its_end() {
     const FULL: [&str; 2] = ["reached maximum load", "available again"];
     let evil = json!({"load": 100, "problem": "no display at :0\r\n.\r\nRCPT TO:<thief@example.com>\u{1b}[2J"});
     let failures = [
+        (Manner::Reset, DOWN, "Reason:     no-answer"),
         (Manner::Reset, DOWN, "no connection"),
         (Manner::Hang, DOWN, "no answer within 2 s"),
         (Manner::Drip, DOWN, "no answer within 2 s"),
@@ -55,7 +56,7 @@ async fn every_kind_of_failure_is_mailed_and_so_is_its_end() {
     let mut smtp = Smtp::start(&[]).await;
     let servers: Vec<StandIn> = failures.iter().map(|_| StandIn::start(Manner::idle(7.0, 10))).collect();
     let session = mailing(&addresses(&servers), smtp.port).start().await;
-    until_states(&session, &["up"; 7]).await;
+    until_states(&session, &["up"; 8]).await;
     for (server, (manner, ..)) in servers.iter().zip(&failures) {
         server.set(manner.clone());
     }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use serde_json::json;
+use serde_json::{Value, json};
 
 use super::stand_in::{Manner, StandIn};
 use super::{addresses, times_logged, until_states};
@@ -92,10 +92,18 @@ async fn a_world_goes_only_where_it_will_be_accepted() {
     let refused = session_for(&url).await;
     let words = "Error: no simulation server accepts https://github.com/stranger/arm.";
     assert_eq!((refused.status.as_u16(), refused.text().as_str()), (403, words));
+    assert_eq!(refused.header("webots-reason"), Some("repository-not-allowed"));
     client.send(&url).await;
     assert_eq!(client.until("").await, words);
+    // The reason comes only to a client that asks for it.
+    client.send(&json!({"url": url, "reason": true}).to_string()).await;
+    let reason = client.until("").await;
+    let reason: Value = serde_json::from_str(reason.strip_prefix("reason: ").unwrap()).unwrap();
+    let expected = json!({"code": "repository-not-allowed", "blame": "user", "retry": "no"});
+    assert_eq!((reason, client.until("").await.as_str()), (expected, words));
     let wrong = session_for("https://github.com/lab").await;
     assert_eq!(wrong.status, 400);
+    assert_eq!(wrong.header("webots-reason"), Some("invalid-world"));
     assert!(wrong.text().starts_with("Error: "), "{}", wrong.text());
     client.send(r#"{"url": 5}"#).await;
     client.until("Error: ").await;

@@ -95,6 +95,10 @@ async fn status_and_metrics_have_what_an_alarm_needs() {
         (&json!("down"), &json!(null), &json!(null))
     );
     assert!(down["error"].as_str().unwrap().contains("500"));
+    assert_eq!(
+        (&up["reason"], &down["reason"]),
+        (&json!(null), &json!("invalid-answer"))
+    );
     assert_eq!(status["changes"].as_array().unwrap().len(), 3);
     let page = http::get(&session.url("/monitor")).await;
     assert!(page.header("content-type").unwrap().starts_with("text/html"));
@@ -110,8 +114,8 @@ async fn status_and_metrics_have_what_an_alarm_needs() {
         "available 1".to_owned(),
         "load_percent 30".to_owned(),
         "requests_total{outcome=\"placed\"} 1".to_owned(),
-        "requests_total{outcome=\"wrong_url\"} 1".to_owned(),
-        "requests_total{outcome=\"not_accepted\"} 0".to_owned(),
+        "requests_total{outcome=\"invalid-world\"} 1".to_owned(),
+        "requests_total{outcome=\"repository-not-allowed\"} 0".to_owned(),
         "servers{state=\"up\"} 1".to_owned(),
         format!("server_up{{server=\"{up}\"}} 1"),
         format!("server_up{{server=\"{down}\"}} 0"),

@@ -30,6 +30,9 @@ fn bad_manners() -> Vec<Manner> {
         Manner::Raw(b"SSH-2.0-OpenSSH_9.2\r\n".to_vec()),
         Manner::Raw(b"HTTP/1.1 200 OK\r\nContent-Length: 50\r\n\r\n{\"load\": 1".to_vec()),
         Manner::Raw(b"HTTP/1.0 200 OK\r\n\r\n{\"load\": 1".to_vec()),
+        // Whole JSON that is cut off.
+        Manner::Raw(b"HTTP/1.1 200 OK\r\nContent-Length: 50\r\n\r\n{\"load\": 1}".to_vec()),
+        Manner::Raw(b"HTTP/1.0 200 OK\r\n\r\n{\"load\": 1}".to_vec()),
         Manner::Raw([b"HTTP/1.1 200 OK\r\nX: ".to_vec(), vec![b'x'; 2_000_000]].concat()),
         Manner::Body(500, b"5.0".to_vec()),
         Manner::Body(302, b"5.0".to_vec()),

@@ -84,7 +84,6 @@ async fn session(request: HttpRequest, stream: web::Payload, server: web::Data<A
         response.insert_header(retry_after());
     }
     response.insert_header((REASON_HEADER, failure.reason.code()));
-    response.insert_header((header::ACCESS_CONTROL_EXPOSE_HEADERS, REASON_HEADER));
     Ok(response.content_type(TEXT).body(refusal::sentence(&failure)))
 }
 

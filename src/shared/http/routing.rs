@@ -100,7 +100,7 @@ pub fn all(configure: fn(&mut web::ServiceConfig), hint: &'static str) -> impl H
         .add((header::ACCESS_CONTROL_ALLOW_ORIGIN, "*"))
         .add((header::ACCESS_CONTROL_ALLOW_HEADERS, "x-requested-with"))
         .add((header::ACCESS_CONTROL_ALLOW_METHODS, "POST, GET, OPTIONS"))
-        .add((header::ACCESS_CONTROL_EXPOSE_HEADERS, "Retry-After"))
+        .add((header::ACCESS_CONTROL_EXPOSE_HEADERS, "Retry-After, Webots-Reason"))
         .add((header::CACHE_CONTROL, "no-store"))
         .add((header::X_CONTENT_TYPE_OPTIONS, "nosniff"));
     web::scope("")
