@@ -22,11 +22,12 @@ const WATCH: Duration = Duration::from_secs(3);
 /// Timeout of Webots' end once its client has left.
 const GONE: Duration = Duration::from_secs(15);
 /// Prefixes of the texts that Webots' page knows on the connection to the simulation server.
-const KNOWN: [&str; 10] = [
+const KNOWN: [&str; 11] = [
     "session:",
     "loading:",
     "queue:",
     "shutdownTimeout:",
+    "kind: ",
     "webots:",
     "ide: ",
     "type:",
