@@ -14,6 +14,7 @@ use nix::unistd::Pid;
 use super::deeds::{Stage, as_nobody};
 use crate::simulation::scene::{gone_within, nothing_left};
 use crate::support::client::Heard;
+use crate::support::name_server::NameServer;
 use crate::support::{
     Builder, Client, DEMO, Server, Webots, arm, display, instances_below, is_told, programs, skip, until,
 };
@@ -280,14 +281,15 @@ async fn which_network_simulations_have_is_told() {
     let names = [
         "git", "bash", "env", "sh", "setpriv", "bwrap", "prlimit", "unshare", "pasta",
     ];
-    let (all, none) = (programs(&names), programs(&names[..8]));
+    let all = programs(&names);
+    let none = programs(&names[..8]);
     let path = |folder: &tempfile::TempDir| folder.path().to_str().unwrap().to_owned();
     for (network, path, shown, words) in [
         (
             "auto",
             path(&all),
             "own",
-            "own, with the internet, without this machine and private addresses",
+            "own, with the internet by TCP, without this machine and private addresses",
         ),
         ("closed", path(&all), "closed", "closed, nothing can be reached"),
         ("shared", path(&all), "shared", "shared with this machine"),
@@ -356,5 +358,194 @@ async fn a_machine_with_one_version_of_ip_has_own_networks() {
             client.leave().await;
             nothing_left(&server, 2).await;
         }
+    }
+}
+
+/// An address that stands for one on the internet, and the port there of a service that answers each datagram.
+const OUTSIDE: &str = "198.51.100.7";
+const ANSWERS: u16 = 4000;
+/// The source ports of datagrams: one that no program of the machine has, one of a service, one of another simulation.
+const FREE: u16 = 5353;
+const OF_SERVICE: u16 = 5354;
+const OF_OTHER: u16 = 5355;
+
+/// Moves this thread, and what it starts, to a machine of its own with one address on the internet. Returns false, with
+/// a reason printed, if that is not allowed.
+fn move_to_own_machine() -> bool {
+    if unshare(CloneFlags::CLONE_NEWNET).is_err() {
+        skip("only root can make a network namespace");
+        return false;
+    }
+    let script = format!(
+        "ip link set lo up && ip address add {OUTSIDE}/32 dev lo && ip link add out type veth peer name far && \
+         ip link set far up && ip address add 192.0.2.2/24 dev out && ip link set out up && ip route add default via 192.0.2.1"
+    );
+    let made = std::process::Command::new("sh")
+        .args(["-ec", &script])
+        .output()
+        .unwrap();
+    if !made.status.success() {
+        skip(&format!("no network: {}", String::from_utf8_lossy(&made.stderr)));
+    }
+    made.status.success()
+}
+
+/// Answers each datagram outside, and sends datagrams to services of the machine, on a thread of its own. The result is
+/// the largest number of UDP ports that were in use.
+fn answer_and_send(until: std::sync::mpsc::Receiver<()>) -> std::thread::JoinHandle<usize> {
+    let outside = std::net::UdpSocket::bind((OUTSIDE, ANSWERS)).unwrap();
+    outside
+        .set_read_timeout(Some(std::time::Duration::from_millis(10)))
+        .unwrap();
+    // Services that share their port with others, as those of mDNS do, lose it to who binds it last.
+    let service = socket2::Socket::new(socket2::Domain::IPV4, socket2::Type::DGRAM, None).unwrap();
+    service.set_reuse_address(true).unwrap();
+    let everywhere: std::net::SocketAddr = (std::net::Ipv4Addr::UNSPECIFIED, OF_SERVICE).into();
+    service.bind(&everywhere.into()).unwrap();
+    let stranger = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+    std::thread::spawn(move || {
+        let mut most = 0;
+        while until.try_recv() == Err(std::sync::mpsc::TryRecvError::Empty) {
+            stranger.send_to(b"stranger", ("127.0.0.1", FREE)).ok();
+            stranger.send_to(b"for the service", ("127.0.0.1", OF_SERVICE)).ok();
+            let mut question = [0; 99];
+            for _ in 0..100 {
+                let Ok((length, from)) = outside.recv_from(&mut question) else {
+                    break;
+                };
+                outside.send_to(&question[..length], from).ok();
+            }
+            let used = std::fs::read_to_string("/proc/thread-self/net/udp").unwrap();
+            most = most.max(used.lines().count());
+        }
+        drop(service);
+        most
+    })
+}
+
+/// A deed: sends a datagram outside from this port, and receives this one.
+fn receives(port: u16, text: &str) -> String {
+    python(&format!(
+        "u = s.socket(s.AF_INET, s.SOCK_DGRAM); u.bind(('', {port})); u.settimeout(5); \
+         u.sendto(b'second', ('{OUTSIDE}', {ANSWERS})); assert any(u.recv(99) == b'{text}' for n in range(99))"
+    ))
+}
+
+#[actix_rt::test]
+async fn a_world_in_its_own_network_gets_and_sends_no_datagram() {
+    let Some(user) = ordinary() else { return };
+    if !move_to_own_machine() {
+        return;
+    }
+    let (stop, until_stopped) = std::sync::mpsc::channel();
+    let machine = answer_and_send(until_stopped);
+    let first = format!(
+        "u = socket.socket(socket.AF_INET, socket.SOCK_DGRAM); u.bind(('', {OF_OTHER}))\nwhile True:\n try: u.sendto(b'first', ('{OUTSIDE}', {ANSWERS}))\n \
+         except OSError: pass\n time.sleep(0.02)"
+    );
+    let first = Webots::script(&format!(
+        "python3 -c \"import socket, time\n{first}\" &\n{DEMO} \"$@\" & wait"
+    ));
+    let first_stage = Stage::new();
+    let first_server = server(&first_stage, &first, user, "own").start().await;
+    let first_client = Client::ready(&first_server).await;
+
+    let many = "l = [s.socket(s.AF_INET, s.SOCK_DGRAM) for n in range(900)]";
+    let deeds = [
+        ("get a datagram of a stranger", receives(FREE, "stranger")),
+        ("get a datagram for a service", receives(OF_SERVICE, "for the service")),
+        ("get an answer to another simulation", receives(OF_OTHER, "first")),
+        (
+            "take the ports of the machine",
+            python(&format!(
+                "{many}; [u.sendto(b'x', ('{OUTSIDE}', {ANSWERS})) for u in l]"
+            )),
+        ),
+        (
+            "be refused at once",
+            python(&format!(
+                "assert s.socket(s.AF_INET, s.SOCK_DGRAM).connect_ex(('{OUTSIDE}', {ANSWERS})) == 0; \
+                 u = s.socket(s.AF_INET, s.SOCK_DGRAM)\ntry: u.sendto(b'x', ('{OUTSIDE}', {ANSWERS}))\nexcept PermissionError: exit(0)\nexit(1)"
+            )),
+        ),
+        (
+            "send datagrams to itself",
+            python(
+                "u = s.socket(s.AF_INET, s.SOCK_DGRAM); u.bind(('127.0.0.1', 0)); u.sendto(b'x', u.getsockname()); u.settimeout(5); u.recv(9)",
+            ),
+        ),
+    ];
+    let stage = Stage::new();
+    let done = stage.tried(&deeds, "sandbox", |builder| {
+        builder
+            .before(user)
+            .set("sandbox.network", "own")
+            .set("limits.output", 10_000)
+    });
+    let done = done.await;
+    first_client.leave().await;
+    nothing_left(&first_server, 2).await;
+    stop.send(()).unwrap();
+    let ports = machine.join().unwrap();
+    assert_eq!(done, ["be refused at once", "send datagrams to itself"]);
+    assert!(ports < 100, "{ports} ports of the machine were in use");
+}
+
+#[actix_rt::test]
+async fn the_connections_of_a_world_are_bounded_in_its_own_network() {
+    let Some(user) = ordinary() else { return };
+    if !move_to_own_machine() {
+        return;
+    }
+    let listener = std::net::TcpListener::bind((OUTSIDE, ANSWERS)).unwrap();
+    // It ends with the test.
+    std::thread::spawn(move || listener.incoming().collect::<Vec<_>>());
+    let hold = |number| {
+        python(&format!(
+            "l = [s.create_connection(('{OUTSIDE}', {ANSWERS}), 5) for n in range({number})]"
+        ))
+    };
+    let deeds = [("hold some", hold(100)), ("hold a thousand", hold(1000))];
+    let stage = Stage::new();
+    let done = stage.tried(&deeds, "sandbox", |builder| {
+        builder.before(user).set("sandbox.network", "own")
+    });
+    assert_eq!(done.await, ["hold some"]);
+}
+
+#[actix_rt::test]
+async fn names_are_resolved_in_own_networks() {
+    let Some(user) = ordinary() else { return };
+    let Some(names) = NameServer::start() else { return };
+    // Too many for a datagram of 512 bytes.
+    let addresses: Vec<std::net::IpAddr> = (1..=60).map(|last| [198, 51, 100, last].into()).collect();
+    names.set("arms.test", &addresses);
+    if !nix::unistd::getuid().is_root() {
+        return skip("only root can give the server another name server and another user");
+    }
+    let asked = names.asked().replace("&& exec \"$0\" \"$@\"", &format!("&& {user}"));
+    let resolve = "assert len({a[4][0] for a in s.getaddrinfo('arms.test', 80)}) == 60";
+    let deeds = [
+        ("resolve a name", python(resolve)),
+        (
+            "resolve it a hundred times",
+            python(&format!(
+                "[s.getaddrinfo('arms.test', 80) for n in range(100)]; {resolve}"
+            )),
+        ),
+        (
+            "ask much at once",
+            python("l = [s.create_connection(('127.0.0.1', 53), 5) for n in range(20)]"),
+        ),
+    ];
+    for (network, expected) in [
+        ("own", &["resolve a name", "resolve it a hundred times"][..]),
+        ("closed", &[]),
+    ] {
+        let stage = Stage::new();
+        let done = stage.tried(&deeds, "sandbox", |builder| {
+            builder.before(&asked).set("sandbox.network", network)
+        });
+        assert_eq!(done.await, expected, "{network}");
     }
 }

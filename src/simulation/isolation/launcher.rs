@@ -157,7 +157,7 @@ impl Launcher {
     pub fn network(&self) -> Option<SandboxNetwork> {
         match self.own_network() {
             None => (self.level != IsolationSetting::Container).then_some(SandboxNetwork::Shared),
-            Some(network) => Some(if network.closed {
+            Some(network) => Some(if network.is_closed() {
                 SandboxNetwork::Closed
             } else {
                 SandboxNetwork::Own
@@ -172,10 +172,11 @@ impl Launcher {
             (SandboxNetwork::Shared, Some(why)) => format!("shared with this machine: {why}"),
             (SandboxNetwork::Closed, _) => "closed, nothing can be reached".to_owned(),
             _ if self.own_network().is_some_and(|network| network.nft.is_none()) => {
-                "own, with the internet and private addresses, for nft can't be used; the package nftables has it"
+                "own, with the internet, private addresses and UDP ports of this machine, for nft can't be used; the \
+                 package nftables has it"
                     .to_owned()
             }
-            _ => "own, with the internet, without this machine and private addresses".to_owned(),
+            _ => "own, with the internet by TCP, without this machine and private addresses".to_owned(),
         })
     }
 

@@ -5,6 +5,7 @@ mod disk;
 mod display;
 mod launcher;
 mod mount;
+mod names;
 mod network;
 mod sandbox;
 mod system_calls;

@@ -14,6 +14,7 @@ use std::path::{Path, PathBuf};
 use which::which;
 
 use super::mount::Mount;
+use super::names;
 use crate::simulation::config::{SandboxNetwork, SimulationConfig};
 
 /// The programs and settings that give each sandbox a network of its own.
@@ -21,24 +22,24 @@ pub struct OwnNetwork {
     pasta: PathBuf,
     /// The program that loads the packet filter; `None` if it is missing or fails.
     pub nft: Option<PathBuf>,
-    /// Whether programs reach nothing at all.
-    pub closed: bool,
+    /// The port of the machine's loopback at which names are resolved; `None` if programs reach nothing at all.
+    names: Option<u16>,
+    /// Whether the configuration demands a network that is isolated in full.
+    needs_filter: bool,
     loopback: IpAddr,
     /// The address of the machine on which the port of each simulation is forwarded: the one on which the server
     /// listens, or the loopback if only this server may reach simulations.
     forwarded: IpAddr,
 }
 
-/// Address of the name server in a sandbox: pasta forwards queries to the machine's own one. The second address is for
-/// a machine without IPv4.
-const RESOLVER: &str = "169.254.1.1";
-const RESOLVER_6: &str = "fd53::1:1";
 /// Internet addresses (reserved for documentation) to look up a route; nothing is sent to them.
 const INTERNET: IpAddr = IpAddr::V4(Ipv4Addr::new(203, 0, 113, 7));
 const INTERNET_6: IpAddr = IpAddr::V6(Ipv6Addr::new(0x2001, 0xdb8, 0, 0, 0, 0, 0, 7));
 /// The system's resolver configuration, and its replacement in the instance's directory.
 const RESOLV_CONF: &str = "/etc/resolv.conf";
 const OWN_RESOLV_CONF: &str = "resolv.conf";
+/// The port of a network's loopback that pasta forwards to [`names`].
+const NAMES: u16 = 53;
 /// The socket of the system's log.
 const SYSTEM_LOG: &str = "/dev/log";
 /// Path of nft, which is not in the `PATH` of ordinary users.
@@ -63,11 +64,11 @@ impl OwnNetwork {
             format!("{program} is not there; on Debian, Ubuntu and Fedora the package {package} has it")
         };
         let pasta = which("pasta").map_err(|_| missing("pasta", "passt"))?;
-        let closed = config.sandbox.network == SandboxNetwork::Closed;
         let nft = which("nft")
             .ok()
             .or_else(|| Some(PathBuf::from(NFT)).filter(|nft| nft.is_file()));
-        if closed && nft.is_none() {
+        let needs_filter = config.sandbox.network.is_demanded();
+        if needs_filter && nft.is_none() {
             return Err(missing("nft", "nftables"));
         }
         // If the machine has no IPv4 route, pasta makes networks without IPv4, and forwards nothing from 127.0.0.1.
@@ -81,10 +82,13 @@ impl OwnNetwork {
         } else {
             loopback
         };
+        let is_closed = config.sandbox.network == SandboxNetwork::Closed;
+        let names = (!is_closed).then(|| names::start(loopback)).transpose();
         Ok(Self {
             pasta,
             nft,
-            closed,
+            needs_filter,
+            names: names.map_err(|error| format!("names can't be resolved for it: {error}"))?,
             loopback,
             forwarded,
         })
@@ -92,7 +96,12 @@ impl OwnNetwork {
 
     /// Drops the packet filter, if the configuration allows that. Returns whether there was one.
     pub fn give_up_filter(&mut self) -> bool {
-        !self.closed && self.nft.take().is_some()
+        !self.needs_filter && self.nft.take().is_some()
+    }
+
+    /// Whether programs reach nothing at all.
+    pub fn is_closed(&self) -> bool {
+        self.names.is_none()
     }
 
     /// The address at which this server reaches the forwarded port of each simulation.
@@ -113,18 +122,10 @@ impl OwnNetwork {
         let mut command: Vec<OsString> = ["setpriv", "--pdeathsig", "KILL", "--"].map(Into::into).into();
         command.push(self.pasta.clone().into());
         // By default pasta maps its gateway to the machine's loopback, and forwards ports in both directions.
-        let fixed = [
-            "--config-net",
-            "--no-map-gw",
-            "-u",
-            "none",
-            "-T",
-            "none",
-            "-U",
-            "none",
-            "-t",
-        ];
-        command.extend(fixed.map(Into::into));
+        command.extend(["--config-net", "--no-map-gw", "-u", "none", "-U", "none", "-T"].map(Into::into));
+        let names = self.names.map(|port| format!("{NAMES}:{port}"));
+        command.push(names.map_or_else(|| "none".into(), Into::into));
+        command.push("-t".into());
         // A port without an address is forwarded from all addresses, IPv4 and IPv6.
         let is_any = self.forwarded == Ipv6Addr::UNSPECIFIED;
         command.push(
@@ -143,23 +144,15 @@ impl OwnNetwork {
         if !Path::new(SYSTEM_LOG).exists() {
             command.extend(["--log-file".into(), instance.join("pasta.log").into()]);
         }
-        if !self.closed {
-            let resolver = if self.loopback.is_ipv4() { RESOLVER } else { RESOLVER_6 };
-            command.extend(["--dns-forward", resolver].map(Into::into));
-            std::fs::write(instance.join(OWN_RESOLV_CONF), format!("nameserver {resolver}\n"))?;
+        if !self.is_closed() {
+            let text = format!("nameserver {}\noptions use-vc\n", self.loopback);
+            std::fs::write(instance.join(OWN_RESOLV_CONF), text)?;
         }
         command.extend(["--", "/bin/sh", "-c"].map(Into::into));
         let (mut loader, mut rules) = (Path::new("sh"), PathBuf::new());
         if let Some(nft) = &self.nft {
             (loader, rules) = (nft, instance.join("network.nft"));
-            std::fs::write(
-                &rules,
-                if self.closed {
-                    include_str!("closed.nft")
-                } else {
-                    include_str!("own.nft")
-                },
-            )?;
+            std::fs::write(&rules, self.rules())?;
         }
         command.extend([BEGIN.into(), loader.into(), rules.into()]);
         // pasta starts a new PID namespace, and bubblewrap needs a `/proc` that matches it.
@@ -167,9 +160,21 @@ impl OwnNetwork {
         Ok(command)
     }
 
+    /// The packet filter, as nft reads it.
+    fn rules(&self) -> String {
+        if self.is_closed() {
+            return include_str!("closed.nft").to_owned();
+        }
+        let version = if self.loopback.is_ipv4() { "ipv4" } else { "ipv6" };
+        include_str!("own.nft").replace("RELAY", version)
+    }
+
     /// The mount of the resolver configuration, if programs in the sandbox may resolve names.
     pub fn mounts(&self, instance: &Path) -> Option<Mount> {
-        let at = Path::new(RESOLV_CONF).canonicalize().ok().filter(|_| !self.closed)?;
+        let at = Path::new(RESOLV_CONF)
+            .canonicalize()
+            .ok()
+            .filter(|_| !self.is_closed())?;
         Some(Mount::file(at, instance.join(OWN_RESOLV_CONF)))
     }
 }
