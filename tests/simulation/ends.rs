@@ -33,7 +33,7 @@ fn lines(server: &Server) -> Vec<Vec<String>> {
     let text = std::fs::read_to_string(server.folder.join("log/simulation/simulations.csv")).unwrap_or_default();
     text.lines()
         .skip(1)
-        .map(|line| line.split(',').map(str::to_owned).collect())
+        .map(|line| line.split(',').map(|text| text.trim_matches('"').to_owned()).collect())
         .collect()
 }
 
@@ -120,6 +120,39 @@ async fn a_simulation_keeps_one_id() {
             "{words:?}: {log}"
         );
     }
+}
+
+#[actix_rt::test]
+async fn a_kept_output_stays_whatever_is_printed_afterwards() {
+    // A process that outlives its Webots prints without end as soon as the output is kept, and for more than one file.
+    let (folder, forge) = (tempfile::tempdir().unwrap(), Forge::with_arm());
+    let logs = folder.path().join("log/simulation");
+    let flood = format!(
+        "touch left; until ls {}/ended/*.log; do sleep 0.02; done 2>/dev/null >&2; exec yes 'a flood of lines'",
+        logs.display()
+    );
+    let webots = Webots::script(&format!(
+        "setsid sh -c \"{flood}\" &\nuntil [ -e left ]; do sleep 0.02; done\necho last words\nexit 3"
+    ));
+    let server = simulation_server(&webots.path(), forge.path(), 1)
+        .folder(folder.path())
+        .set("isolation", "none")
+        .set("limits.output", 100_000)
+        .start()
+        .await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("loading: Error:").await;
+    let id = client.id().to_owned();
+    until("much was printed", async || {
+        logs.join(format!("instances/{id}.log.1")).exists()
+    })
+    .await;
+    let kept = std::fs::read_to_string(logs.join(format!("ended/{id}.log"))).unwrap();
+    assert!(
+        kept.starts_with("last words") && kept.contains("What has happened:"),
+        "{} bytes",
+        kept.len()
+    );
 }
 
 #[actix_rt::test]

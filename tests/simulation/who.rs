@@ -43,7 +43,7 @@ async fn event(server: &Server) -> String {
 #[actix_rt::test]
 async fn a_name_is_for_administrators_alone_and_never_markup() {
     let server = with_users(2).start().await;
-    let (user, label) = ("<b>anna@lab</b>", "\"<script>alert(1)</script>\u{202e}\n=1+1,x");
+    let (user, label) = ("<b>anna@lab</b>", "\"<script>alert(1)</script>\u{202e}\n=1+1,x;=2");
     let mut client = start(&server, &[("x-forwarded-user", user)], Some(label)).await;
     client.until("webots:").await;
     let id = client.id().to_owned();
@@ -67,7 +67,7 @@ async fn a_name_is_for_administrators_alone_and_never_markup() {
     let csv = || std::fs::read_to_string(server.folder.join("log/simulation/simulations.csv")).unwrap_or_default();
     until("it is in simulations.csv", async || csv().contains(&id)).await;
     let line = csv().lines().find(|line| line.starts_with(&id)).unwrap().to_owned();
-    let written = "<b>anna@lab</b>,\"\"\"<script>alert(1)</script>\u{fffd} =1+1,x\"";
+    let written = "\"<b>anna@lab</b>\",\"\"\"<script>alert(1)</script>\u{fffd} =1+1,x;'=2\"";
     assert!(line.ends_with(written), "{line}");
     assert!(
         csv()

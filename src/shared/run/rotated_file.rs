@@ -3,8 +3,9 @@
 //! Crates for this fail in one way or another: file-rotate 0.8 panics if a directory can't be read; with rolling-file
 //! 0.2 and logroller 0.1, a file that can't be renamed grows without limit or is no longer written.
 
-use std::fs::File;
+use std::fs::{File, Metadata};
 use std::io::{self, Write};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 /// A file to which lines are appended. The previous file is `NAME.1`.
@@ -40,19 +41,39 @@ impl RotatedFile {
         })
     }
 
+    /// Continues with an empty file. A file that somebody has moved is left as it is.
     fn rotate(&mut self) -> io::Result<()> {
-        let mut older = self.path.clone().into_os_string();
-        older.push(".1");
-        std::fs::rename(&self.path, older)?;
+        if self.is_at_path() {
+            let mut older = self.path.clone().into_os_string();
+            older.push(".1");
+            if std::fs::rename(&self.path, older).is_err() {
+                // A file that can't be renamed must not grow without limit either.
+                self.size = 0;
+                return self.file.set_len(0);
+            }
+        }
         self.file = File::options().create(true).append(true).open(&self.path)?;
+        self.size = self.file.metadata()?.len();
         Ok(())
+    }
+
+    /// Whether the file is still at its path.
+    fn is_at_path(&self) -> bool {
+        let identity = |about: Metadata| (about.dev(), about.ino());
+        let own = self.file.metadata().map(identity);
+        std::fs::metadata(&self.path)
+            .map(identity)
+            .is_ok_and(|there| own.is_ok_and(|own| own == there))
     }
 
     /// Appends all bytes or none: a truncated line would corrupt the next one.
     fn add(&mut self, bytes: &[u8]) -> io::Result<()> {
-        self.file
-            .write_all(bytes)
-            .inspect_err(|_| drop(self.file.set_len(self.size)))?;
+        if let Err(error) = self.file.write_all(bytes) {
+            if self.is_at_path() {
+                self.file.set_len(self.size)?;
+            }
+            return Err(error);
+        }
         self.size += bytes.len() as u64;
         Ok(())
     }
@@ -62,11 +83,7 @@ impl Write for RotatedFile {
     /// Writes whole lines. Lines for which the disk has no space are lost.
     fn write(&mut self, lines: &[u8]) -> io::Result<usize> {
         if self.size >= self.max_size {
-            // A file that can't be renamed must not grow without limit either.
-            if self.rotate().is_err() {
-                self.file.set_len(0)?;
-            }
-            self.size = 0;
+            self.rotate()?;
         }
         if self.size == 0 {
             self.add(self.heading.as_bytes())?;

@@ -28,9 +28,9 @@ fn line(level: &str, ended: &Ended) -> String {
         simulation.id.to_string(),
         time(simulation.since),
         time(ended.at),
-        ended.client.to_string(),
-        simulation.repository.clone(),
-        simulation.world.clone(),
+        quoted(&ended.client.to_string()),
+        quoted(&simulation.repository),
+        quoted(&simulation.world),
         simulation.port.map(|port| port.to_string()).unwrap_or_default(),
         level.to_owned(),
         taken.memory.map(|bytes| bytes.to_string()).unwrap_or_default(),
@@ -39,25 +39,29 @@ fn line(level: &str, ended: &Ended) -> String {
             .map(|time| format!("{:.1}", time.as_secs_f64()))
             .unwrap_or_default(),
         ended.how.reason.label().to_owned(),
-        simulation.identity.user.clone().unwrap_or_default(),
-        simulation.identity.label.clone().unwrap_or_default(),
+        quoted(simulation.identity.user.as_deref().unwrap_or_default()),
+        quoted(simulation.identity.label.as_deref().unwrap_or_default()),
     ];
-    fields.map(|text| field(&text)).join(",") + "\n"
+    fields.join(",") + "\n"
 }
 
-/// A quoted field. An apostrophe is prepended if a spreadsheet would read the text as a formula.
-fn field(text: &str) -> String {
-    let formula = text.starts_with(['=', '+', '-', '@', '\t', '\r', '\n']);
-    let text = if formula {
-        format!("'{}", one_line(text))
-    } else {
-        one_line(text)
-    };
-    if text.contains([',', '"']) {
-        format!("\"{}\"", text.replace('"', "\"\""))
-    } else {
-        text
+/// A text that others choose, in quotes. An apostrophe is put before what a spreadsheet would read as a formula: at the
+/// beginning, and after a character at which a spreadsheet may begin the next cell.
+fn quoted(text: &str) -> String {
+    let mut quoted = String::from('"');
+    let mut begins = true;
+    for letter in one_line(text).chars() {
+        if begins && matches!(letter, '=' | '+' | '-' | '@') {
+            quoted.push('\'');
+        }
+        if letter == '"' {
+            quoted.push('"');
+        }
+        quoted.push(letter);
+        begins = matches!(letter, ',' | ';' | '|') || begins && matches!(letter, ' ' | '"');
     }
+    quoted.push('"');
+    quoted
 }
 
 #[cfg(test)]
@@ -65,21 +69,24 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_field_stays_one_field_and_is_no_formula() {
+    fn a_text_stays_one_field_and_is_no_formula() {
         for (text, written) in [
-            ("192.0.2.7", "192.0.2.7"),
-            ("2001:db8::7", "2001:db8::7"),
+            ("192.0.2.7", "\"192.0.2.7\""),
             ("a,b", "\"a,b\""),
             ("say \"hi\"", "\"say \"\"hi\"\"\""),
-            ("one\r\ntwo", "one  two"),
+            ("one\r\ntwo", "\"one  two\""),
             ("=HYPERLINK(\"x\",1)", "\"'=HYPERLINK(\"\"x\"\",1)\""),
-            ("+1", "'+1"),
-            ("-1", "'-1"),
-            ("@SUM(1)", "'@SUM(1)"),
-            ("\t=1", "' =1"),
-            ("", ""),
+            ("+1", "\"'+1\""),
+            ("-1", "\"'-1\""),
+            ("@SUM(1)", "\"'@SUM(1)\""),
+            ("\t=1", "\" '=1\""),
+            ("a;=1", "\"a;'=1\""),
+            ("a; \"+1\"", "\"a; \"\"'+1\"\"\""),
+            ("a,-1", "\"a,'-1\""),
+            ("1-1=0", "\"1-1=0\""),
+            ("", "\"\""),
         ] {
-            assert_eq!(field(text), written, "{text:?}");
+            assert_eq!(quoted(text), written, "{text:?}");
         }
     }
 }
