@@ -2,23 +2,37 @@
 
 import { add, cross, lookAt, pose, scale, turned, unit } from './matrix.js';
 
+/** @typedef {import('./matrix.js').Vector} Vector */
+/** @typedef {import('./scene.js').Viewpoint} Viewpoint */
+
 const STEEPEST = 1.55;
 
 export class Camera {
   #canvas;
   #changed;
-  #start;
+  /** @type {Viewpoint} */
+  #start = { position: [-5, 0, 3], orientation: [0, 1, 0, 0.5] };
+  /** Where each pointer is. @type {Map<number, [number, number]>} */
   #pointers = new Map();
+  /** What it circles around, from how far, and in which direction it looks; in metres and radians. @type {Vector} */
+  target = [0, 0, 0];
+  distance = 5;
+  heading = 0;
+  steepness = 0;
 
-  /** A camera of a canvas; `changed` is called after each move. */
+  /**
+   * A camera of a canvas; `changed` is called after each move.
+   * @param {HTMLCanvasElement} canvas
+   * @param {() => void} changed
+   */
   constructor(canvas, changed) {
     this.#canvas = canvas;
     this.#changed = changed;
-    this.home({ position: [-5, 0, 3], orientation: [0, 1, 0, 0.5] });
+    this.home();
     canvas.addEventListener('pointerdown', (event) => this.#down(event));
     canvas.addEventListener('pointermove', (event) => this.#move(event));
-    for (const name of ['pointerup', 'pointercancel'])
-      canvas.addEventListener(name, (event) => this.#pointers.delete(event.pointerId));
+    canvas.addEventListener('pointerup', (event) => this.#pointers.delete(event.pointerId));
+    canvas.addEventListener('pointercancel', (event) => this.#pointers.delete(event.pointerId));
     canvas.addEventListener('wheel', (event) => this.#wheel(event), { passive: false });
     canvas.addEventListener('keydown', (event) => this.#key(event));
     canvas.addEventListener('contextmenu', (event) => event.preventDefault());
@@ -50,12 +64,20 @@ export class Camera {
     return lookAt(this.eye, this.target, [0, 0, 1]);
   }
 
+  /**
+   * @param {number} right
+   * @param {number} up
+   */
   #orbit(right, up) {
     this.heading -= right;
     this.steepness = Math.max(-STEEPEST, Math.min(STEEPEST, this.steepness + up));
     this.#changed();
   }
 
+  /**
+   * @param {number} right
+   * @param {number} up
+   */
   #shift(right, up) {
     const sideways = unit(cross(this.#forward(), [0, 0, 1]));
     const upwards = cross(sideways, this.#forward());
@@ -63,20 +85,25 @@ export class Camera {
     this.#changed();
   }
 
+  /** @param {number} factor */
   #zoom(factor) {
     this.distance = Math.max(0.05, Math.min(1000, this.distance * factor));
     this.#changed();
   }
 
+  /** @param {PointerEvent} event */
   #down(event) {
     this.#canvas.setPointerCapture(event.pointerId);
     this.#pointers.set(event.pointerId, [event.clientX, event.clientY]);
   }
 
+  /** @param {PointerEvent} event */
   #move(event) {
     const before = this.#pointers.get(event.pointerId);
-    if (!before)
+    if (!before) {
       return;
+    }
+    /** @type {[number, number]} */
     const now = [event.clientX, event.clientY];
     const [x, y] = [(now[0] - before[0]) / this.#canvas.clientHeight, (now[1] - before[1]) / this.#canvas.clientHeight];
     const spread = () => {
@@ -88,20 +115,25 @@ export class Camera {
       this.#pointers.set(event.pointerId, now);
       this.#zoom(wide / spread());
       this.#shift(-x / 2, y / 2);
-    } else if (event.shiftKey || event.buttons & 6)
+    } else if (event.shiftKey || event.buttons & 6) {
       this.#shift(-x, y);
-    else
+    } else {
       this.#orbit(3 * x, 3 * y);
+    }
     this.#pointers.set(event.pointerId, now);
   }
 
+  /** @param {WheelEvent} event */
   #wheel(event) {
     event.preventDefault();
     this.#zoom(Math.exp(Math.max(-1, Math.min(1, event.deltaY / 500))));
   }
 
+  /** @param {KeyboardEvent} event */
   #key(event) {
+    /** @type {(x: number, y: number) => void} */
     const move = event.shiftKey ? (x, y) => this.#shift(x, y) : (x, y) => this.#orbit(-2 * x, 2 * y);
+    /** @type {Record<string, () => void>} */
     const keys = {
       ArrowLeft: () => move(-0.05, 0),
       ArrowRight: () => move(0.05, 0),
@@ -112,9 +144,10 @@ export class Camera {
       '-': () => this.#zoom(1 / 0.9),
       Home: () => this.home(),
     };
-    if (keys[event.key] && !event.ctrlKey && !event.altKey && !event.metaKey) {
+    const action = keys[event.key];
+    if (action && !event.ctrlKey && !event.altKey && !event.metaKey) {
       event.preventDefault();
-      keys[event.key]();
+      action();
     }
   }
 }

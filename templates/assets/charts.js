@@ -2,7 +2,10 @@
 
 import { Chart } from './chart.js';
 
+/** @typedef {import('./chart.js').Sample} Sample */
+
 /** The charts: each has the columns whose names begin with `begin`, the first one all others. */
+/** @type {(Omit<import('./chart.js').Group, 'series'> & { begin?: string })[]} */
 const GROUPS = [
   { title: 'Load and memory', unit: '%', most: 100 },
   { title: 'Simulations', begin: 'Webots ', unit: '', whole: true, least: 4 },
@@ -11,6 +14,7 @@ const GROUPS = [
 const KEPT = 600;
 const STORE = 'hidden-series';
 
+/** @returns {Set<string>} */
 function hiddenSeries() {
   try {
     return new Set(JSON.parse(localStorage.getItem(STORE) ?? '[]'));
@@ -20,18 +24,34 @@ function hiddenSeries() {
 }
 
 export class Charts {
+  /** @type {Sample[]} */
   #samples = [];
+  /** @type {Chart[]} */
   #charts = [];
   #hidden = hiddenSeries();
 
-  /** Puts the charts into an element that names the columns of a sample. */
+  /**
+   * Puts the charts into an element that names the columns of a sample.
+   * @param {HTMLElement} root
+   */
   constructor(root) {
-    const all = root.dataset.columns.split(', ').map((name, index) => [name, index]);
+    const columns = root.dataset.columns ?? '';
+    /** @type {[string, number][]} */
+    const all = columns.split(', ').map((name, index) => [name, index]);
+    /** @param {string} name */
     const groupOf = (name) => GROUPS.find(({ begin }) => begin && name.startsWith(begin)) ?? GROUPS[0];
     for (const group of GROUPS) {
       // The first column is the time.
       const series = all.slice(1).filter(([name]) => groupOf(name) === group);
-      this.#charts.push(new Chart(root, { ...group, series }, this.#hidden, () => this.#switched(), (time) => this.#point(time)));
+      this.#charts.push(
+        new Chart(
+          root,
+          { ...group, series },
+          this.#hidden,
+          () => this.#switched(),
+          (time) => this.#point(time),
+        ),
+      );
     }
   }
 
@@ -44,7 +64,10 @@ export class Charts {
     this.#draw();
   }
 
-  /** All charts show the same moment. */
+  /**
+   * All charts show the same moment.
+   * @param {number} [time]
+   */
   #point(time) {
     this.#charts.forEach((chart) => chart.point(time));
   }
@@ -53,16 +76,24 @@ export class Charts {
     this.#charts.forEach((chart) => chart.draw(this.#samples));
   }
 
-  /** Takes all samples, the oldest first. */
+  /**
+   * Takes all samples, the oldest first.
+   * @param {Sample[]} samples
+   */
   begin(samples) {
     this.#samples = samples.slice(-KEPT);
     this.#draw();
   }
 
-  /** Takes one more sample. */
+  /**
+   * Takes one more sample.
+   * @param {Sample} sample
+   */
   add(sample) {
-    if (this.#samples.length > 0 && sample[0] <= this.#samples.at(-1)[0])
+    const newest = this.#samples.at(-1);
+    if (newest && sample[0] <= newest[0]) {
       return;
+    }
     this.#samples = [...this.#samples, sample].slice(-KEPT);
     this.#draw();
   }

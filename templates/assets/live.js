@@ -1,62 +1,98 @@
 // Keeps a monitor page up to date: receives the server's events and updates what has changed. An event has parts (the
 // contents of elements) and tables (their rows), as HTML that the server renders from the same templates as the page.
 
+import { find, setText } from './dom.js';
 import { showTimes } from './times.js';
 
+/** Gets the numbers of an event, and whether events may have been missed before. @typedef {(sample: number[], fresh: boolean) => void} Listener */
+/** A row of a table, as the server renders it. @typedef {{ key: string, html: string }} Row */
+/** An event: parts by the ids of elements, tables by those of their bodies.
+ * @typedef {{ version?: string, parts?: Record<string, string>, tables?: Record<string, Row[]>, sample?: string[] }} Update
+ */
+
+/** @type {Listener[]} */
 const listeners = [];
-const lamp = document.getElementById('live');
-/** The HTML that each part and each row of a table was last filled with, and the cells of rows. */
+const lamp = find('live', HTMLElement);
+/** The HTML that each part and each row of a table was last filled with. @type {WeakMap<Element, string>} */
 const known = new WeakMap();
+/** The HTML of the cells of rows. @type {WeakMap<Element, string[]>} */
 const cells = new WeakMap();
 /** Natural order: 2 comes before 10. */
 const alphabet = new Intl.Collator(undefined, { numeric: true });
+/** @type {EventSource | undefined} */
 let source;
 /** Time of the last message from the server; it sends one every 15 seconds. */
-let heard;
+let heard = Date.now();
 /** Whether events may have been missed before the next one. */
-let fresh;
+let fresh = false;
+/** @type {string | undefined} */
 let lastSample;
 const SILENCE = 40_000;
 
-/** Calls a function with the numbers of each event that has some; `fresh`: events may have been missed before. */
+/**
+ * Calls a function with the numbers of each event that has some.
+ * @param {Listener} listener
+ */
 export function onSample(listener) {
   listeners.push(listener);
 }
 
+/**
+ * @param {string} text
+ * @param {boolean} lost
+ */
 function say(text, lost) {
   lamp.textContent = text;
   lamp.classList.toggle('lost', lost);
 }
 
-/** The cells of a row of HTML. */
+/**
+ * The cells of a row of HTML.
+ * @param {string} html
+ */
 function parsed(html) {
   const template = document.createElement('template');
   template.innerHTML = `<table><tbody><tr>${html}</tr></tbody></table>`;
-  return [...template.content.querySelector('tr').children];
+  return [...(template.content.querySelector('tr')?.children ?? [])];
 }
 
-/** Fills a row. Replaces only the cells that differ, so that a focused link stays focused and an opened list open. */
+/**
+ * Fills a row. Replaces only the cells that differ, so that a focused link stays focused and an opened list open.
+ * @param {HTMLTableRowElement} row
+ * @param {string} html
+ */
 function fill(row, html) {
-  if (known.get(row) === html)
+  if (known.get(row) === html) {
     return;
+  }
   known.set(row, html);
   const before = cells.get(row) ?? [];
   const after = parsed(html);
-  cells.set(row, after.map((cell) => cell.outerHTML));
-  while (row.children.length > after.length)
-    row.lastElementChild.remove();
+  cells.set(
+    row,
+    after.map((cell) => cell.outerHTML),
+  );
+  while (row.children.length > after.length) {
+    row.lastElementChild?.remove();
+  }
   after.forEach((cell, column) => {
-    if (before[column] === cell.outerHTML)
+    if (before[column] === cell.outerHTML) {
       return;
+    }
     showTimes(cell);
     const old = row.children[column];
-    if (old)
+    if (old) {
       old.replaceWith(cell);
-    else
+    } else {
       row.append(cell);
+    }
   });
 }
 
+/**
+ * @param {HTMLTableSectionElement} body
+ * @param {Row[]} rows
+ */
 function fillTable(body, rows) {
   const present = new Map([...body.rows].map((row) => [row.dataset.key, row]));
   rows.forEach(({ key, html }, place) => {
@@ -68,7 +104,7 @@ function fillTable(body, rows) {
       row.dataset.key = key;
       body.append(row);
     }
-    row.dataset.place = place;
+    row.dataset.place = String(place);
     fill(row, html);
   });
   present.forEach((row) => row.remove());
@@ -76,91 +112,130 @@ function fillTable(body, rows) {
   filter(body);
 }
 
+/**
+ * @param {Element} part
+ * @param {string} html
+ */
 function fillPart(part, html) {
-  if (known.get(part) === html)
+  if (known.get(part) === html) {
     return;
+  }
   known.set(part, html);
   part.innerHTML = html;
   showTimes(part);
 }
 
-function cellValue(row, column, kind) {
-  const value = row.children[column]?.dataset.value ?? '';
-  return kind === 'number' ? Number(value) : value;
+/**
+ * @param {HTMLTableRowElement} row
+ * @param {number} column
+ */
+function cellValue(row, column) {
+  return row.children[column]?.getAttribute('data-value') ?? '';
 }
 
-/** Sorts the rows by the column that the header marks, and moves only those that are out of place. */
+/**
+ * The cells of a table's head.
+ * @param {HTMLTableElement | null} table
+ */
+function headsOf(table) {
+  return [...(table?.tHead?.rows[0]?.cells ?? [])];
+}
+
+/**
+ * Sorts the rows by the column that the header marks, and moves only those that are out of place.
+ * @param {HTMLTableSectionElement} body
+ */
 function sort(body) {
-  const heads = [...body.closest('table').tHead.rows[0].cells];
+  const heads = headsOf(body.closest('table'));
   const column = heads.findIndex((head) => head.hasAttribute('aria-sort'));
   const rows = [...body.rows];
   const wanted = [...rows].sort((one, other) => Number(one.dataset.place) - Number(other.dataset.place));
-  if (column >= 0) {
-    const kind = heads[column].dataset.sort;
-    const sign = heads[column].getAttribute('aria-sort') === 'descending' ? -1 : 1;
+  const head = heads[column];
+  if (head) {
+    const sign = head.getAttribute('aria-sort') === 'descending' ? -1 : 1;
     wanted.sort((one, other) => {
-      const [a, b] = [cellValue(one, column, kind), cellValue(other, column, kind)];
-      const order = kind === 'number' ? a - b : alphabet.compare(a, b);
+      const [a, b] = [cellValue(one, column), cellValue(other, column)];
+      const order = head.dataset.sort === 'number' ? Number(a) - Number(b) : alphabet.compare(a, b);
       return sign * order;
     });
   }
   wanted.forEach((row, place) => {
-    if (body.rows[place] !== row)
+    if (body.rows[place] !== row) {
       body.insertBefore(row, body.rows[place] ?? null);
+    }
   });
 }
 
-/** Shows the rows that have all the words of the table's filter, if it has one. */
+/**
+ * Shows the rows that have all the words of the table's filter, if it has one.
+ * @param {HTMLTableSectionElement} body
+ */
 function filter(body) {
   const field = document.querySelector(`[data-filter="${body.id}"]`);
-  if (!field)
+  if (!(field instanceof HTMLInputElement)) {
     return;
+  }
   const words = field.value.toLowerCase().split(/\s+/).filter(Boolean);
   const rows = [...body.rows];
   for (const row of rows) {
-    const text = words.length > 0 ? row.textContent.toLowerCase() : '';
+    const text = words.length > 0 ? (row.textContent ?? '').toLowerCase() : '';
     row.hidden = !words.every((word) => text.includes(word));
   }
   const shown = rows.filter((row) => !row.hidden).length;
   const said = words.length > 0 ? `${shown} of ${rows.length}` : '';
-  const place = field.parentElement.querySelector('[role=status]');
-  if (place.textContent !== said)
-    place.textContent = said;
+  const place = field.parentElement?.querySelector('[role=status]');
+  if (place) {
+    setText(place, said);
+  }
 }
 
-function makeSortable(table) {
-  [...table.tBodies[0].rows].forEach((row, place) => {
-    row.dataset.place = place;
-    cells.set(row, [...row.children].map((cell) => cell.outerHTML));
+/**
+ * @param {HTMLTableElement} table
+ * @param {HTMLTableSectionElement} body
+ */
+function makeSortable(table, body) {
+  [...body.rows].forEach((row, place) => {
+    row.dataset.place = String(place);
+    cells.set(
+      row,
+      [...row.children].map((cell) => cell.outerHTML),
+    );
   });
-  for (const head of table.tHead.rows[0].cells) {
-    if (!head.dataset.sort)
+  const heads = headsOf(table);
+  for (const head of heads) {
+    if (!head.dataset.sort) {
       continue;
+    }
     const button = document.createElement('button');
     button.type = 'button';
     button.textContent = head.textContent;
     button.addEventListener('click', () => {
       const turn = head.getAttribute('aria-sort') === 'ascending' ? 'descending' : 'ascending';
-      for (const other of table.tHead.rows[0].cells)
+      for (const other of heads) {
         other.removeAttribute('aria-sort');
+      }
       head.setAttribute('aria-sort', turn);
-      sort(table.tBodies[0]);
+      sort(body);
     });
     head.replaceChildren(button);
   }
 }
 
+/** @param {MessageEvent} event */
 function take(event) {
   heard = Date.now();
+  /** @type {Update} */
   const { version, parts = {}, tables = {}, sample = [] } = JSON.parse(event.data);
   if (version && version !== document.documentElement.dataset.version) {
     location.reload();
     return;
   }
-  for (const [id, html] of Object.entries(parts))
-    fillPart(document.getElementById(id), html);
-  for (const [id, rows] of Object.entries(tables))
-    fillTable(document.getElementById(id), rows);
+  for (const [id, html] of Object.entries(parts)) {
+    fillPart(find(id, HTMLElement), html);
+  }
+  for (const [id, rows] of Object.entries(tables)) {
+    fillTable(find(id, HTMLTableSectionElement), rows);
+  }
   if (sample.length && sample.join() !== lastSample) {
     lastSample = sample.join();
     listeners.forEach((listener) => listener(sample.map(Number), fresh));
@@ -170,8 +245,9 @@ function take(event) {
 
 /** A hidden tab does not listen: browsers allow few connections to one server. */
 function listen() {
-  if (document.hidden || source)
+  if (document.hidden || source) {
     return;
+  }
   heard = Date.now();
   source = new EventSource('events');
   source.addEventListener('open', () => {
@@ -191,8 +267,9 @@ function listen() {
 
 function lose() {
   const since = new Date(heard).toLocaleTimeString();
-  if (!lamp.classList.contains('lost'))
+  if (!lamp.classList.contains('lost')) {
     say(`No connection since ${since}: what you see is old. Trying again …`, true);
+  }
 }
 
 /** A server that hangs, or a network that drops everything, does not close the connection. */
@@ -209,14 +286,20 @@ function rest() {
   source = undefined;
 }
 
-document.querySelectorAll('table:has(th[data-sort])').forEach(makeSortable);
+for (const table of document.querySelectorAll('table')) {
+  const [body] = table.tBodies;
+  if (body && table.querySelector('th[data-sort]')) {
+    makeSortable(table, body);
+  }
+}
 for (const field of document.querySelectorAll('[data-filter]')) {
   field.addEventListener('input', () => {
-    filter(document.getElementById(field.dataset.filter));
+    filter(find(field.getAttribute('data-filter') ?? '', HTMLTableSectionElement));
     // A list that has become shorter could end above the visible part.
     const section = field.closest('section');
-    if (section.getBoundingClientRect().top < 0)
+    if (section && section.getBoundingClientRect().top < 0) {
       section.scrollIntoView();
+    }
   });
 }
 showTimes(document);

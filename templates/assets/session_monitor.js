@@ -1,23 +1,26 @@
 // The session server's page besides its live tables: announcements, which need the password.
 
+import { find } from './dom.js';
 import './live.js';
 
+/** Only with a password the page has this form. */
 const form = document.getElementById('announce');
-const text = document.getElementById('announce-text');
-const problem = document.getElementById('announce-problem');
 
+/** @param {{ text?: string }} order without a text, the announcement ends */
 async function announce(order) {
   const request = { method: 'POST', headers: { 'Content-Type': 'application/json' }, body: JSON.stringify(order) };
   // The browser asks for the password.
+  const problem = find('announce-problem', HTMLElement);
   const answer = await fetch('announcement', request).catch(() => undefined);
-  if (answer?.ok)
+  if (answer?.ok) {
     problem.textContent = '';
-  else
+  } else {
     problem.textContent = answer ? await answer.text() : 'The server does not answer.';
+  }
 }
 
 form?.addEventListener('submit', (event) => {
   event.preventDefault();
-  announce({ text: text.value });
+  announce({ text: find('announce-text', HTMLInputElement).value });
 });
 document.getElementById('announce-end')?.addEventListener('click', () => announce({}));

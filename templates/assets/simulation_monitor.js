@@ -2,12 +2,13 @@
 // administrators a way to stop a simulation.
 
 import { Charts } from './charts.js';
+import { find } from './dom.js';
 import { onSample } from './live.js';
 import { duration } from './times.js';
 
-const charts = new Charts(document.getElementById('charts'));
-const dialog = document.getElementById('output');
-const text = document.getElementById('output-text');
+const charts = new Charts(find('charts', HTMLElement));
+const dialog = find('output', HTMLDialogElement);
+const text = find('output-text', HTMLElement);
 
 async function loadHistory() {
   const answer = await fetch('history');
@@ -16,72 +17,92 @@ async function loadHistory() {
 
 /** If the page may have missed samples, it requests all of them again. */
 onSample((sample, fresh) => {
-  if (fresh)
+  if (fresh) {
     loadHistory().catch(() => charts.add(sample));
-  else
+  } else {
     charts.add(sample);
+  }
 });
 
 setInterval(() => {
   for (const element of document.querySelectorAll('[data-ends]')) {
-    const left = Number(element.dataset.ends) - Date.now() / 1000;
+    const left = Number(element.getAttribute('data-ends')) - Date.now() / 1000;
     element.textContent = duration(left);
     element.classList.toggle('bad', left < 300);
   }
-  for (const element of document.querySelectorAll('[data-away]'))
-    element.textContent = `away, ${duration(Number(element.dataset.away) - Date.now() / 1000)} left`;
+  for (const element of document.querySelectorAll('[data-away]')) {
+    element.textContent = `away, ${duration(Number(element.getAttribute('data-away')) - Date.now() / 1000)} left`;
+  }
 }, 1000);
 
+/** @param {HTMLAnchorElement} link */
 async function showOutput(link) {
-  document.getElementById('output-title').textContent = `Output of ${link.dataset.output}`;
+  find('output-title', HTMLElement).textContent = `Output of ${link.dataset.output}`;
   text.textContent = 'Loading …';
   dialog.showModal();
   try {
     const answer = await fetch(link.href);
-    text.textContent = await answer.text() || 'It has printed nothing yet.';
+    text.textContent = (await answer.text()) || 'It has printed nothing yet.';
   } catch {
     text.textContent = 'The server does not answer.';
   }
   text.scrollTop = text.scrollHeight;
 }
 
-/* Only administrators have this dialog. */
-const stopping = document.getElementById('stop');
-const problem = document.getElementById('stop-problem');
-const reason = document.getElementById('stop-reason');
+/* Only administrators have this dialog, and the buttons that open it. */
+
+/** The elements of the dialog. */
+const stopDialog = () => ({
+  dialog: find('stop', HTMLDialogElement),
+  problem: find('stop-problem', HTMLElement),
+  reason: find('stop-reason', HTMLInputElement),
+});
+/** The id of the simulation to stop. @type {string | undefined} */
 let chosen;
 
+/** @param {HTMLElement} button */
 function askToStop({ dataset: { stop, world, who } }) {
+  const { dialog: stopping, problem, reason } = stopDialog();
   chosen = stop;
-  document.getElementById('stop-what').textContent = who ? `${world} of ${who} (${stop})` : `${world} (${stop})`;
-  problem.textContent = reason.value = '';
+  find('stop-what', HTMLElement).textContent = who ? `${world} of ${who} (${stop})` : `${world} (${stop})`;
+  problem.textContent = '';
+  reason.value = '';
   stopping.showModal();
   reason.focus();
 }
 
+/** @param {Event} event */
 async function stopNow(event) {
   event.preventDefault();
-  const order = { method: 'POST', headers: { 'Content-Type': 'application/json' }, body: JSON.stringify({ reason: reason.value }) };
+  const { dialog: stopping, problem, reason } = stopDialog();
+  const order = {
+    method: 'POST',
+    headers: { 'Content-Type': 'application/json' },
+    body: JSON.stringify({ reason: reason.value }),
+  };
   const answer = await fetch(`simulations/${chosen}/stop`, order).catch(() => undefined);
-  if (answer?.ok)
+  if (answer?.ok) {
     stopping.close();
-  else
+  } else {
     problem.textContent = answer ? await answer.text() : 'The server does not answer.';
+  }
 }
 
 document.getElementById('stop-form')?.addEventListener('submit', stopNow);
-document.getElementById('stop-cancel')?.addEventListener('click', () => stopping.close());
+document.getElementById('stop-cancel')?.addEventListener('click', () => stopDialog().dialog.close());
 document.addEventListener('click', (event) => {
-  const button = event.target.closest('button[data-stop]');
-  if (button)
+  const button = event.target instanceof Element && event.target.closest('button[data-stop]');
+  if (button instanceof HTMLElement) {
     askToStop(button);
+  }
 });
 
 document.addEventListener('click', (event) => {
-  const link = event.target.closest('a[data-output]');
-  if (!link || event.ctrlKey || event.metaKey || event.shiftKey)
+  const link = event.target instanceof Element && event.target.closest('a[data-output]');
+  if (!(link instanceof HTMLAnchorElement) || event.ctrlKey || event.metaKey || event.shiftKey) {
     return;
+  }
   event.preventDefault();
   showOutput(link);
 });
-document.getElementById('output-close').addEventListener('click', () => dialog.close());
+find('output-close', HTMLButtonElement).addEventListener('click', () => dialog.close());

@@ -4,55 +4,85 @@
 // page to locate its data. Both are redirected to where the component itself comes from: a simulation server that has
 // Webots has all of these files, and this page runs no inline scripts.
 
+import { find } from './dom.js';
+
 const HOME = /^https:\/\/cyberbotics\.com\/wwi\/[^/]+\//;
 const wanted = new URLSearchParams(location.hash.slice(1));
 const script = wanted.get('script') ?? '';
 const base = script.slice(0, script.lastIndexOf('/') + 1);
 
+/** @param {string} text */
 function problem(text) {
-  document.getElementById('problem').textContent = text;
+  find('problem', HTMLElement).textContent = text;
 }
 
-function redirected(node) {
-  for (const key of ['src', 'href']) {
-    if (typeof node[key] === 'string' && HOME.test(node[key]))
-      node[key] = node[key].replace(HOME, base);
+/**
+ * Lets an element load from where the component comes from.
+ * @param {Node} node
+ */
+function redirect(node) {
+  if (node instanceof HTMLScriptElement && HOME.test(node.src)) {
+    node.src = node.src.replace(HOME, base);
+  } else if (node instanceof HTMLLinkElement && HOME.test(node.href)) {
+    node.href = node.href.replace(HOME, base);
   }
-  return node;
 }
 
 /** This page can't store anything: the component gets a store that lasts as long as the page. */
 function forgetful() {
+  /** @type {Map<string, string>} */
   const kept = new Map();
   return {
+    /** @param {unknown} key */
     getItem: (key) => kept.get(String(key)) ?? null,
+    /**
+     * @param {unknown} key
+     * @param {unknown} value
+     */
     setItem: (key, value) => kept.set(String(key), String(value)),
+    /** @param {unknown} key */
     removeItem: (key) => kept.delete(String(key)),
     clear: () => kept.clear(),
   };
 }
 
-for (const name of ['localStorage', 'sessionStorage'])
+for (const name of ['localStorage', 'sessionStorage']) {
   Object.defineProperty(window, name, { value: forgetful() });
+}
 
-window.Module = [];
-window.Module.locateFile = (path, prefix) => (path.endsWith('.data') ? base : prefix) + path;
+/** @type {(path: string, prefix: string) => string} */
+const locateFile = (path, prefix) => (path.endsWith('.data') ? base : prefix) + path;
+Object.assign(window, { Module: Object.assign([], { locateFile }) });
 
+/** @type {(node: Node) => Node} */
 const append = document.head.appendChild.bind(document.head);
-document.head.appendChild = (node) => {
-  const isText = node.tagName === 'SCRIPT' && !node.src;
-  return isText ? node : append(redirected(node));
-};
+Object.assign(document.head, {
+  /** @param {Node} node */
+  appendChild(node) {
+    if (node instanceof HTMLScriptElement && !node.src) {
+      return node;
+    }
+    redirect(node);
+    return append(node);
+  },
+});
+
+/** The component, of which only this is used.
+ * @typedef {HTMLElement & { connect(url: string | null, mode: undefined, broadcast: boolean, mobile: boolean, timeout: number): void }} WebotsView
+ */
 
 try {
   // A page that is not embedded could be opened by a link that names any script.
-  if (window === top || !script)
+  if (window === top || !script) {
     throw new Error('no viewer is named');
+  }
   await import(script);
-  const view = document.createElement('webots-view');
-  document.getElementById('main').append(view);
+  const view = /** @type {WebotsView} */ (document.createElement('webots-view'));
+  find('main', HTMLElement).append(view);
   // The kind of stream is left to the component: its name has changed over the versions of Webots.
   view.connect(wanted.get('stream'), undefined, wanted.has('watch'), matchMedia('(pointer: coarse)').matches, -1);
 } catch (error) {
-  problem(`Webots’ viewer can’t be loaded: ${error.message}. Choose the small viewer and connect again.`);
+  problem(
+    `Webots’ viewer can’t be loaded: ${error instanceof Error ? error.message : error}. Choose the small viewer and connect again.`,
+  );
 }

@@ -20,6 +20,7 @@ pub const COMMON: &[Asset] = &[
     asset!("icon.svg"),
     asset!("live.js"),
     asset!("times.js"),
+    asset!("dom.js"),
     asset!("viewer.css"),
     asset!("stream.js"),
     asset!("small_viewer.js"),
