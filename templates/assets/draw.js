@@ -1,6 +1,9 @@
 // Draws a scene with WebGL: one light, plain colours.
 
 import { perspective, unit } from './matrix.js';
+import { SceneError } from './scene.js';
+
+/** @typedef {import('./shapes.js').Triangles} Triangles */
 
 const VERTEX = `
 attribute vec3 position;
@@ -39,66 +42,106 @@ void main() {
 export class Drawing {
   #canvas;
   #gl;
-  #program;
-  #places = {};
+  #locations;
+  /** The buffers of each mesh: positions, normals. @type {WeakMap<Triangles, WebGLBuffer[]>} */
   #buffers = new WeakMap();
 
-  /** Prepares a canvas. Throws if this browser has no WebGL. */
+  /**
+   * Prepares a canvas. Throws if this browser has no WebGL.
+   * @param {HTMLCanvasElement} canvas
+   */
   constructor(canvas) {
     this.#canvas = canvas;
-    this.#gl = canvas.getContext('webgl', { antialias: true, alpha: false });
-    if (!this.#gl)
-      throw new Error('this browser offers no WebGL, so that nothing can be drawn');
-    this.#begin();
+    const gl = canvas.getContext('webgl', { antialias: true, alpha: false });
+    if (!gl) {
+      throw new SceneError('no-webgl');
+    }
+    this.#gl = gl;
+    this.#locations = this.#begin();
     canvas.addEventListener('webglcontextlost', (event) => event.preventDefault());
-    canvas.addEventListener('webglcontextrestored', () => this.#begin());
+    canvas.addEventListener('webglcontextrestored', () => {
+      this.#locations = this.#begin();
+    });
   }
 
   #begin() {
     const gl = this.#gl;
     this.#buffers = new WeakMap();
-    this.#program = gl.createProgram();
-    for (const [kind, source] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
+    const program = gl.createProgram();
+    for (const { kind, source } of [
+      { kind: gl.VERTEX_SHADER, source: VERTEX },
+      { kind: gl.FRAGMENT_SHADER, source: FRAGMENT },
+    ]) {
       const shader = gl.createShader(kind);
+      // A browser that loses its GPU now restores the context later.
+      if (!shader) {
+        continue;
+      }
       gl.shaderSource(shader, source);
       gl.compileShader(shader);
-      gl.attachShader(this.#program, shader);
+      gl.attachShader(program, shader);
     }
-    gl.linkProgram(this.#program);
-    gl.useProgram(this.#program);
-    const names = ['model', 'view', 'projection', 'colour', 'glow', 'sky', 'toLight', 'lightColour', 'eye', 'opacity', 'haze'];
-    for (const name of names)
-      this.#places[name] = gl.getUniformLocation(this.#program, name);
+    gl.linkProgram(program);
+    gl.useProgram(program);
     gl.enable(gl.DEPTH_TEST);
     gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
+    /** @param {string} name */
+    const at = (name) => gl.getUniformLocation(program, name);
+    return {
+      attributes: ['position', 'normal'].map((name) => gl.getAttribLocation(program, name)),
+      model: at('model'),
+      view: at('view'),
+      projection: at('projection'),
+      colour: at('colour'),
+      glow: at('glow'),
+      sky: at('sky'),
+      toLight: at('toLight'),
+      lightColour: at('lightColour'),
+      eye: at('eye'),
+      opacity: at('opacity'),
+      haze: at('haze'),
+    };
   }
 
+  /** @param {Triangles} mesh */
   #buffersOf(mesh) {
-    if (!this.#buffers.has(mesh)) {
+    let buffers = this.#buffers.get(mesh);
+    if (!buffers) {
       const gl = this.#gl;
+      /** @param {Float32Array} data */
       const make = (data) => {
         const buffer = gl.createBuffer();
         gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
         gl.bufferData(gl.ARRAY_BUFFER, data, gl.STATIC_DRAW);
         return buffer;
       };
-      this.#buffers.set(mesh, [make(mesh.positions), make(mesh.normals)]);
+      buffers = [make(mesh.positions), make(mesh.normals)];
+      this.#buffers.set(mesh, buffers);
     }
-    return this.#buffers.get(mesh);
+    return buffers;
   }
 
-  /** Draws a scene as a camera sees it. */
+  /**
+   * Draws a scene as a camera sees it.
+   * @param {import('./scene.js').Scene} scene
+   * @param {import('./camera.js').Camera} camera
+   */
   draw(scene, camera) {
-    const [gl, at, canvas] = [this.#gl, this.#places, this.#canvas];
+    const gl = this.#gl;
+    const at = this.#locations;
+    const canvas = this.#canvas;
     const density = Math.min(2, window.devicePixelRatio || 1);
-    const size = [Math.round(canvas.clientWidth * density), Math.round(canvas.clientHeight * density)];
-    if (canvas.width !== size[0] || canvas.height !== size[1])
-      [canvas.width, canvas.height] = size;
-    const aspect = size[0] / Math.max(1, size[1]);
+    const width = Math.round(canvas.clientWidth * density);
+    const height = Math.round(canvas.clientHeight * density);
+    if (canvas.width !== width || canvas.height !== height) {
+      [canvas.width, canvas.height] = [width, height];
+    }
+    const aspect = width / Math.max(1, height);
     // Webots' field of view is that of the wider side.
     const angle = aspect > 1 ? 2 * Math.atan(Math.tan(scene.viewpoint.angle / 2) / aspect) : scene.viewpoint.angle;
-    gl.viewport(0, 0, ...size);
-    gl.clearColor(...scene.sky, 1);
+    gl.viewport(0, 0, width, height);
+    const [red = 0, green = 0, blue = 0] = scene.sky;
+    gl.clearColor(red, green, blue, 1);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     gl.uniformMatrix4fv(at.view, false, camera.matrix());
     gl.uniformMatrix4fv(at.projection, false, perspective(angle, aspect, camera.distance / 100, camera.distance * 100));
@@ -108,17 +151,20 @@ export class Drawing {
     gl.uniform3fv(at.eye, camera.eye);
     gl.uniform1f(at.haze, 4 * camera.distance);
     const clear = scene.shapes.filter(({ opacity }) => opacity < 1);
-    for (const shape of scene.shapes.filter(({ opacity }) => opacity >= 1))
+    for (const shape of scene.shapes.filter(({ opacity }) => opacity >= 1)) {
       this.#shape(shape);
+    }
     gl.enable(gl.BLEND);
     clear.forEach((shape) => this.#shape(shape));
     gl.disable(gl.BLEND);
   }
 
+  /** @param {import('./scene.js').Shape} shape */
   #shape({ mesh, matrix, colour, glow, opacity }) {
-    const [gl, at] = [this.#gl, this.#places];
+    const gl = this.#gl;
+    const at = this.#locations;
     this.#buffersOf(mesh).forEach((buffer, index) => {
-      const place = gl.getAttribLocation(this.#program, ['position', 'normal'][index]);
+      const place = at.attributes[index];
       gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
       gl.enableVertexAttribArray(place);
       gl.vertexAttribPointer(place, 3, gl.FLOAT, false, 0, 0);

@@ -1,150 +1,188 @@
 // The small viewer: a scene in three dimensions, its clock, and the buttons of a simulation.
 
 import { Camera } from './camera.js';
+import { make } from './dom.js';
 import { Drawing } from './draw.js';
-import { Scene } from './scene.js';
+import { words } from './english.js';
+import { Scene, SceneError } from './scene.js';
 import { Stream } from './stream.js';
+
+/** @typedef {import('./stream.js').Mode} Mode */
 
 /** Number of lines of the simulation's console that are kept. */
 const LINES = 200;
 
-function make(name, properties, ...children) {
-  const element = Object.assign(document.createElement(name), properties);
-  element.append(...children);
-  return element;
-}
+/**
+ * What happens in the viewer. `heard`: the simulator has sent an update.
+ * @typedef {{ is: 'loading', status: string, percent: number }
+ *   | { is: 'shown', title: string }
+ *   | { is: 'mode', mode: Mode }
+ *   | { is: 'heard' }
+ *   | { is: 'failed', why: import('./scene.js').SceneProblem }
+ *   | { is: 'closed' }} ViewerEvent
+ */
 
-export class SmallViewer extends EventTarget {
+/**
+ * `kind`: the kind of stream, if it is known; `isOnlooker`: the simulation's time goes on; `isReadOnly`: without buttons
+ * that change the simulation.
+ * @typedef {{ kind?: string | undefined, isOnlooker?: boolean, isReadOnly?: boolean }} ViewerOptions
+ */
+
+export class SmallViewer {
   #stream;
+  #tell;
+  /** @type {Scene | undefined} */
   #scene;
   #camera;
   #drawing;
+  /** @type {Mode} */
   #mode = 'pause';
-  /** The mode to go back to after a reset. */
+  /** The mode to go back to after a reset. @type {Mode | undefined} */
   #running;
-  #time = 0;
-  #drawn = false;
+  #isDrawn = false;
   #isFrozen = false;
+  /** @type {string[]} */
   #lines = [];
   #parts;
-  #watch = new ResizeObserver(() => this.#redraw());
-
-  /** Whether its user only watches. */
-  #watches;
+  #resizes = new ResizeObserver(() => this.#redraw());
 
   /**
-   * Shows the simulation at an address in an element. Its time goes on for a client that returns (`true`) or only
-   * watches (`'watches'`). Events: `ready`, `loading` (text), `heard`, `lost`.
+   * Shows the simulation at an address in an element. Throws if this browser can't draw.
+   * @param {HTMLElement} stage
+   * @param {string} url
+   * @param {ViewerOptions} options
+   * @param {(event: ViewerEvent) => void} tell
    */
-  constructor(stage, url, isBack = false) {
-    super();
-    this.#watches = isBack === 'watches';
-    this.#parts = this.#build();
+  constructor(stage, url, { kind, isOnlooker = false, isReadOnly = false }, tell) {
+    this.#tell = tell;
+    this.#parts = this.#build(isReadOnly);
     stage.replaceChildren(...this.#parts.all);
     this.#drawing = new Drawing(this.#parts.canvas);
     this.#camera = new Camera(this.#parts.canvas, () => this.#redraw());
-    this.#watch.observe(this.#parts.canvas);
-    this.#stream = new Stream(url, Boolean(isBack));
-    const hear = (kind, handler) => this.#stream.addEventListener(kind, ({ detail }) => handler(detail));
-    hear('loading', (text) => this.#tell('loading', text));
-    hear('model', (xml) => this.#show(xml));
-    hear('update', (update) => {
-      this.#update(update);
-      this.#tell('heard');
-    });
-    hear('mode', (mode) => this.#enter(mode));
-    hear('time', (time) => this.#setTime(time));
-    hear('reset', () => this.#afterReset());
-    hear('console', (text) => this.#print(text));
-    hear('closed', () => this.#isFrozen || this.#tell('lost'));
+    this.#resizes.observe(this.#parts.canvas);
+    this.#stream = new Stream(url, { kind, isOnlooker }, (event) => this.#hear(event));
   }
 
-  #build() {
+  /** @param {import('./stream.js').StreamEvent} event */
+  #hear(event) {
+    switch (event.is) {
+      case 'loading':
+        return this.#tell(event);
+      case 'model':
+        return this.#show(event.xml);
+      case 'update':
+        this.#update(event.update);
+        return this.#tell({ is: 'heard' });
+      case 'mode':
+        return this.#enter(event.mode);
+      case 'time':
+        return this.#setTime(event.time);
+      case 'reset':
+        return this.#afterReset();
+      case 'console':
+        return this.#print(event.text);
+      case 'closed':
+        return this.#isFrozen ? undefined : this.#tell(event);
+    }
+  }
+
+  /** @param {boolean} isReadOnly */
+  #build(isReadOnly) {
+    /**
+     * @param {string} text
+     * @param {() => void} action
+     * @param {string} title
+     */
     const button = (text, action, title) => {
       const made = make('button', { type: 'button', textContent: text, title, disabled: true });
       made.addEventListener('click', action);
       return made;
     };
-    const play = button('Play', () => this.#toggle(), 'Run in real time, or pause');
-    const step = button('Step', () => this.#stream.send('step'), 'One step of time');
-    const reset = button('Reset', () => this.#reset(), 'Back to the beginning');
-    const view = button('Home view', () => this.#camera.home(), 'Look from where the world says');
+    const { viewer } = words;
+    const play = button(viewer.play, () => this.#toggle(), viewer.playTitle);
+    const step = button(viewer.step, () => this.#stream.send('step'), viewer.stepTitle);
+    const reset = button(viewer.reset, () => this.#reset(), viewer.resetTitle);
+    const home = button(viewer.home, () => this.#camera.home(), viewer.homeTitle);
     const clock = make('span', { className: 'clock', id: 'clock', textContent: '0:00.000' });
     clock.setAttribute('role', 'timer');
-    clock.setAttribute('aria-label', 'Simulation time');
-    const mode = make('span', { className: 'mode', id: 'mode', textContent: 'loading' });
-    const tools = make('div', { className: 'tools' }, play, step, reset, view, mode, clock);
-    for (const one of [play, step, reset])
-      one.hidden = this.#watches;
+    clock.setAttribute('aria-label', viewer.clock);
+    const mode = make('span', { className: 'mode', id: 'mode', textContent: viewer.modes.loading });
+    const tools = make('div', { className: 'tools' }, play, step, reset, home, mode, clock);
+    for (const one of [play, step, reset]) {
+      one.hidden = isReadOnly;
+    }
     tools.setAttribute('role', 'toolbar');
-    tools.setAttribute('aria-label', 'Simulation');
-    const title = make('p', { className: 'title' });
+    tools.setAttribute('aria-label', viewer.tools);
     const canvas = make('canvas', { tabIndex: 0, id: 'view' });
     canvas.setAttribute('role', 'application');
-    canvas.setAttribute('aria-label', 'View of the scene');
-    const help = make('p', { className: 'help', id: 'view-help' }, make('small', {
-      textContent: 'Drag or use the arrow keys to look around; with Shift to move; wheel, pinch, + and − to come closer; Home to go back.',
-    }));
+    canvas.setAttribute('aria-label', viewer.view(''));
+    const help = make('p', { className: 'help', id: 'view-help' }, make('small', { textContent: viewer.help }));
     canvas.setAttribute('aria-describedby', help.id);
     const lines = make('pre', { tabIndex: 0 });
-    const output = make('details', { hidden: true }, make('summary', { textContent: 'Console' }), lines);
-    return { play, step, reset, view, clock, mode, title, canvas, lines, output, all: [tools, canvas, help, output] };
+    const output = make('details', { hidden: true }, make('summary', { textContent: viewer.console }), lines);
+    return { play, step, reset, home, clock, mode, canvas, lines, output, all: [tools, canvas, help, output] };
   }
 
-  #tell(kind, detail) {
-    this.dispatchEvent(new CustomEvent(kind, { detail }));
-  }
-
+  /** @param {string} xml */
   #show(xml) {
+    let scene;
     try {
-      this.#scene = new Scene(xml);
+      scene = new Scene(xml);
     } catch (error) {
-      this.#tell('lost', error.message);
+      if (!(error instanceof SceneError)) {
+        throw error;
+      }
+      this.#tell({ is: 'failed', why: error.code });
       return;
     }
-    this.#camera.home(this.#scene.viewpoint);
+    this.#scene = scene;
+    this.#camera.home(scene.viewpoint);
     this.#setTime(0);
-    for (const button of [this.#parts.play, this.#parts.step, this.#parts.reset, this.#parts.view])
+    for (const button of [this.#parts.play, this.#parts.step, this.#parts.reset, this.#parts.home]) {
       button.disabled = false;
-    this.#parts.canvas.setAttribute('aria-label', `View of the scene ${this.#scene.title}`.trim());
+    }
+    this.#parts.canvas.setAttribute('aria-label', words.viewer.view(scene.title));
+    this.#tell({ is: 'shown', title: scene.title });
     this.#enter('pause');
-    this.#tell('ready', this.#scene.title);
   }
 
+  /** @param {import('./stream.js').Update} update */
   #update(update) {
     this.#setTime(update.time);
     this.#scene?.update(update);
     this.#redraw();
   }
 
+  /** @param {number} time in milliseconds */
   #setTime(time) {
-    this.#time = time;
     const seconds = Math.floor(time / 1000);
+    /**
+     * @param {number} number
+     * @param {number} digits
+     */
     const pad = (number, digits) => String(number).padStart(digits, '0');
-    this.#parts.clock.textContent =
-      `${Math.floor(seconds / 60)}:${pad(seconds % 60, 2)}.${pad(Math.round(time) % 1000, 3)}`;
+    this.#parts.clock.textContent = `${Math.floor(seconds / 60)}:${pad(seconds % 60, 2)}.${pad(Math.round(time) % 1000, 3)}`;
   }
 
+  /** @param {Mode} mode */
   #enter(mode) {
     this.#mode = mode;
-    this.#parts.play.textContent = mode === 'pause' ? 'Play' : 'Pause';
-    this.#parts.mode.textContent = mode === 'pause' ? 'paused' : mode.replace('-', ' ');
-  }
-
-  /** Whether the time of the simulation goes on, also if another client has started it. */
-  get runs() {
-    return !this.#isFrozen && this.#mode !== 'pause';
+    this.#parts.play.textContent = mode === 'pause' ? words.viewer.play : words.viewer.pause;
+    this.#parts.mode.textContent = words.viewer.modes[mode];
+    if (!this.#isFrozen) {
+      this.#tell({ is: 'mode', mode });
+    }
   }
 
   /** Marks what is shown as out of date. */
-  stale() {
-    this.#parts.mode.textContent = 'no connection';
+  markStale() {
+    this.#parts.mode.textContent = words.viewer.modes.lost;
   }
 
   /** Keeps what is shown, and closes the connection. */
   freeze() {
     this.#isFrozen = true;
-    this.stale();
+    this.markStale();
     this.close();
   }
 
@@ -159,11 +197,13 @@ export class SmallViewer extends EventTarget {
   }
 
   #afterReset() {
-    if (this.#running)
+    if (this.#running) {
       this.#stream.send(`${this.#running}:-1`);
+    }
     this.#running = undefined;
   }
 
+  /** @param {string} text */
   #print(text) {
     this.#lines = [...this.#lines, ...text.split('\n')].slice(-LINES);
     this.#parts.lines.textContent = this.#lines.join('\n');
@@ -172,19 +212,23 @@ export class SmallViewer extends EventTarget {
 
   /** Draws in the next animation frame. */
   #redraw() {
-    if (this.#drawn || !this.#scene)
+    if (this.#isDrawn || !this.#scene) {
       return;
-    this.#drawn = true;
+    }
+    this.#isDrawn = true;
     requestAnimationFrame(() => {
-      this.#drawn = false;
-      this.#drawing.draw(this.#scene, this.#camera);
+      this.#isDrawn = false;
+      if (this.#scene) {
+        this.#drawing.draw(this.#scene, this.#camera);
+      }
     });
   }
 
   close() {
-    for (const button of [this.#parts.play, this.#parts.step, this.#parts.reset])
+    for (const button of [this.#parts.play, this.#parts.step, this.#parts.reset]) {
       button.disabled = true;
-    this.#watch.disconnect();
+    }
+    this.#resizes.disconnect();
     this.#stream.close();
   }
 }

@@ -1,93 +1,174 @@
-// The streaming protocol of Webots, as a viewer speaks it: texts over a WebSocket.
+// The streaming protocol of Webots, as a viewer speaks it: texts over a WebSocket. No DOM.
 
-/** Time without an answer after which the stream is requested by its newer name, in milliseconds. */
+/** Time without a scene after which the stream is requested by its newer name, in milliseconds. */
 const SILENCE = 2000;
-/** Newer versions of Webots call their 3D stream `w3d`. */
+/** The names of the 3D stream, in the order in which they are tried if the server has not told which one it is. */
 const KINDS = ['x3d', 'w3d'];
+/** How long a simulator has to show that it is the demonstration's, in milliseconds. */
+const DEMONSTRATION = 3 * SILENCE;
 
 /**
- * A connection to a simulator. Events: `loading` (text), `model` (XML), `update` (object), `mode` (`pause`,
- * `real-time` or `fast`), `time` (milliseconds), `reset`, `console` (text), `closed` (clean or not).
+ * An update of the scene, as the simulator sends it.
+ * @typedef {{ time: number, updates?: { id: number, translation?: string, rotation?: string }[] }} Update
  */
-export class Stream extends EventTarget {
-  #socket;
-  #timer;
-  #heard = false;
 
-  /** Opens the connection. A new client makes the simulator pause; an onlooker, or a client that returns, does not. */
-  constructor(url, onlooker = false) {
-    super();
+/** @typedef {'pause' | 'real-time' | 'fast'} Mode */
+
+/**
+ * What a simulator sends. `closed` is the last event.
+ * @typedef {{ is: 'loading', status: string, percent: number }
+ *   | { is: 'model', xml: string }
+ *   | { is: 'update', update: Update }
+ *   | { is: 'mode', mode: Mode }
+ *   | { is: 'time', time: number }
+ *   | { is: 'reset' }
+ *   | { is: 'console', text: string }
+ *   | { is: 'closed' }} StreamEvent
+ */
+
+/** A connection to a simulator. */
+export class Stream {
+  #socket;
+  #tell;
+  /** @type {ReturnType<typeof setTimeout> | undefined} */
+  #timer;
+  /**
+   * Whether the simulator has answered the request for its scene. It sends updates, errors and warnings to everybody,
+   * asked or not: they say nothing about that.
+   */
+  #isAnswered = false;
+
+  /**
+   * Connects, and requests the scene.
+   * @param {string} url
+   * @param {{ kind?: string | undefined, isOnlooker?: boolean }} options the kind of stream that the simulator offers, if
+   *   it is known; a new client makes the simulator pause, an onlooker, or a client that returns, does not
+   * @param {(event: StreamEvent) => void} tell
+   */
+  constructor(url, { kind, isOnlooker = false }, tell) {
+    this.#tell = tell;
     this.#socket = new WebSocket(`${url}/`);
-    this.#socket.addEventListener('open', () => this.#introduce(onlooker ? ';broadcast' : '', 0));
-    this.#socket.addEventListener('message', ({ data }) => {
-      this.#heard = true;
-      this.#understand(data);
-    });
-    this.#socket.addEventListener('close', ({ wasClean }) => {
+    const kinds = kind ? [kind] : KINDS;
+    this.#socket.addEventListener('open', () => this.#request(kinds, isOnlooker ? ';broadcast' : ''));
+    this.#socket.addEventListener('message', ({ data }) => this.#read(String(data)));
+    this.#socket.addEventListener('close', () => {
       clearTimeout(this.#timer);
-      this.#tell('closed', wasClean);
+      tell({ is: 'closed' });
     });
   }
 
-  #introduce(suffix, attempt) {
-    this.send(KINDS[attempt] + suffix);
+  /**
+   * @param {string[]} kinds
+   * @param {string} suffix
+   */
+  #request([kind, ...others], suffix) {
+    this.send(`${kind}${suffix}`);
+    if (others.length === 0) {
+      return;
+    }
     this.#timer = setTimeout(() => {
-      if (!this.#heard && attempt + 1 < KINDS.length)
-        this.#introduce(suffix, attempt + 1);
+      if (!this.#isAnswered) {
+        this.#request(others, suffix);
+      }
     }, SILENCE);
   }
 
-  #tell(kind, detail) {
-    this.dispatchEvent(new CustomEvent(kind, { detail }));
-  }
-
+  /** @param {string} text */
   send(text) {
-    if (this.#socket.readyState === WebSocket.OPEN)
+    if (this.#socket.readyState === WebSocket.OPEN) {
       this.#socket.send(text);
+    }
   }
 
   close() {
     this.#socket.close(1000);
   }
 
-  #understand(text) {
-    const rest = (prefix) => text.slice(prefix.length);
-    if (text.startsWith('application/json:')) {
-      const update = JSON.parse(rest('application/json:'));
-      // Up to R2022b the key was `poses`.
-      this.#tell('update', { ...update, updates: update.updates ?? update.poses });
-    } else if (text.startsWith('model:'))
-      this.#tell('model', rest('model:'));
-    else if (text.startsWith('loading:')) {
-      const [status, percent] = rest('loading:').split(':');
-      this.#tell('loading', `${status.trim()} ${percent} %`);
-    } else if (text.startsWith('pause:')) {
-      this.#tell('mode', 'pause');
-      this.#tell('time', Number(rest('pause:')));
-    } else if (text === 'paused by client')
-      this.#tell('mode', 'pause');
-    else if (text === 'real-time' || text === 'fast')
-      this.#tell('mode', text);
-    else if (text === 'run')
-      this.#tell('mode', 'fast');
-    else if (text === 'reset finished')
-      this.#tell('reset');
-    else if (text.startsWith('stdout:') || text.startsWith('stderr:'))
-      this.#tell('console', text.split('\n').map((line) => line.replace(/^(stdout|stderr):/, '')).join('\n'));
+  /** @param {string} text */
+  #read(text) {
+    if (['world:', 'model:', 'loading:'].some((prefix) => text.startsWith(prefix))) {
+      this.#isAnswered = true;
+    }
+    for (const event of events(text)) {
+      this.#tell(event);
+    }
   }
 }
 
-/** Whether the simulator at this address is the demonstration's, as its scene says. */
-export function isDemonstration(url) {
+/**
+ * The events of a text.
+ * @param {string} text
+ * @returns {StreamEvent[]}
+ */
+function events(text) {
+  switch (text) {
+    case 'paused by client':
+      return [{ is: 'mode', mode: 'pause' }];
+    case 'real-time':
+    case 'fast':
+      return [{ is: 'mode', mode: text }];
+    case 'run':
+      return [{ is: 'mode', mode: 'fast' }];
+    case 'reset finished':
+      return [{ is: 'reset' }];
+  }
+  const colon = text.indexOf(':');
+  const rest = text.slice(colon + 1);
+  switch (text.slice(0, Math.max(colon, 0))) {
+    case 'application/json': {
+      const update = JSON.parse(rest);
+      // Up to R2022b the key was `poses`.
+      return [{ is: 'update', update: { ...update, updates: update.updates ?? update.poses } }];
+    }
+    case 'model':
+      return [{ is: 'model', xml: rest }];
+    case 'loading': {
+      const [status = '', percent = ''] = rest.split(':');
+      return [{ is: 'loading', status: status.trim(), percent: Number(percent) }];
+    }
+    case 'pause':
+      return [
+        { is: 'mode', mode: 'pause' },
+        { is: 'time', time: Number(rest) },
+      ];
+    case 'stdout':
+    case 'stderr':
+      return [{ is: 'console', text: text.split('\n').map(printed).join('\n') }];
+  }
+  return [];
+}
+
+/**
+ * A line of the console without the name of its stream.
+ * @param {string} line
+ */
+function printed(line) {
+  const prefix = ['stdout:', 'stderr:'].find((name) => line.startsWith(name)) ?? '';
+  return line.slice(prefix.length);
+}
+
+/**
+ * Whether the simulator at this address is the demonstration's, as the head of its scene says.
+ * @param {string} url
+ * @param {string | undefined} kind
+ * @returns {Promise<boolean>}
+ */
+export function isDemonstration(url, kind) {
   return new Promise((resolve) => {
-    const stream = new Stream(url, true);
+    /** @param {boolean} found */
     const answer = (found) => {
       clearTimeout(timer);
       stream.close();
       resolve(found);
     };
-    const timer = setTimeout(() => answer(false), 3 * SILENCE);
-    stream.addEventListener('model', ({ detail }) => answer(/name="simulator" content="demo"/.test(detail.slice(0, 500))));
-    stream.addEventListener('closed', () => answer(false));
+    const timer = setTimeout(() => answer(false), DEMONSTRATION);
+    const stream = new Stream(url, { kind, isOnlooker: true }, (event) => {
+      if (event.is === 'model') {
+        // What comes before the scene is not of the world.
+        answer(event.xml.slice(0, event.xml.indexOf('<Scene')).includes('name="simulator" content="demo"'));
+      } else if (event.is === 'closed') {
+        answer(false);
+      }
+    });
   });
 }

@@ -1,40 +1,65 @@
 // The page on which an administrator watches a simulation: a read-only viewer.
 
+import { find } from './dom.js';
+import { words } from './english.js';
+import { SceneError } from './scene.js';
 import { SmallViewer } from './small_viewer.js';
 
-const stage = document.getElementById('stage');
+const stage = find('stage', HTMLElement);
 
+/** @param {string} text */
 function tell(text) {
-  document.getElementById('state').textContent = text;
+  find('state', HTMLElement).textContent = text;
 }
 
 function address() {
-  const url = new URL(stage.dataset.stream, location.href);
+  const url = new URL(stage.dataset.stream ?? '', location.href);
   url.protocol = url.protocol === 'https:' ? 'wss:' : 'ws:';
   return url.href;
 }
 
-function showSmall() {
-  const viewer = new SmallViewer(stage, address(), 'watches');
-  viewer.addEventListener('loading', ({ detail }) => tell(detail));
-  viewer.addEventListener('ready', () => tell('Watching'));
-  viewer.addEventListener('lost', ({ detail }) => {
-    viewer.stale();
-    tell(detail ? `The scene can’t be shown: ${detail}.` : 'It is over: the simulation has ended, or its server can’t be reached.');
-  });
+/** @param {import('./small_viewer.js').ViewerEvent} event */
+function take(event) {
+  switch (event.is) {
+    case 'loading':
+      return tell(words.steps.loading(event.status, event.percent));
+    case 'shown':
+      return tell(words.watching.on);
+    case 'failed':
+      viewer?.markStale();
+      return tell(words.scene[event.why]);
+    case 'closed':
+      viewer?.markStale();
+      return tell(words.watching.over);
+  }
 }
 
-function showWebots() {
+function openSmall() {
+  const options = { kind: stage.dataset.kind || undefined, isOnlooker: true, isReadOnly: true };
+  try {
+    return new SmallViewer(stage, address(), options, take);
+  } catch (error) {
+    if (!(error instanceof SceneError)) {
+      throw error;
+    }
+    tell(words.scene[error.code]);
+    return undefined;
+  }
+}
+
+/** @param {string} path of Webots' own viewer */
+function showWebots(path) {
   const frame = document.createElement('iframe');
-  frame.title = 'Webots’ viewer';
+  frame.title = words.stage.webotsViewer;
   frame.allow = 'fullscreen';
-  const script = new URL(stage.dataset.script, location.href).href;
+  const script = new URL(path, location.href).href;
   frame.src = `webots-viewer#${new URLSearchParams({ script, stream: address(), watch: '' })}`;
   stage.replaceChildren(frame);
-  tell('Watching');
+  tell(words.watching.on);
 }
 
-if (stage.dataset.script)
-  showWebots();
-else
-  showSmall();
+const { script } = stage.dataset;
+if (script) {
+  showWebots(script);
+}
+const viewer = script ? undefined : openSmall();

@@ -18,9 +18,14 @@ use crate::shared::run::timestamp;
 /// Assets of this server's pages, besides those that both servers share.
 const ASSETS: &[Asset] = &[
     asset!("viewer.js"),
-    asset!("start.js"),
+    asset!("visit.js"),
+    asset!("page_view.js"),
+    asset!("reasons.js"),
+    asset!("messages.js"),
+    asset!("session_server.js"),
+    asset!("simulation_link.js"),
+    asset!("stage.js"),
     asset!("kept.js"),
-    asset!("lifeline.js"),
     asset!("session_monitor.js"),
 ];
 

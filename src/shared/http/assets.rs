@@ -21,6 +21,7 @@ pub const COMMON: &[Asset] = &[
     asset!("live.js"),
     asset!("times.js"),
     asset!("dom.js"),
+    asset!("english.js"),
     asset!("viewer.css"),
     asset!("stream.js"),
     asset!("small_viewer.js"),

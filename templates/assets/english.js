@@ -1,0 +1,145 @@
+// All words of the viewer page, the small viewer and the watch page, in English. The page chooses them by codes: another
+// language is a file with the same names.
+
+import { duration } from './times.js';
+
+/** @typedef {import('./visit.js').OwnProblem} OwnProblem */
+
+export const words = {
+  availability: {
+    connecting: ['Connecting', 'to the session server …'],
+    free: ['Available', 'A simulation server can take you.'],
+    busy: ['Not available', 'All simulation servers are busy or do not answer.'],
+    unreachable: ['No connection', 'to the session server. Trying again …'],
+    lost: ['No connection', 'It is tried again and again.'],
+  },
+  buttons: { leave: 'Disconnect', stop: 'Stop waiting' },
+  stage: {
+    clear: 'The simulation appears here.',
+    clearLeft: 'You have left the simulation; it has ended.',
+    clearStopped: 'You wait no longer.',
+    webotsViewer: 'Webots’ viewer',
+    onlySmall: 'Webots’ own viewer is not to be had here; the small viewer shows the simulation.',
+  },
+  steps: {
+    choosing: 'choosing a simulation server',
+    choosingAnother: 'choosing another simulation server',
+    allBusy: 'all are busy',
+    /** @param {string} why */
+    redirected: (why) => `another one is asked for: ${why}`,
+    chosen: 'has chosen a simulation server',
+    notAsked: 'is not asked again',
+    /** @param {string} server */
+    connecting: (server) => `connecting to ${server}`,
+    requesting: 'asking for one',
+    /** @param {number} ahead */
+    queued: (ahead) => {
+      if (ahead === 0) {
+        return 'you are next';
+      }
+      return ahead === 1 ? 'one client is ahead of you' : `${ahead} clients are ahead of you`;
+    },
+    granted: 'taken',
+    launching: 'webots is starting',
+    launched: 'the simulator is ready',
+    joining: 'connecting to the simulator',
+    /**
+     * @param {string} status
+     * @param {number} percent
+     */
+    loading: (status, percent) => `${status} ${percent} %`,
+    shown: 'is shown',
+    framed: 'is shown by Webots’ own viewer',
+    closed: 'the simulator has closed its connection',
+    returning: 'asking for the one that was left',
+  },
+  waiting: {
+    general: 'All servers are busy.',
+    share: 'You have as many simulations as you may.',
+    idleTime: 'Worlds of others run here only while the servers have little to do.',
+    advice: 'It starts by itself when one is free.',
+  },
+  lost: {
+    /** @param {number} seconds */
+    since: (seconds) => `No connection since ${duration(seconds)}.`,
+    /** @param {number} seconds */
+    waits: (seconds) =>
+      seconds > 0 ? `Your simulation waits another ${duration(seconds)}.` : 'Your simulation may have ended.',
+    /** @param {number} seconds */
+    said: (seconds) => `No connection. ${words.lost.waits(seconds)}`,
+    found: 'The connection is there again.',
+  },
+  /** @param {number} seconds */
+  idle: (seconds) => `The simulation is paused, and ends in ${duration(seconds)}.`,
+  /** @param {number} seconds */
+  closes: (seconds) => `It will be closed in ${duration(seconds)}.`,
+  /** @param {string} name */
+  visitor: (name) => `The administrator sees you as ${name}.`,
+
+  /** What the page itself has found. */
+  problems: {
+    'session-unreachable': 'The session server could not be reached.',
+    'session-silent': 'The session server does not answer.',
+    'server-unreachable': 'The simulation server could not be reached, or has closed the connection.',
+    'broken-before': 'The connection to the simulation server broke before the simulation ran.',
+    broken: 'The connection to the simulation server broke: the simulation has ended.',
+    /** @param {Extract<OwnProblem, { code: 'absent' }>} problem */
+    absent: ({ since }) => `There was no connection for ${duration(since)}: the simulation has ended.`,
+    /** @param {Extract<OwnProblem, { code: 'simulator-unreachable' }>} problem */
+    'simulator-unreachable': ({ address }) => `The simulator could not be reached at ${address}.`,
+    /** @param {Extract<OwnProblem, { code: 'no-scene' }>} problem */
+    'no-scene': ({ why }) => words.scene[why],
+  },
+  /** Why a scene can't be shown. */
+  scene: {
+    'no-webgl': 'The scene can’t be shown: this browser offers no WebGL, so that nothing can be drawn.',
+    unreadable: 'The scene can’t be shown: the simulator has sent a scene that can’t be read.',
+  },
+  /** What the visitor can do. */
+  advice: {
+    general: 'Connect again. If that fails too, tell the administrator what is written here.',
+    again: 'Connect again for another simulation.',
+    later: 'Try again later.',
+    address:
+      'Copy the address of the world’s page on its forge, such as https://github.com/USER/REPOSITORY/blob/main/worlds/NAME.wbt.',
+    allowed: 'Only worlds of allowed repositories run here: the monitor page of each simulation server lists them.',
+    idleTime: 'Worlds of others run here only while the servers have little to do. Try again later.',
+    share: 'End one of your simulations, or connect again later.',
+    elsewhere:
+      'Connect again in a moment: the session server chooses another simulation server as soon as there is one.',
+    administrator:
+      'It is not the fault of the world. Connect again; if that fails too, tell the administrator what is written here.',
+    exists: 'Look whether the repository, the branch and the file exist, and whether everybody may read them.',
+    moved: 'Open the repository’s page on its forge, and copy the address of the world from there.',
+    smaller: 'Try a smaller project, or ask the administrator for a higher limit.',
+    project: 'It comes from the world or its project. Change that, or connect again.',
+    takenOver: 'Another tab, or another window, shows it now. Connect here for a simulation of this tab’s own.',
+    teacher: 'Ask your teacher before you connect again.',
+    firewall:
+      'A firewall may be in the way: the ports above the simulation server’s own have to be open, or forwarded.',
+  },
+
+  /** The small viewer. */
+  viewer: {
+    play: 'Play',
+    pause: 'Pause',
+    playTitle: 'Run in real time, or pause',
+    step: 'Step',
+    stepTitle: 'One step of time',
+    reset: 'Reset',
+    resetTitle: 'Back to the beginning',
+    home: 'Home view',
+    homeTitle: 'Look from where the world says',
+    clock: 'Simulation time',
+    tools: 'Simulation',
+    help: 'Drag or use the arrow keys to look around; with Shift to move; wheel, pinch, + and − to come closer; Home to go back.',
+    console: 'Console',
+    /** @param {string} title */
+    view: (title) => `View of the scene ${title}`.trim(),
+    modes: { loading: 'loading', pause: 'paused', 'real-time': 'real time', fast: 'fast', lost: 'no connection' },
+  },
+  watching: {
+    on: 'Watching',
+    over: 'It is over: the simulation has ended, or its server can’t be reached.',
+  },
+};

@@ -1,0 +1,195 @@
+// The texts that servers send on their WebSockets, read into messages. Texts that belong together become one message:
+// a reason and its sentence, a kind of stream and its address. No DOM.
+
+/**
+ * Why something failed, as a server sends it before the sentence. What others have printed is in `output`.
+ * @typedef {{ code: string, blame: string, retry: string, output?: string }} Reason
+ */
+
+/**
+ * A refusal, a failed start or an end: the server's sentence and, from servers that send it, the reason.
+ * @typedef {{ sentence: string, reason?: Reason | undefined }} Failure
+ */
+
+/**
+ * How a client resumes its simulation: the token, and how many seconds the simulation waits for its client.
+ * @typedef {{ token: string, absence: number }} Resumption
+ */
+
+/**
+ * A message of a simulation server.
+ * @typedef {{ is: 'queued', ahead: number }
+ *   | { is: 'progress', text: string }
+ *   | { is: 'launched', closesIn: number }
+ *   | { is: 'ready', address: string, kind: string | undefined }
+ *   | { is: 'resumable', resumption: Resumption }
+ *   | { is: 'watched', now: boolean }
+ *   | { is: 'idle', endsIn: number | undefined }
+ *   | { is: 'failed', failure: Failure }
+ *   | { is: 'alive' }} Message
+ */
+
+/**
+ * What follows a prefix of a text; `undefined` if the text has another beginning.
+ * @param {string} text
+ * @param {string} prefix
+ */
+export function after(text, prefix) {
+  return text.startsWith(prefix) ? text.slice(prefix.length).trim() : undefined;
+}
+
+/**
+ * Reads a reason. One that is malformed counts as none.
+ * @param {string} json
+ * @returns {Reason | undefined}
+ */
+function parseReason(json) {
+  try {
+    const { code, blame, retry, output } = JSON.parse(json);
+    if (![code, blame, retry].every((value) => typeof value === 'string')) {
+      return undefined;
+    }
+    return typeof output === 'string' && output !== '' ? { code, blame, retry, output } : { code, blame, retry };
+  } catch {
+    return undefined;
+  }
+}
+
+/** Reads reasons, each of which belongs to the sentence that follows it. */
+class Reasons {
+  /** @type {Reason | undefined} */
+  #reason;
+
+  /**
+   * Whether the text was a reason.
+   * @param {string} text
+   */
+  take(text) {
+    const json = after(text, 'reason:');
+    if (json !== undefined) {
+      this.#reason = parseReason(json);
+    }
+    return json !== undefined;
+  }
+
+  /**
+   * The failure of a sentence.
+   * @param {string} sentence
+   * @returns {Failure}
+   */
+  failure(sentence) {
+    const reason = this.#reason;
+    this.#reason = undefined;
+    return { sentence, reason };
+  }
+}
+
+/** Reads the texts of a simulation server's WebSocket. */
+export class SimulationReader {
+  #reasons = new Reasons();
+  #absence = 0;
+  /** @type {string | undefined} */
+  #kind;
+  #wasQueue = false;
+
+  /**
+   * Reads a text; `undefined` if it belongs to the next one.
+   * @param {string} text
+   * @returns {Message | undefined}
+   */
+  read(text) {
+    if (this.#reasons.take(text)) {
+      return undefined;
+    }
+    const sentence = after(text, 'loading: Error:') ?? after(text, 'error:');
+    if (sentence !== undefined) {
+      return { is: 'failed', failure: this.#reasons.failure(sentence) };
+    }
+    const wasQueue = this.#wasQueue;
+    this.#wasQueue = text.startsWith('queue:');
+    const progress = after(text, 'loading:');
+    if (progress === undefined) {
+      return this.#readValue(text);
+    }
+    // The text after `queue:` says the same, for Webots' page.
+    return wasQueue ? { is: 'alive' } : { is: 'progress', text: withoutCount(progress) };
+  }
+
+  /**
+   * @param {string} text
+   * @returns {Message | undefined}
+   */
+  #readValue(text) {
+    const colon = text.indexOf(':');
+    if (colon < 0) {
+      return { is: 'alive' };
+    }
+    const value = text.slice(colon + 1).trim();
+    switch (text.slice(0, colon)) {
+      case 'queue':
+        return { is: 'queued', ahead: Number(value) };
+      case 'shutdownTimeout':
+        return { is: 'launched', closesIn: Number(value) };
+      case 'kind':
+        this.#kind = value;
+        return undefined;
+      case 'webots':
+        return { is: 'ready', address: value, kind: this.#kind };
+      case 'absence':
+        this.#absence = Number(value);
+        return { is: 'alive' };
+      case 'resume':
+        return { is: 'resumable', resumption: { token: value, absence: this.#absence } };
+      case 'watched':
+        return { is: 'watched', now: value === '1' };
+      case 'idle':
+        return { is: 'idle', endsIn: value === 'never' ? undefined : Number(value) };
+      default:
+        return { is: 'alive' };
+    }
+  }
+}
+
+/**
+ * Progress without its count of steps, `Step 1/9 : `, which is for the progress bar of Webots' page.
+ * @param {string} text
+ */
+function withoutCount(text) {
+  const end = text.indexOf(' : ');
+  return text.startsWith('Step ') && end > 0 ? text.slice(end + ' : '.length) : text;
+}
+
+/**
+ * A message of the session server.
+ * @typedef {{ is: 'available', now: boolean }
+ *   | { is: 'announced', text: string }
+ *   | { is: 'chosen', server: string }
+ *   | { is: 'refused', failure: Failure }} FleetMessage
+ */
+
+/** Reads the texts of the session server's WebSocket. */
+export class FleetReader {
+  #reasons = new Reasons();
+
+  /**
+   * Reads a text; `undefined` if it belongs to the next one.
+   * @param {string} text
+   * @returns {FleetMessage | undefined}
+   */
+  read(text) {
+    if (this.#reasons.take(text)) {
+      return undefined;
+    }
+    if (text === '1' || text === '0') {
+      return { is: 'available', now: text === '1' };
+    }
+    const announcement = after(text, 'announcement:');
+    if (announcement !== undefined) {
+      return { is: 'announced', text: announcement };
+    }
+    const sentence = after(text, 'Error:');
+    return sentence === undefined
+      ? { is: 'chosen', server: text }
+      : { is: 'refused', failure: this.#reasons.failure(sentence) };
+  }
+}

@@ -1,0 +1,228 @@
+// What the viewer page shows during a visit, derived from its state alone. No DOM.
+
+import { words } from './english.js';
+import { adviceFor } from './reasons.js';
+import { isConnected, reasonOf, resumptionOf, SHOWN_AFTER } from './visit.js';
+
+/** @typedef {import('./visit.js').Going} Going */
+/** @typedef {import('./visit.js').Lost} Lost */
+/** @typedef {import('./visit.js').Problem} Problem */
+/** @typedef {import('./visit.js').State} State */
+/** @typedef {import('./visit.js').Visit} Visit */
+
+/** The steps, in their order. */
+export const STEPS = /** @type {const} */ (['session', 'server', 'place', 'checkout', 'launch', 'simulation']);
+/** @typedef {typeof STEPS[number]} StepName */
+
+/** How far a visit is: those before `at` are done. `notes`: the texts of some.
+ * @typedef {{ at: StepName, is: 'doing' | 'done' | 'failed', notes: Partial<Record<StepName, string>> }} Progress
+ */
+
+/** @typedef {{ text: string, advice: string }} Notice */
+
+/**
+ * What is shown. `idle`, `closes`: seconds left. `leave`: the label of the button that leaves, which is off without one.
+ * @typedef {{ lamp: 'on' | 'off' | undefined, availability: string[], progress: Progress | undefined,
+ *   notice: Notice | undefined, problem: (Notice & { output: string | undefined }) | undefined,
+ *   idle: string | undefined, closes: string | undefined, isWatched: boolean, leave: string | undefined,
+ *   opensTabs: boolean }} PageView
+ */
+
+/**
+ * @param {Visit} visit
+ * @param {number} now in milliseconds
+ * @returns {PageView}
+ */
+export function view({ fleet, state }, now) {
+  const facts = isConnected(state) && 'facts' in state ? state.facts : undefined;
+  const isLost = state.is === 'lost' && now - state.heardAt >= SHOWN_AFTER;
+  /** @param {number | undefined} time */
+  const left = (time) => (time === undefined ? undefined : (time - now) / 1000);
+  const [idle, closes] = [left(facts?.idleEndsAt), left(facts?.closesAt)];
+  const lamps = /** @type {const} */ ({ free: 'on', busy: 'off', connecting: undefined, unreachable: undefined });
+  return {
+    lamp: isLost ? undefined : lamps[fleet],
+    availability: words.availability[isLost ? 'lost' : fleet],
+    progress: state.is === 'ended' ? failedProgress(state.from) : progress(state),
+    notice: isLost ? lostNotice(state, now) : waitingNotice(state),
+    problem: state.is === 'ended' ? problemView(state.problem) : undefined,
+    idle: idle === undefined ? undefined : words.idle(idle),
+    closes: closes === undefined ? undefined : words.closes(closes),
+    isWatched: facts?.isWatched ?? false,
+    leave: leaveLabel(state),
+    opensTabs: resumptionOf(state) !== undefined,
+  };
+}
+
+/** @param {State} state */
+function leaveLabel(state) {
+  if (state.is === 'idle' || state.is === 'ended') {
+    return undefined;
+  }
+  return waitingNotice(state) ? words.buttons.stop : words.buttons.leave;
+}
+
+/**
+ * @param {State} state
+ * @returns {Notice | undefined}
+ */
+export function waitingNotice(state) {
+  const why = state.is === 'waiting' ? state.why : state.is === 'asking' ? state.waitsFor : undefined;
+  if (!why) {
+    return undefined;
+  }
+  const advice = adviceFor(reasonOf(why)?.code);
+  const text = advice === 'share' || advice === 'idleTime' ? words.waiting[advice] : words.waiting.general;
+  return { text, advice: words.waiting.advice };
+}
+
+/**
+ * How long a lost simulation still waits, in seconds.
+ * @param {Lost} state
+ * @param {number} now
+ */
+export function timeLeft({ resumption, heardAt }, now) {
+  return resumption.absence - (now - heardAt) / 1000;
+}
+
+/**
+ * @param {Lost} state
+ * @param {number} now
+ * @returns {Notice}
+ */
+function lostNotice(state, now) {
+  return { text: words.lost.since((now - state.heardAt) / 1000), advice: words.lost.waits(timeLeft(state, now)) };
+}
+
+/* problems */
+
+/**
+ * A sentence of a server begins with a capital, but an address stays as it is.
+ * @param {string} sentence
+ */
+function capitalized(sentence) {
+  const [first = ''] = sentence.split(' ');
+  const isWord = [...first].every((letter) => letter >= 'a' && letter <= 'z');
+  return isWord ? sentence.charAt(0).toUpperCase() + sentence.slice(1) : sentence;
+}
+
+/** @param {Problem} problem */
+function problemText(problem) {
+  if ('sentence' in problem) {
+    return capitalized(problem.sentence);
+  }
+  switch (problem.code) {
+    case 'absent':
+      return words.problems.absent(problem);
+    case 'simulator-unreachable':
+      return words.problems['simulator-unreachable'](problem);
+    case 'no-scene':
+      return words.problems['no-scene'](problem);
+    default:
+      return words.problems[problem.code];
+  }
+}
+
+/** @param {Problem} problem */
+function problemAdvice(problem) {
+  if ('sentence' in problem) {
+    return words.advice[adviceFor(problem.reason?.code)];
+  }
+  return words.advice[problem.code === 'simulator-unreachable' ? 'firewall' : 'general'];
+}
+
+/** @param {Problem} problem */
+function problemView(problem) {
+  return { text: problemText(problem), advice: problemAdvice(problem), output: reasonOf(problem)?.output };
+}
+
+/* steps */
+
+/**
+ * @param {Going} from
+ * @returns {Progress}
+ */
+function failedProgress(from) {
+  return { ...(progress(from) ?? { at: 'session', notes: {} }), is: 'failed' };
+}
+
+/**
+ * @param {Going} state
+ * @returns {Progress | undefined}
+ */
+function progress(state) {
+  if (isConnected(state)) {
+    return connectedProgress(state);
+  }
+  switch (state.is) {
+    case 'asking':
+      return {
+        at: 'session',
+        is: 'doing',
+        notes: { session: state.goal.attempt ? words.steps.choosingAnother : words.steps.choosing },
+      };
+    case 'waiting':
+      return { at: 'session', is: 'doing', notes: { session: words.steps.allBusy } };
+    case 'redirected':
+      return { at: 'session', is: 'doing', notes: { session: words.steps.redirected(problemText(state.why)) } };
+    default:
+      return undefined;
+  }
+}
+
+/**
+ * @param {import('./visit.js').Connected} state
+ * @returns {Progress}
+ */
+function connectedProgress(state) {
+  const session = state.isRestored ? words.steps.notAsked : words.steps.chosen;
+  const asked = { session, server: state.server };
+  switch (state.is) {
+    case 'connecting':
+      if (state.place.is === 'opening') {
+        return { at: 'server', is: 'doing', notes: { session, server: words.steps.connecting(state.server) } };
+      }
+      return { at: 'place', is: 'doing', notes: { ...asked, place: placeNote(state.place) } };
+    case 'starting': {
+      const granted = { ...asked, place: words.steps.granted };
+      return state.phase === 'checkout'
+        ? { at: 'checkout', is: 'doing', notes: { ...granted, checkout: state.text ?? '' } }
+        : { at: 'launch', is: 'doing', notes: { ...granted, launch: state.text ?? words.steps.launching } };
+    }
+    case 'running': {
+      const ready = { ...asked, place: words.steps.granted, launch: words.steps.launched };
+      const { is, note } = sceneProgress(state.scene);
+      return { at: 'simulation', is, notes: { ...ready, simulation: note } };
+    }
+    case 'lost':
+      return {
+        at: 'simulation',
+        is: state.wasShown ? 'done' : 'doing',
+        notes: { ...asked, simulation: words.steps.returning },
+      };
+  }
+}
+
+/** @param {Extract<import('./visit.js').Connecting['place'], { is: 'asked' | 'queued' }>} place */
+function placeNote(place) {
+  return place.is === 'queued' ? words.steps.queued(place.ahead) : words.steps.requesting;
+}
+
+/**
+ * @param {import('./visit.js').Scene} scene
+ * @returns {{ is: 'doing' | 'done' | 'failed', note: string }}
+ */
+function sceneProgress(scene) {
+  switch (scene.is) {
+    case 'connecting':
+      return { is: 'doing', note: words.steps.joining };
+    case 'loading':
+      return { is: 'doing', note: words.steps.loading(scene.status, scene.percent) };
+    case 'shown':
+      return { is: 'done', note: scene.title || words.steps.shown };
+    case 'framed':
+      return { is: 'done', note: words.steps.framed };
+    case 'closed':
+      return { is: 'failed', note: words.steps.closed };
+  }
+}

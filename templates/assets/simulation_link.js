@@ -1,0 +1,93 @@
+// The WebSocket of a simulation server, which holds a client's simulation.
+
+import { SimulationReader } from './messages.js';
+
+/** @typedef {import('./messages.js').Failure} Failure */
+/** @typedef {import('./messages.js').Message} Message */
+
+/** Time to wait for the close code after a sentence without a reason, in milliseconds. */
+const CLOSING = 1000;
+
+/**
+ * What happens on the connection. `closed` is the last event: with the failure, if the server has sent one, and the
+ * close code, if it is known.
+ * @typedef {{ type: 'opened' }
+ *   | { type: 'message', message: Message }
+ *   | { type: 'closed', code?: number | undefined, failure?: Failure | undefined }} LinkEvent
+ */
+
+export class SimulationLink {
+  #socket;
+  #reader = new SimulationReader();
+  #tell;
+  #isOver = false;
+  /** @type {Failure | undefined} */
+  #failure;
+
+  /**
+   * Connects, and sends a request as soon as the connection is open.
+   * @param {string} server the WebSocket address of the simulation server
+   * @param {object} request
+   * @param {(event: LinkEvent) => void} tell
+   */
+  constructor(server, request, tell) {
+    this.#tell = tell;
+    this.#socket = new WebSocket(`${server}/client`);
+    this.#socket.addEventListener('open', () => {
+      if (this.#isOver) {
+        return;
+      }
+      this.send(request);
+      tell({ type: 'opened' });
+    });
+    this.#socket.addEventListener('message', ({ data }) => this.#read(String(data)));
+    this.#socket.addEventListener('close', ({ code }) => this.#end(code));
+  }
+
+  /** @param {string} text */
+  #read(text) {
+    if (this.#isOver || this.#failure) {
+      return;
+    }
+    const message = this.#reader.read(text);
+    if (message?.is === 'failed') {
+      this.#failure = message.failure;
+      if (message.failure.reason) {
+        this.#end();
+      } else {
+        // Without a reason, the close code shows whether another server may accept the client.
+        setTimeout(() => this.#end(), CLOSING);
+      }
+    } else if (message) {
+      this.#tell({ type: 'message', message });
+    }
+  }
+
+  /** @param {number} [code] */
+  #end(code) {
+    if (this.#isOver) {
+      return;
+    }
+    this.#isOver = true;
+    this.#tell({ type: 'closed', code, failure: this.#failure });
+  }
+
+  /** @param {object} message */
+  send(message) {
+    if (this.#socket.readyState === WebSocket.OPEN) {
+      this.#socket.send(JSON.stringify(message));
+    }
+  }
+
+  /** Closes the connection. A simulation that can be resumed waits. */
+  detach() {
+    this.#isOver = true;
+    this.#socket.close();
+  }
+
+  /** Closes the connection, and ends the simulation. */
+  leave() {
+    this.#isOver = true;
+    this.#socket.close(1000);
+  }
+}

@@ -1,0 +1,704 @@
+// A visit of the viewer page as one state machine: what the page knows of the fleet, and the way of the visitor from a
+// world's URL to a simulation and its end. No DOM, no clock, no randomness: `next` gets an event with the time, and
+// returns the new visit with the effects that the page carries out.
+//
+//   idle -> asking -> connecting -> starting -> running <-> lost
+//             ^  |        |            |           |          |
+//             |  v        v            v           v          v
+//   waiting, redirected <- (busy, elsewhere)     ended      ended
+
+import { helpsToWait } from './reasons.js';
+
+/** @typedef {import('./messages.js').Failure} Failure */
+/** @typedef {import('./messages.js').Message} Message */
+/** @typedef {import('./messages.js').Reason} Reason */
+/** @typedef {import('./messages.js').Resumption} Resumption */
+
+/** What a problem that the page itself has found consists of. Times in seconds.
+ * @typedef {{ code: 'session-unreachable' | 'session-silent' | 'server-unreachable' | 'broken-before' | 'broken' }
+ *   | { code: 'absent', since: number }
+ *   | { code: 'simulator-unreachable', address: string }
+ *   | { code: 'no-scene', why: import('./scene.js').SceneProblem }} OwnProblem
+ */
+
+/** Why it did not go on: the failure that a server has sent, or what the page has found.
+ * @typedef {Failure | OwnProblem} Problem
+ */
+
+/** Where a visitor wants to go. `attempt`: number of requests for another server; `wait`: the next pause while all are
+ * busy, in milliseconds.
+ * @typedef {{ world: string, attempt: number, wait: number }} Goal
+ */
+
+/** A goal on a simulation server. `isRestored`: the session server was not asked, because the page was loaded again.
+ * @typedef {{ goal: Goal, server: string, isRestored: boolean }} Target
+ */
+
+/** What the server has said about a simulation. Points in time in milliseconds.
+ * @typedef {{ closesAt?: number | undefined, idleEndsAt?: number | undefined, isWatched: boolean }} Facts
+ */
+
+/** What is shown of a running simulation.
+ * @typedef {{ is: 'connecting' }
+ *   | { is: 'loading', status: string, percent: number }
+ *   | { is: 'shown', title: string, runs: boolean }
+ *   | { is: 'framed' }
+ *   | { is: 'closed', until: number }} Scene
+ */
+
+/** The states before a simulation server is known. `until`: when the next thing happens by itself.
+ * @typedef {{ is: 'idle' }
+ *   | { is: 'asking', goal: Goal, id: number, until: number, waitsFor?: Problem | undefined }
+ *   | { is: 'waiting', goal: Goal, why: Problem, until?: number | undefined }
+ *   | { is: 'redirected', goal: Goal, why: Problem, until: number }} Unconnected
+ */
+
+/** @typedef {Target & { is: 'connecting', place: { is: 'opening' } | { is: 'asked' } | { is: 'queued', ahead: number } }} Connecting */
+/** @typedef {Target & { is: 'starting', phase: 'checkout' | 'launch', text?: string | undefined, facts: Facts }} Starting */
+/** `heardAt`: the last sign of life of the server or the simulator.
+ * @typedef {Target & { is: 'running', address: string, scene: Scene, facts: Facts, heardAt: number, resumption?: Resumption | undefined }} Running
+ */
+/** The simulation waits for this page, which tries to return. `wasShown`: the page still shows its scene;
+ * `refusedSince`: since when its server refuses all attempts although the session server answers.
+ * @typedef {Target & { is: 'lost', facts: Facts, heardAt: number, resumption: Resumption, wasShown: boolean, isTold: boolean,
+ *   tries: number, nextTry: number, refusedSince?: number | undefined }} Lost
+ */
+/** @typedef {Connecting | Starting | Running | Lost} Connected */
+/** @typedef {Unconnected | Connected} Going */
+/** It is over. `from`: the state in which the problem came.
+ * @typedef {{ is: 'ended', problem: Problem, from: Going }} Ended
+ */
+/** @typedef {Going | Ended} State */
+
+/** What is known of the fleet: whether a simulation server is free, or that there is no connection.
+ * @typedef {'connecting' | 'free' | 'busy' | 'unreachable'} Fleet
+ */
+
+/** The visit. `asked`: number of requests so far; `wakeAt`: when `next` wants a `tick`.
+ * @typedef {{ fleet: Fleet, state: State, asked: number, wakeAt: number | undefined }} Visit
+ */
+
+/** @typedef {{ server: string, world: string } & Resumption} Kept a simulation that this tab can resume */
+
+/**
+ * @typedef {{ type: 'submitted', world: string }
+ *   | { type: 'restored', kept: Kept }
+ *   | { type: 'left' }
+ *   | { type: 'hidden' }
+ *   | { type: 'keep' }
+ *   | { type: 'online' }
+ *   | { type: 'tick' }
+ *   | { type: 'probed' }
+ *   | { type: 'scene', scene: Exclude<Scene, { is: 'closed' }> }
+ *   | { type: 'sceneFailed', why: import('./scene.js').SceneProblem }
+ *   | { type: 'sceneClosed' }
+ *   | { type: 'mode', runs: boolean }
+ *   | { type: 'heard' }
+ *   | import('./session_server.js').FleetEvent
+ *   | import('./simulation_link.js').LinkEvent} Event
+ */
+
+/**
+ * What the page does. `leave` ends the simulation, `detach` lets it wait; both close the viewer. `freeze` keeps what the
+ * viewer shows and closes its stream. `probe` finds out whether the session server answers.
+ * @typedef {{ do: 'ask', id: number, world: string }
+ *   | { do: 'connect', server: string, request: { world: string } | { resume: string } }
+ *   | { do: 'show', address: string, kind: string | undefined, server: string, isBack: boolean }
+ *   | { do: 'store', kept: Kept }
+ *   | { do: 'send', message: object }
+ *   | { do: 'clear' | 'clearLeft' | 'clearStopped' | 'leave' | 'detach' | 'freeze' | 'probe' | 'sayLost' | 'sayFound' }} Effect
+ */
+
+/** @typedef {{ fleet: Fleet, asked: number, now: number, random: () => number }} Surroundings */
+/** @typedef {{ to: State, effects?: Effect[] }} Transition */
+
+/** How long the session server has for an answer, in milliseconds. */
+const ANSWER = 10_000;
+/** Maximum of requests for another server, and the pause before the first one in milliseconds; it doubles each time. */
+const MOST_ATTEMPTS = 3;
+const FIRST_ATTEMPT = 1000;
+/** Pause before the next request although a server is free, in milliseconds; it doubles up to the longest. */
+const FIRST_WAIT = 2000;
+const LONGEST_WAIT = 30_000;
+/** Longest random pause after a server has become free, so that not all waiting pages ask at once, in milliseconds. */
+const JITTER = 3000;
+/** Close codes after which another simulation server may accept the client: going away, try again later. */
+const TRY_ANOTHER = [1001, 1013];
+/** Time without a sign of life after which the connection is lost, in milliseconds; Webots gives one every five seconds. */
+const SILENCE = 8000;
+/** A shorter interruption is not shown. In milliseconds. */
+export const SHOWN_AFTER = 2000;
+/** Timeout of an attempt to return, in milliseconds: a second one would invalidate the token of the first. */
+const ATTEMPT = 15_000;
+/** Pause after a failed attempt to return, in milliseconds; it doubles up to the longest. */
+const FIRST_PAUSE = 1000;
+const LONGEST_PAUSE = 10_000;
+/** A server that refuses all attempts for this long, while the session server answers, counts as gone. In milliseconds. */
+const GONE = 2500;
+/** Time in which a simulation server reports an end after Webots has closed its stream, in milliseconds. */
+const REPORT = 2000;
+const SECOND = 1000;
+
+/** @type {Visit} */
+export const BEGIN = { fleet: 'connecting', state: { is: 'idle' }, asked: 0, wakeAt: undefined };
+
+/**
+ * The visit after an event, and what the page has to do.
+ * @param {Visit} visit
+ * @param {Event} event
+ * @param {number} now in milliseconds
+ * @param {() => number} random from 0 to 1
+ * @returns {{ visit: Visit, effects: Effect[] }}
+ */
+export function next(visit, event, now, random) {
+  const { state: from } = visit;
+  const fleet = fleetAfter(visit.fleet, event);
+  const { to, effects = [] } = transition(from, event, { fleet, asked: visit.asked, now, random }) ?? { to: from };
+  // Whatever the way out: the connection does not outlive the states that hold it.
+  if (isConnected(from) && !isConnected(to)) {
+    effects.unshift({ do: event.type === 'hidden' && resumptionOf(from) ? 'detach' : 'leave' });
+  }
+  const asked = to.is === 'asking' ? to.id : visit.asked;
+  return { visit: { fleet, state: to, asked, wakeAt: wakeAt(to, visit.wakeAt, now) }, effects };
+}
+
+/**
+ * @param {Fleet} fleet
+ * @param {Event} event
+ * @returns {Fleet}
+ */
+function fleetAfter(fleet, event) {
+  if (event.type === 'available') {
+    return event.now ? 'free' : 'busy';
+  }
+  return event.type === 'disconnected' ? 'unreachable' : fleet;
+}
+
+/**
+ * While there is a connection, the time goes on every second.
+ * @param {State} state
+ * @param {number | undefined} before
+ * @param {number} now
+ */
+function wakeAt(state, before, now) {
+  if (isConnected(state)) {
+    return before !== undefined && before > now && before <= now + SECOND ? before : now + SECOND;
+  }
+  return 'until' in state ? state.until : undefined;
+}
+
+/**
+ * @param {State} state
+ * @returns {state is Connected}
+ */
+export function isConnected(state) {
+  return ['connecting', 'starting', 'running', 'lost'].includes(state.is);
+}
+
+/**
+ * How the simulation of a state can be resumed, if it can.
+ * @param {State} state
+ */
+export function resumptionOf(state) {
+  return state.is === 'running' || state.is === 'lost' ? state.resumption : undefined;
+}
+
+/**
+ * @param {State} state
+ * @param {Event} event
+ * @param {Surroundings} around
+ * @returns {Transition | undefined}
+ */
+function transition(state, event, around) {
+  switch (event.type) {
+    case 'submitted':
+      return ask({ world: event.world, attempt: 0, wait: FIRST_WAIT }, around, undefined, [{ do: 'clear' }]);
+    case 'restored':
+      return restore(event.kept, around);
+    case 'left':
+      return { to: { is: 'idle' }, effects: [{ do: isConnected(state) ? 'clearLeft' : 'clearStopped' }] };
+    case 'hidden':
+      return state.is === 'ended' ? undefined : { to: { is: 'idle' } };
+  }
+  switch (state.is) {
+    case 'asking':
+      return whileAsking(state, event, around);
+    case 'waiting':
+      return whileWaiting(state, event, around);
+    case 'redirected':
+      return event.type === 'tick' && around.now >= state.until ? ask(state.goal, around) : undefined;
+    case 'connecting':
+    case 'starting':
+      return whileStarting(state, event, around);
+    case 'running':
+      return whileRunning(state, event, around);
+    case 'lost':
+      return whileLost(state, event, around);
+    case 'ended':
+      return whileEnded(state, event);
+  }
+  return undefined;
+}
+
+/* the session server */
+
+/**
+ * Requests a simulation server.
+ * @param {Goal} goal
+ * @param {Surroundings} around
+ * @param {Problem} [waitsFor] why it has waited
+ * @param {Effect[]} [before] effects before that
+ * @returns {Transition}
+ */
+function ask(goal, { fleet, asked, now }, waitsFor, before = []) {
+  const id = asked + 1;
+  /** @type {State} */
+  const asking = { is: 'asking', goal, id, until: now + ANSWER, waitsFor };
+  if (fleet === 'connecting' || fleet === 'unreachable') {
+    return { to: end({ code: 'session-unreachable' }, asking), effects: before };
+  }
+  return { to: asking, effects: [...before, { do: 'ask', id, world: goal.world }] };
+}
+
+/**
+ * @param {Extract<State, { is: 'asking' }>} state
+ * @param {Event} event
+ * @param {Surroundings} around
+ * @returns {Transition | undefined}
+ */
+function whileAsking(state, event, around) {
+  if (event.type === 'disconnected') {
+    return { to: end({ code: 'session-unreachable' }, state) };
+  }
+  if (event.type === 'tick' && around.now >= state.until) {
+    return { to: end({ code: 'session-silent' }, state) };
+  }
+  if (event.type !== 'answered' || event.id !== state.id) {
+    return undefined;
+  }
+  const { goal } = state;
+  if ('failure' in event.answer) {
+    const { failure } = event.answer;
+    // After a redirection the session server may not have noticed yet that the last server can't take anybody.
+    const isFinal = goal.attempt === 0 || failure.reason?.retry === 'no';
+    return isFinal ? waitOrEnd(failure, goal, state, around) : redirect(failure, goal, state, around);
+  }
+  const { server } = event.answer;
+  return {
+    to: { is: 'connecting', goal, server, isRestored: false, place: { is: 'opening' } },
+    effects: [{ do: 'connect', server, request: { world: goal.world } }],
+  };
+}
+
+/**
+ * @param {Extract<State, { is: 'waiting' }>} state
+ * @param {Event} event
+ * @param {Surroundings} around
+ * @returns {Transition | undefined}
+ */
+function whileWaiting(state, event, around) {
+  if (event.type === 'available' && event.now) {
+    return { to: { ...state, until: around.now + JITTER * around.random() } };
+  }
+  if (event.type !== 'tick' || state.until === undefined || around.now < state.until) {
+    return undefined;
+  }
+  if (around.fleet === 'unreachable') {
+    // The next report that a server is free sets another time.
+    return { to: { ...state, until: undefined } };
+  }
+  return ask({ ...state.goal, attempt: 0 }, around, state.why);
+}
+
+/**
+ * Waits until a server is free, if that helps.
+ * @param {Problem} problem
+ * @param {Goal} goal
+ * @param {Going} from
+ * @param {Surroundings} around
+ * @returns {Transition}
+ */
+function waitOrEnd(problem, goal, from, { fleet, now, random }) {
+  if (!helpsToWait(reasonOf(problem))) {
+    return { to: end(problem, from) };
+  }
+  const until = fleet === 'free' ? now + goal.wait * (0.5 + random()) : undefined;
+  return { to: { is: 'waiting', goal: { ...goal, wait: Math.min(LONGEST_WAIT, 2 * goal.wait) }, why: problem, until } };
+}
+
+/**
+ * Requests another server after a pause: the session server notices within seconds that this one is stopping,
+ * unreachable, or can't start the simulation.
+ * @param {Problem} problem
+ * @param {Goal} goal
+ * @param {Going} from
+ * @param {Surroundings} around
+ * @returns {Transition}
+ */
+function redirect(problem, goal, from, around) {
+  if (goal.attempt === MOST_ATTEMPTS) {
+    return waitOrEnd(problem, goal, from, around);
+  }
+  const until = around.now + FIRST_ATTEMPT * 2 ** goal.attempt;
+  return { to: { is: 'redirected', goal: { ...goal, attempt: goal.attempt + 1 }, why: problem, until } };
+}
+
+/* the way to a simulation */
+
+/**
+ * @param {Connecting | Starting} state
+ * @param {Event} event
+ * @param {Surroundings} around
+ * @returns {Transition | undefined}
+ */
+function whileStarting(state, event, around) {
+  if (event.type === 'opened' && state.is === 'connecting') {
+    return { to: { ...state, place: { is: 'asked' } } };
+  }
+  if (event.type === 'closed') {
+    return startFailed(state, event, around);
+  }
+  if (event.type !== 'message') {
+    return undefined;
+  }
+  const { message } = event;
+  const { goal, server, isRestored } = state;
+  const target = { goal, server, isRestored };
+  const facts = factsAfter(state.is === 'starting' ? state.facts : { isWatched: false }, message, around.now);
+  const phase = state.is === 'starting' ? state.phase : 'checkout';
+  switch (message.is) {
+    case 'queued':
+      return { to: { ...target, is: 'connecting', place: { is: 'queued', ahead: message.ahead } } };
+    case 'progress':
+      return { to: { ...target, is: 'starting', phase, text: message.text, facts } };
+    case 'launched':
+      return { to: { ...target, is: 'starting', phase: 'launch', facts } };
+    case 'ready':
+      return run(target, message, facts, false, around.now);
+    default:
+      return state.is === 'starting' ? { to: { ...state, facts } } : undefined;
+  }
+}
+
+/**
+ * A start has failed: perhaps another server can do it, or this one later.
+ * @param {Connecting | Starting} state
+ * @param {{ code?: number | undefined, failure?: Failure | undefined }} closed
+ * @param {Surroundings} around
+ * @returns {Transition}
+ */
+function startFailed(state, { code, failure }, around) {
+  const { goal } = state;
+  const isGranted = state.is === 'starting';
+  if (!failure) {
+    return isGranted
+      ? { to: end({ code: 'broken-before' }, state) }
+      : redirect({ code: 'server-unreachable' }, goal, state, around);
+  }
+  const isForAnother = failure.reason
+    ? failure.reason.retry === 'elsewhere'
+    : code !== undefined && TRY_ANOTHER.includes(code);
+  return isForAnother ? redirect(failure, goal, state, around) : waitOrEnd(failure, goal, state, around);
+}
+
+/**
+ * What a message says about a simulation.
+ * @param {Facts} facts
+ * @param {Message} message
+ * @param {number} now
+ * @returns {Facts}
+ */
+function factsAfter(facts, message, now) {
+  switch (message.is) {
+    case 'launched':
+      return { ...facts, closesAt: now + SECOND * message.closesIn };
+    case 'watched':
+      return { ...facts, isWatched: message.now };
+    case 'idle':
+      return { ...facts, idleEndsAt: message.endsIn === undefined ? undefined : now + SECOND * message.endsIn };
+    default:
+      return facts;
+  }
+}
+
+/* the simulation */
+
+/**
+ * The simulator is ready.
+ * @param {Target} target
+ * @param {Extract<Message, { is: 'ready' }>} ready
+ * @param {Facts} facts
+ * @param {boolean} isBack whether its client has returned to it
+ * @param {number} now
+ * @param {Resumption} [resumption]
+ * @returns {{ to: Running, effects: Effect[] }}
+ */
+function run({ goal, server, isRestored }, { address, kind }, facts, isBack, now, resumption) {
+  return {
+    to: {
+      is: 'running',
+      goal,
+      server,
+      isRestored,
+      address,
+      facts,
+      heardAt: now,
+      resumption,
+      scene: { is: 'connecting' },
+    },
+    effects: [{ do: 'show', address, kind, server, isBack }],
+  };
+}
+
+/**
+ * @param {Running} state
+ * @param {Event} event
+ * @param {Surroundings} around
+ * @returns {Transition | undefined}
+ */
+function whileRunning(state, event, { now }) {
+  const { scene } = state;
+  switch (event.type) {
+    case 'message':
+      return hear(state, event.message, now);
+    case 'heard':
+      return { to: { ...state, heardAt: now } };
+    case 'keep':
+      return { to: state, effects: [{ do: 'send', message: { keep: true } }] };
+    case 'closed':
+      if (event.failure) {
+        return { to: end(event.failure, state) };
+      }
+      return state.resumption ? lose(state, state.resumption, now) : { to: end({ code: 'broken' }, state) };
+    case 'scene':
+      return { to: { ...state, scene: event.scene } };
+    case 'mode':
+      return scene.is === 'shown' ? { to: { ...state, scene: { ...scene, runs: event.runs } } } : undefined;
+    case 'sceneFailed':
+      return { to: end({ code: 'no-scene', why: event.why }, state) };
+    case 'sceneClosed':
+      // Either the simulator has ended, which its server reports in a moment, or only the stream is lost.
+      return {
+        to:
+          scene.is === 'connecting'
+            ? end({ code: 'simulator-unreachable', address: state.address }, state)
+            : { ...state, scene: { is: 'closed', until: now + REPORT } },
+      };
+    case 'tick':
+      return runOn(state, now);
+  }
+  return undefined;
+}
+
+/**
+ * A second has passed.
+ * @param {Running} state
+ * @param {number} now
+ * @returns {Transition}
+ */
+function runOn(state, now) {
+  const { scene, resumption } = state;
+  const isStreamLost = scene.is === 'closed' && now >= scene.until;
+  if (resumption && (isStreamLost || now - state.heardAt >= SILENCE)) {
+    return lose(state, resumption, now);
+  }
+  // If a controller has started the simulation, only its server still takes it for paused.
+  const isKept = state.facts.idleEndsAt !== undefined && scene.is === 'shown' && scene.runs;
+  return { to: state, effects: isKept ? [{ do: 'send', message: { keep: true } }] : [] };
+}
+
+/**
+ * @param {Running} state
+ * @param {Message} message
+ * @param {number} now
+ * @returns {Transition}
+ */
+function hear(state, message, now) {
+  const facts = factsAfter(state.facts, message, now);
+  if (message.is === 'ready') {
+    return run(state, message, facts, false, now, state.resumption);
+  }
+  const to = { ...state, facts, heardAt: now };
+  if (message.is !== 'resumable') {
+    return { to };
+  }
+  const { resumption } = message;
+  const { server, goal } = state;
+  return { to: { ...to, resumption }, effects: [{ do: 'store', kept: { ...resumption, server, world: goal.world } }] };
+}
+
+/* coming back */
+
+/**
+ * The connection is lost: the page tries at once to return.
+ * @param {Running} state
+ * @param {Resumption} resumption
+ * @param {number} now
+ * @returns {Transition}
+ */
+function lose({ goal, server, isRestored, facts, heardAt, scene }, resumption, now) {
+  const wasShown = ['shown', 'closed', 'framed'].includes(scene.is);
+  const { closesAt } = facts;
+  return tryAgain(
+    {
+      is: 'lost',
+      goal,
+      server,
+      isRestored,
+      resumption,
+      heardAt,
+      wasShown,
+      isTold: false,
+      tries: 0,
+      nextTry: now,
+      // The server says again what still applies.
+      facts: { closesAt, isWatched: false },
+    },
+    now,
+    [{ do: 'freeze' }],
+  );
+}
+
+/**
+ * The page was loaded again, or is shown again: its simulation waits.
+ * @param {Kept} kept
+ * @param {Surroundings} around
+ * @returns {Transition}
+ */
+function restore({ server, world, token, absence }, { now }) {
+  return tryAgain(
+    {
+      is: 'lost',
+      goal: { world, attempt: 0, wait: FIRST_WAIT },
+      server,
+      isRestored: true,
+      resumption: { token, absence },
+      heardAt: now,
+      wasShown: false,
+      isTold: false,
+      tries: 0,
+      nextTry: now,
+      facts: { isWatched: false },
+    },
+    now,
+  );
+}
+
+/**
+ * @param {Lost} state
+ * @param {number} now
+ * @param {Effect[]} [before]
+ * @returns {Transition}
+ */
+function tryAgain(state, now, before = []) {
+  return {
+    to: { ...state, tries: state.tries + 1, nextTry: now + ATTEMPT },
+    effects: [...before, { do: 'connect', server: state.server, request: { resume: state.resumption.token } }],
+  };
+}
+
+/**
+ * @param {Lost} state
+ * @param {Event} event
+ * @param {Surroundings} around
+ * @returns {Transition | undefined}
+ */
+function whileLost(state, event, { now, random }) {
+  const away = now - state.heardAt;
+  switch (event.type) {
+    case 'message': {
+      const facts = factsAfter(state.facts, event.message, now);
+      if (event.message.is !== 'ready') {
+        return { to: { ...state, facts, heardAt: now, tries: 1, refusedSince: undefined } };
+      }
+      const { to, effects } = run(state, event.message, facts, true, now, state.resumption);
+      return { to, effects: state.isTold ? [...effects, { do: 'sayFound' }] : effects };
+    }
+    case 'closed': {
+      if (event.failure) {
+        return {
+          to: end(
+            isTooLate(state, event.failure, away) ? { code: 'absent', since: away / SECOND } : event.failure,
+            state,
+          ),
+        };
+      }
+      // Random, so that clients that were disconnected together do not return together.
+      const pause = Math.min(LONGEST_PAUSE, FIRST_PAUSE * 2 ** (state.tries - 1)) * (0.5 + random());
+      return { to: { ...state, nextTry: Math.min(state.nextTry, now + pause) }, effects: [{ do: 'probe' }] };
+    }
+    case 'probed': {
+      const refusedSince = state.refusedSince ?? now;
+      return {
+        to:
+          now - refusedSince >= GONE
+            ? end({ code: 'absent', since: away / SECOND }, state)
+            : { ...state, refusedSince },
+      };
+    }
+    case 'online':
+      return { to: { ...state, nextTry: now } };
+    case 'tick':
+      return waitOn(state, away, now);
+  }
+  return undefined;
+}
+
+/**
+ * A second without a connection has passed.
+ * @param {Lost} state
+ * @param {number} away in milliseconds
+ * @param {number} now
+ * @returns {Transition}
+ */
+function waitOn(state, away, now) {
+  // The server may notice the loss later, by its timeout of silent connections.
+  if (away > 2 * SECOND * state.resumption.absence) {
+    return { to: end({ code: 'absent', since: away / SECOND }, state) };
+  }
+  const isTold = state.isTold || away >= SHOWN_AFTER;
+  /** @type {Effect[]} */
+  const effects = isTold && !state.isTold ? [{ do: 'sayLost' }] : [];
+  const told = { ...state, isTold };
+  return now >= state.nextTry ? tryAgain(told, now, effects) : { to: told, effects };
+}
+
+/**
+ * Whether a simulation that has ended did so because the page was away for too long.
+ * @param {Lost} state
+ * @param {Failure} failure
+ * @param {number} away in milliseconds
+ */
+function isTooLate({ resumption }, { reason }, away) {
+  return away > SECOND * resumption.absence && ['ended', 'away', undefined].includes(reason?.code);
+}
+
+/* the end */
+
+/**
+ * @param {Problem} problem
+ * @param {Going} from
+ * @returns {Ended}
+ */
+function end(problem, from) {
+  return { is: 'ended', problem, from };
+}
+
+/**
+ * A problem of the session server is over when it sends something again.
+ * @param {Ended} state
+ * @param {Event} event
+ * @returns {Transition | undefined}
+ */
+function whileEnded({ problem }, event) {
+  const isOver = 'code' in problem && (problem.code === 'session-unreachable' || problem.code === 'session-silent');
+  return isOver && event.type === 'available' ? { to: { is: 'idle' } } : undefined;
+}
+
+/**
+ * The reason of a problem, if a server has sent one.
+ * @param {Problem} problem
+ */
+export function reasonOf(problem) {
+  return 'sentence' in problem ? problem.reason : undefined;
+}

@@ -1,0 +1,499 @@
+// The visit of the viewer page: events in, states and effects out.
+
+import assert from 'node:assert/strict';
+import { test } from 'node:test';
+
+import { FleetReader, SimulationReader } from '../../templates/assets/messages.js';
+import { view } from '../../templates/assets/page_view.js';
+import { BEGIN, next } from '../../templates/assets/visit.js';
+
+/** @typedef {import('../../templates/assets/visit.js').Event} VisitEvent */
+/** @typedef {import('../../templates/assets/visit.js').Effect} Effect */
+/** @typedef {import('../../templates/assets/messages.js').Reason} Reason */
+
+const WORLD = 'https://github.com/demo/worlds/blob/main/worlds/playground.wbt';
+const SERVER = 'ws://one:2000';
+const TOKEN = 'f00d';
+const KEPT = { server: SERVER, world: WORLD, token: TOKEN, absence: 60 };
+const SHOWN = /** @type {const} */ ({ type: 'scene', scene: { is: 'shown', title: 'Playground', runs: false } });
+
+/** @type {(code: string, blame: string, retry: string, output?: string) => Reason} */
+const reason = (code, blame, retry, output) => ({ code, blame, retry, ...(output && { output }) });
+const FULL = reason('no-server-available', 'fleet', 'later');
+const DRAINING = reason('draining', 'server', 'elsewhere');
+const CRASHED = reason('crashed', 'project', 'here');
+
+/** A visit, with a clock of its own and without chance. */
+class Visit {
+  visit = BEGIN;
+  now = 1_000_000;
+  /** All effects so far. @type {Effect[]} */
+  effects = [];
+
+  /** @param {VisitEvent[]} events */
+  take(...events) {
+    for (const event of events) {
+      const { visit, effects } = next(this.visit, event, this.now, () => 0.5);
+      this.visit = visit;
+      this.effects.push(...effects);
+    }
+    return this;
+  }
+
+  /**
+   * Lets time pass, with the ticks that the visit asks for.
+   * @param {number} seconds
+   */
+  pass(seconds) {
+    const end = this.now + 1000 * seconds;
+    while (this.visit.wakeAt !== undefined && this.visit.wakeAt <= end) {
+      this.now = Math.max(this.now, this.visit.wakeAt);
+      this.take({ type: 'tick' });
+    }
+    this.now = end;
+    return this;
+  }
+
+  /**
+   * The simulation server sends texts.
+   * @param {string[]} texts
+   */
+  receive(...texts) {
+    const reader = new SimulationReader();
+    for (const text of texts) {
+      const message = reader.read(text);
+      if (message?.is === 'failed') {
+        this.take({ type: 'closed', failure: message.failure });
+      } else if (message) {
+        this.take({ type: 'message', message });
+      }
+    }
+    return this;
+  }
+
+  /**
+   * The session server answers the last request.
+   * @param {string[]} texts
+   */
+  answer(...texts) {
+    const reader = new FleetReader();
+    for (const text of texts) {
+      const message = reader.read(text);
+      if (message?.is === 'chosen') {
+        this.take({ type: 'answered', id: this.visit.asked, answer: { server: message.server } });
+      } else if (message?.is === 'refused') {
+        this.take({ type: 'answered', id: this.visit.asked, answer: { failure: message.failure } });
+      }
+    }
+    return this;
+  }
+
+  get state() {
+    return this.visit.state;
+  }
+
+  /** What the page shows. */
+  get view() {
+    return view(this.visit, this.now);
+  }
+
+  /** The names of the effects since the last call. */
+  did() {
+    const names = this.effects.map((effect) => effect.do);
+    this.effects = [];
+    return names;
+  }
+}
+
+/** A visit whose session server is free, and was asked for a world. */
+const asking = () =>
+  new Visit().take({ type: 'connected' }, { type: 'available', now: true }).take({ type: 'submitted', world: WORLD });
+/** One that was led to a simulation server. */
+const connecting = () => asking().answer(SERVER).take({ type: 'opened' });
+/** One whose simulation can be resumed, and is shown. */
+const running = () =>
+  connecting()
+    .receive(
+      'session: 1',
+      'loading: Step 1/9 : fetching',
+      'shutdownTimeout: 7200',
+      'kind: w3d',
+      'webots:ws://one:2001',
+      'absence: 60',
+      `resume: ${TOKEN}`,
+    )
+    .take(SHOWN);
+/** A sentence of a server behind its reason. @type {(sentence: string, why?: Reason) => string[]} */
+const error = (sentence, why) => [...(why ? [`reason: ${JSON.stringify(why)}`] : []), `loading: Error: ${sentence}`];
+
+test('a visit from the start to the end', () => {
+  const visit = asking();
+  assert.deepEqual(visit.effects.at(-1), { do: 'ask', id: 1, world: WORLD });
+  assert.equal(visit.view.progress?.at, 'session');
+  visit.answer(SERVER);
+  assert.deepEqual(visit.effects.at(-1), { do: 'connect', server: SERVER, request: { world: WORLD } });
+  assert.deepEqual([visit.view.progress?.at, visit.view.progress?.notes.server], ['server', `connecting to ${SERVER}`]);
+  visit.take({ type: 'opened' }).receive('session: 1', 'queue: 2', 'loading: waiting for a place, 2 clients are ahead');
+  assert.deepEqual(
+    [visit.view.progress?.at, visit.view.progress?.notes.place],
+    ['place', '2 clients are ahead of you'],
+  );
+  visit.receive('loading: Step 3/9 : fetching 40 %');
+  assert.deepEqual([visit.view.progress?.at, visit.view.progress?.notes.checkout], ['checkout', 'fetching 40 %']);
+  visit.receive('loading: webots is starting', 'shutdownTimeout: 7200');
+  assert.deepEqual([visit.view.progress?.at, visit.view.closes], ['launch', 'It will be closed in 2 h 00 min.']);
+  visit.receive('kind: w3d', 'webots:ws://one:2001');
+  assert.deepEqual(visit.effects.at(-1), {
+    do: 'show',
+    address: 'ws://one:2001',
+    kind: 'w3d',
+    server: SERVER,
+    isBack: false,
+  });
+  visit.receive('absence: 60', `resume: ${TOKEN}`);
+  assert.deepEqual(visit.effects.at(-1), { do: 'store', kept: KEPT });
+  visit.take({ type: 'scene', scene: { is: 'loading', status: 'Parsing nodes', percent: 50 } });
+  assert.deepEqual(visit.view.progress?.notes.simulation, 'Parsing nodes 50 %');
+  visit.take(SHOWN);
+  assert.deepEqual([visit.view.progress?.at, visit.view.progress?.is], ['simulation', 'done']);
+  assert.ok(visit.view.opensTabs);
+  visit.did();
+  visit.take({ type: 'left' });
+  assert.deepEqual([visit.state.is, visit.did()], ['idle', ['leave', 'clearLeft']]);
+  assert.deepEqual([visit.view.leave, visit.visit.wakeAt], [undefined, undefined]);
+});
+
+test('what a project prints changes nothing', () => {
+  const outputs = [
+    'No such file or directory',
+    'all places on the grid are taken',
+    'This simulation server has no Webots that it can run',
+    'no simulation server available at the moment. Clients of your address have 3 places, and You have 7 places',
+    'loading: Error: draining\nreason: {"code":"draining","blame":"server","retry":"elsewhere"}',
+    'this simulation was taken over elsewhere; the session server could not be reached; it has ended',
+  ];
+  for (const output of outputs) {
+    const quiet = running().receive(...error('Webots ended with exit code 1', CRASHED));
+    const loud = running().receive(...error('Webots ended with exit code 1', { ...CRASHED, output }));
+    assert.deepEqual(loud.did(), quiet.did());
+    assert.equal(loud.state.is, 'ended');
+    assert.deepEqual(loud.view, { ...quiet.view, problem: { ...quiet.view.problem, output } });
+    // A server without reasons has the output in its sentence.
+    const python = running().receive(...error(output));
+    assert.deepEqual(python.view.problem, { ...python.view.problem, advice: unreasoned().advice, output: undefined });
+    assert.equal(python.view.problem?.text.toLowerCase(), output.toLowerCase());
+    python.pass(3600);
+    assert.equal(python.state.is, 'ended');
+    // Nor has a start that fails other consequences.
+    for (const start of [connecting(), asking().answer(SERVER).receive('loading: Step 1/9 : x')]) {
+      start
+        .receive(...error('the image could not be built', reason('build-failed', 'project', 'no', output)))
+        .pass(3600);
+      assert.equal(start.state.is, 'ended');
+    }
+  }
+});
+
+/** What is shown for a failure without a reason. */
+function unreasoned() {
+  const { problem } = running().receive(...error('something')).view;
+  assert.ok(problem);
+  return problem;
+}
+
+test('a server without reasons: its sentence, general advice, another server by the close code alone', () => {
+  const failure = { sentence: 'no simulation server available' };
+  for (const [code, expected] of /** @type {const} */ ([
+    [1001, 'redirected'],
+    [1013, 'redirected'],
+    [1000, 'ended'],
+    [1011, 'ended'],
+    [undefined, 'ended'],
+  ])) {
+    assert.equal(connecting().take({ type: 'closed', code, failure }).state.is, expected, String(code));
+  }
+  assert.equal(running().take({ type: 'closed', code: 1001, failure }).state.is, 'ended');
+  const refused = asking().answer('Error: no simulation server available at the moment.');
+  assert.deepEqual(refused.view.problem, {
+    text: 'No simulation server available at the moment.',
+    advice: unreasoned().advice,
+    output: undefined,
+  });
+});
+
+test('while all are busy it waits, and starts when one is free', () => {
+  const reasons = [FULL, reason('queue-full', 'fleet', 'later'), reason('share-used', 'user', 'later')];
+  for (const why of reasons) {
+    const visit = connecting()
+      .take({ type: 'available', now: false })
+      .receive(...error('all slots are taken', why));
+    assert.equal(visit.state.is, 'waiting', why.code);
+    assert.equal(visit.view.leave, 'Stop waiting');
+    assert.equal(visit.view.problem, undefined);
+    visit.pass(3600);
+    assert.equal(visit.state.is, 'waiting');
+    visit.did();
+    visit.take({ type: 'available', now: true }).pass(1.6);
+    assert.deepEqual([visit.state.is, visit.did()], ['asking', ['ask']]);
+    assert.equal(visit.view.leave, 'Stop waiting', 'the notice stays until a server is chosen');
+    assert.ok(visit.view.notice);
+    visit.answer(SERVER);
+    assert.equal(visit.view.notice, undefined);
+  }
+  const address = reason('too-many-requests', 'user', 'later');
+  assert.equal(connecting().receive(...error('too many', address)).state.is, 'ended');
+});
+
+test('while all are busy although one is free, it asks again, less and less often', () => {
+  const visit = asking();
+  const pauses = [];
+  for (let time = 0; time < 6; ++time) {
+    visit.answer(`reason: ${JSON.stringify(FULL)}`, 'Error: no simulation server available at the moment.');
+    assert.equal(visit.state.is, 'waiting');
+    const begin = visit.now;
+    while (visit.state.is === 'waiting') {
+      visit.pass(0.5);
+    }
+    pauses.push((visit.now - begin) / 1000);
+  }
+  assert.deepEqual(pauses, [2, 4, 8, 16, 30, 30]);
+  visit.take({ type: 'left' });
+  assert.deepEqual(visit.did().slice(-1), ['clearStopped']);
+  assert.equal(visit.pass(3600).state.is, 'idle');
+});
+
+test('a waiting page survives the loss of the session server', () => {
+  const visit = connecting().receive(...error('full', FULL));
+  visit.take({ type: 'disconnected' }).pass(60);
+  assert.equal(visit.state.is, 'waiting');
+  assert.deepEqual(visit.view.availability[0], 'No connection');
+  visit.take({ type: 'connected' }, { type: 'available', now: true }).pass(1.6);
+  assert.equal(visit.state.is, 'asking');
+});
+
+test('another server is asked for three times at most, after growing pauses', () => {
+  const visit = connecting();
+  const pauses = [];
+  for (let attempt = 0; attempt < 3; ++attempt) {
+    visit.receive(...error('this server is about to stop', DRAINING));
+    assert.equal(visit.state.is, 'redirected');
+    assert.equal(visit.view.progress?.notes.session, 'another one is asked for: This server is about to stop');
+    const begin = visit.now;
+    while (visit.state.is === 'redirected') {
+      visit.pass(0.5);
+    }
+    pauses.push((visit.now - begin) / 1000);
+    visit.answer(SERVER);
+  }
+  assert.deepEqual(pauses, [1, 2, 4]);
+  visit.receive(...error('this server is about to stop', DRAINING));
+  assert.equal(visit.state.is, 'ended');
+  assert.deepEqual(visit.view.progress?.is, 'failed');
+  // The next visit counts from the beginning.
+  visit
+    .take({ type: 'submitted', world: WORLD })
+    .answer(SERVER)
+    .receive(...error('this server is about to stop', DRAINING));
+  assert.equal(visit.state.is, 'redirected');
+});
+
+test('after a redirection a refusal that is not final is asked about again', () => {
+  const redirected = () =>
+    connecting()
+      .receive(...error('this server is about to stop', DRAINING))
+      .pass(1);
+  assert.equal(redirected().answer(`reason: ${JSON.stringify(FULL)}`, 'Error: none').state.is, 'redirected');
+  const final = reason('repository-not-allowed', 'user', 'no');
+  assert.equal(redirected().answer(`reason: ${JSON.stringify(final)}`, 'Error: none').state.is, 'ended');
+});
+
+test('a connection that breaks', () => {
+  const closed = /** @type {const} */ ({ type: 'closed', code: 1006 });
+  assert.equal(connecting().take(closed).state.is, 'redirected', 'nothing was granted');
+  const broken = connecting().receive('loading: Step 1/9 : fetching').take(closed);
+  assert.equal(broken.view.problem?.text, 'The connection to the simulation server broke before the simulation ran.');
+  const python = connecting().receive('webots:ws://one:2001').take(SHOWN, closed);
+  assert.equal(python.view.problem?.text, 'The connection to the simulation server broke: the simulation has ended.');
+  assert.equal(running().take(closed).state.is, 'lost', 'its simulation waits');
+});
+
+test('a session server that is silent, away, or back', () => {
+  /** @param {Visit} visit */
+  const problem = (visit) => visit.view.problem?.text;
+  const silent = asking().pass(10);
+  assert.equal(problem(silent), 'The session server does not answer.');
+  assert.deepEqual(silent.view.progress, { at: 'session', is: 'failed', notes: silent.view.progress?.notes });
+  // The late answer is nobody's, not even that of the next request.
+  silent.take(
+    { type: 'submitted', world: WORLD },
+    { type: 'answered', id: 1, answer: { failure: { sentence: 'late' } } },
+  );
+  assert.equal(silent.state.is, 'asking');
+  silent.answer(SERVER);
+  assert.equal(silent.state.is, 'connecting');
+  const away = asking().take({ type: 'disconnected' });
+  assert.equal(problem(away), 'The session server could not be reached.');
+  away.take({ type: 'available', now: true });
+  assert.equal(problem(away), undefined);
+  const early = new Visit().take({ type: 'submitted', world: WORLD });
+  assert.equal(problem(early), 'The session server could not be reached.');
+  assert.deepEqual(early.did(), ['clear']);
+});
+
+test('a lost connection is shown after two seconds, and found again', () => {
+  /** @param {Visit} visit */
+  const notice = (visit) => visit.view.notice;
+  const visit = running();
+  visit.did();
+  visit.take({ type: 'closed', code: 1006 });
+  assert.deepEqual(visit.did(), ['freeze', 'connect']);
+  assert.equal(notice(visit), undefined);
+  visit.take({ type: 'closed', code: 1006 }).pass(3);
+  assert.match(notice(visit)?.text ?? '', /^No connection since [34] s\.$/);
+  assert.equal(notice(visit)?.advice, 'Your simulation waits another 57 s.');
+  assert.equal(visit.view.progress?.is, 'done', 'its scene is still shown');
+  assert.ok(visit.did().includes('sayLost'));
+  visit.receive('session: 1');
+  assert.equal(notice(visit), undefined);
+  visit.receive('shutdownTimeout: 60', 'webots:ws://one:2001');
+  assert.deepEqual(visit.effects.at(-2), {
+    do: 'show',
+    address: 'ws://one:2001',
+    kind: undefined,
+    server: SERVER,
+    isBack: true,
+  });
+  assert.deepEqual(visit.effects.at(-1), { do: 'sayFound' });
+  visit.receive('absence: 60', 'resume: other');
+  assert.deepEqual(visit.effects.at(-1), { do: 'store', kept: { ...KEPT, token: 'other' } });
+});
+
+test('a server that hangs is noticed by its silence, and one attempt is under way at a time', () => {
+  const visit = running();
+  visit.did();
+  visit.pass(7);
+  assert.equal(visit.state.is, 'running');
+  visit.take({ type: 'heard' }).pass(7);
+  assert.equal(visit.state.is, 'running', 'the stream is a sign of life');
+  visit.pass(1);
+  assert.deepEqual([visit.state.is, visit.did()], ['lost', ['freeze', 'connect']]);
+  visit.pass(14);
+  assert.deepEqual(visit.did(), ['sayLost']);
+  visit.pass(2);
+  assert.deepEqual(visit.did(), ['connect']);
+  visit.take({ type: 'online' }).pass(1);
+  assert.deepEqual(visit.did(), ['connect']);
+});
+
+test('who is away for too long, or comes back to nothing, is told', () => {
+  const offline = running().take({ type: 'closed', code: 1006 });
+  for (let second = 0; second < 125; ++second) {
+    offline.pass(1).take({ type: 'closed', code: 1006 });
+  }
+  assert.match(
+    offline.view.problem?.text ?? '',
+    /^There was no connection for 2 min 0\d s: the simulation has ended\.$/,
+  );
+  const late = running().take({ type: 'closed', code: 1006 }).pass(70);
+  const { now } = late;
+  late.receive(...error('this simulation has ended', reason('ended', 'user', 'here')));
+  assert.equal(late.now, now);
+  assert.match(late.view.problem?.text ?? '', /^There was no connection for 1 min 10 s/);
+  const reloaded = new Visit().take({ type: 'restored', kept: KEPT });
+  assert.deepEqual(reloaded.effects, [{ do: 'connect', server: SERVER, request: { resume: TOKEN } }]);
+  reloaded.receive(...error('this simulation has ended', reason('ended', 'user', 'here')));
+  assert.equal(reloaded.view.problem?.text, 'This simulation has ended');
+  assert.ok(reloaded.did().includes('leave'));
+});
+
+test('a server that refuses all attempts while the session server answers is gone', () => {
+  const visit = running().take({ type: 'closed', code: 1006 });
+  for (let attempt = 0; attempt < 4; ++attempt) {
+    visit.take({ type: 'closed', code: 1006 });
+    assert.deepEqual(visit.did().slice(-1), ['probe']);
+    visit.take({ type: 'probed' }).pass(1);
+  }
+  assert.match(visit.view.problem?.text ?? '', /^There was no connection for [34] s: the simulation has ended\.$/);
+  const offline = running().take({ type: 'closed', code: 1006 });
+  for (let attempt = 0; attempt < 4; ++attempt) {
+    offline.take({ type: 'closed', code: 1006 }).pass(1);
+  }
+  assert.equal(offline.state.is, 'lost', 'without an answer of the session server, the network may be down');
+});
+
+test('a page that is hidden leaves what can be resumed', () => {
+  const visit = running();
+  visit.did();
+  assert.deepEqual(visit.take({ type: 'hidden' }).did(), ['detach']);
+  assert.equal(visit.state.is, 'idle');
+  const early = connecting();
+  early.did();
+  assert.deepEqual(early.take({ type: 'hidden' }).did(), ['leave']);
+  const lost = running().take({ type: 'closed', code: 1006 });
+  lost.did();
+  assert.deepEqual(lost.take({ type: 'hidden' }).did(), ['detach']);
+});
+
+test('a paused simulation is told, and kept by a button or because it runs', () => {
+  const visit = running().receive('idle: 120');
+  assert.equal(visit.view.idle, 'The simulation is paused, and ends in 2 min 00 s.');
+  visit.did();
+  visit.pass(3);
+  assert.deepEqual([visit.did(), visit.view.idle], [[], 'The simulation is paused, and ends in 1 min 57 s.']);
+  visit.take({ type: 'keep' });
+  assert.deepEqual(visit.effects, [{ do: 'send', message: { keep: true } }]);
+  visit.did();
+  visit.take({ type: 'mode', runs: true }).pass(1);
+  assert.deepEqual(visit.did(), ['send'], 'a controller has started it');
+  visit.receive('idle: never').pass(1);
+  assert.deepEqual([visit.did(), visit.view.idle], [[], undefined]);
+});
+
+test('a stream that closes: its server reports the end, or the page returns', () => {
+  const closed = /** @type {const} */ ({ type: 'sceneClosed' });
+  const ended = running().take(closed);
+  assert.equal(ended.view.progress?.is, 'failed');
+  assert.equal(ended.receive(...error('Webots ended', CRASHED)).state.is, 'ended');
+  assert.equal(running().take(closed).pass(3).state.is, 'lost');
+  const { problem } = connecting().receive('webots:ws://one:2001').take(closed).view;
+  assert.equal(problem?.text, 'The simulator could not be reached at ws://one:2001.');
+  assert.ok(problem?.advice.startsWith('A firewall'));
+});
+
+test('an administrator who watches is told to the visitor, also after a return', () => {
+  const visit = running().receive('watched: 1');
+  assert.equal(visit.view.isWatched, true);
+  assert.equal(visit.receive('watched: 0').view.isWatched, false);
+});
+
+test('each way out of a connected state closes the connection once', () => {
+  /** @type {VisitEvent[]} */
+  const ways = [
+    { type: 'left' },
+    { type: 'hidden' },
+    { type: 'submitted', world: WORLD },
+    { type: 'closed', failure: { sentence: 'over' } },
+  ];
+  const states = [
+    connecting,
+    () => connecting().receive('loading: x'),
+    running,
+    () => running().take({ type: 'closed' }),
+  ];
+  for (const way of ways) {
+    for (const state of states) {
+      const visit = state();
+      const from = visit.state.is;
+      visit.did();
+      visit.take(way);
+      assert.equal(
+        visit.did().filter((name) => name === 'leave' || name === 'detach').length,
+        1,
+        `${from}, ${way.type}`,
+      );
+    }
+  }
+  const visit = running();
+  visit.did();
+  assert.deepEqual(visit.take({ type: 'sceneFailed', why: 'no-webgl' }).did(), ['leave']);
+});
