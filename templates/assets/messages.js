@@ -72,6 +72,11 @@ class Reasons {
     return json !== undefined;
   }
 
+  /** Whether the next sentence has a reason. */
+  get isPending() {
+    return this.#reason !== undefined;
+  }
+
   /**
    * The failure of a sentence.
    * @param {string} sentence
@@ -101,7 +106,10 @@ export class SimulationReader {
     if (this.#reasons.take(text)) {
       return undefined;
     }
-    const sentence = after(text, 'loading: Error:') ?? after(text, 'error:');
+    const isReasoned = this.#reasons.isPending;
+    // An end without an error is not called one.
+    const sentence =
+      after(text, 'loading: Error:') ?? after(text, 'error:') ?? (isReasoned ? after(text, 'loading:') : undefined);
     if (sentence !== undefined) {
       return { is: 'failed', failure: this.#reasons.failure(sentence) };
     }

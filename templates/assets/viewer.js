@@ -174,12 +174,12 @@ function draw() {
  * @param {string[]} texts
  */
 function drawAvailability(lamp, [word = '', text = '']) {
-  const { classList } = find('light', HTMLElement);
+  const { classList } = find('availability', HTMLElement);
   for (const name of ['on', 'off']) {
     classList.toggle(name, name === lamp);
   }
-  setText(find('light-word', HTMLElement), word);
-  setText(find('light-text', HTMLElement), text);
+  setText(find('availability-word', HTMLElement), word);
+  setText(find('availability-text', HTMLElement), text);
 }
 
 /**

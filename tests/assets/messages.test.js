@@ -36,6 +36,12 @@ test('a reason belongs to the sentence after it', () => {
   });
 });
 
+test('an end without an error has a reason too', () => {
+  const finished = { code: 'finished', blame: 'project', retry: 'here' };
+  const [, failed] = read(`reason: ${JSON.stringify(finished)}`, 'loading: Webots has ended');
+  assert.deepEqual(failed, { is: 'failed', failure: { sentence: 'Webots has ended', reason: finished } });
+});
+
 test('a malformed reason is none', () => {
   for (const json of [
     '',

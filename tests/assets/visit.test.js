@@ -303,6 +303,12 @@ test('after a redirection a refusal that is not final is asked about again', () 
       .receive(...error('this server is about to stop', DRAINING))
       .pass(1);
   assert.equal(redirected().answer(`reason: ${JSON.stringify(FULL)}`, 'Error: none').state.is, 'redirected');
+  const lost = reason('lost', 'server', 'here');
+  assert.equal(
+    connecting().receive(...error('the server has lost it', lost)).state.is,
+    'ended',
+    'not all faults lead away',
+  );
   const final = reason('repository-not-allowed', 'user', 'no');
   assert.equal(redirected().answer(`reason: ${JSON.stringify(final)}`, 'Error: none').state.is, 'ended');
 });
@@ -335,6 +341,8 @@ test('a session server that is silent, away, or back', () => {
   assert.equal(problem(away), 'The session server could not be reached.');
   away.take({ type: 'available', now: true });
   assert.equal(problem(away), undefined);
+  const other = asking().answer('Error: the session server does not answer').take({ type: 'available', now: true });
+  assert.equal(problem(other), 'The session server does not answer', 'a sentence decides nothing');
   const early = new Visit().take({ type: 'submitted', world: WORLD });
   assert.equal(problem(early), 'The session server could not be reached.');
   assert.deepEqual(early.did(), ['clear']);

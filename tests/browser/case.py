@@ -62,7 +62,7 @@ class BrowserTest(unittest.TestCase):
     def start_world(self, name="Playground", **options):
         """The viewer page with a simulation that is ready, and its simulation server."""
         page = self.open(self.fleet.session.url("viewer"), **options)
-        expect(page.tab.locator("#light")).to_contain_text("Available")
+        expect(page.tab.locator("#availability")).to_contain_text("Available")
         page.tab.get_by_role("button", name=name).click()
         page.tab.get_by_role("button", name="Connect", exact=True).click()
         expect(page.tab.locator("[data-step=simulation].done")).to_be_visible()

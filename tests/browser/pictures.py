@@ -39,7 +39,7 @@ def start(browser, demo, world, width=360, height=300, name=""):
     """A viewer in which a user of this name runs a world; small, because drawing is expensive."""
     page = browser.page(width=width, height=height)
     page.tab.goto(f"http://{demo.session}/viewer?name={name}")
-    expect(page.tab.locator("#light.on")).to_be_visible()
+    expect(page.tab.locator("#availability.on")).to_be_visible()
     page.tab.get_by_role("button", name=world).click()
     page.tab.get_by_role("button", name="Connect", exact=True).click()
     page.tab.get_by_role("button", name="Play", exact=True).click()

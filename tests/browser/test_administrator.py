@@ -30,7 +30,7 @@ class Administrator(BrowserTest):
 
     def student(self, name):
         page = self.open(f"{self.fleet.session.url('viewer')}?name={name}")
-        expect(page.tab.locator("#light")).to_contain_text("Available")
+        expect(page.tab.locator("#availability")).to_contain_text("Available")
         page.tab.get_by_role("button", name="Playground").click()
         page.tab.get_by_role("button", name="Connect", exact=True).click()
         expect(page.tab.locator("[data-step=simulation].done")).to_be_visible()
@@ -83,7 +83,7 @@ class Administrator(BrowserTest):
 
     def test_an_announcement_is_seen_on_open_pages_and_is_gone_when_it_is_over(self):
         viewer = self.open(self.fleet.session.url("viewer"))
-        expect(viewer.tab.locator("#light")).to_contain_text("Available")
+        expect(viewer.tab.locator("#availability")).to_contain_text("Available")
         stranger = self.open(self.fleet.session.url("monitor"))
         expect(stranger.tab.locator("#live")).to_have_text("Live")
         teacher = self.page_with_password(self.fleet.session.url("monitor"))

@@ -53,7 +53,7 @@ class AClass(BrowserTest):
         """The page of a student whose viewer shows a simulation."""
         page = self.visit(name, f"viewer?name={name.title()}&url={WORLD.format('playground')}")
         expect(page.tab.locator("#visitor")).to_contain_text(f"The administrator sees you as {name.title()}.")
-        expect(page.tab.locator("#light.on")).to_be_visible()
+        expect(page.tab.locator("#availability.on")).to_be_visible()
         page.tab.get_by_role("button", name="Connect", exact=True).click()
         return page
 

@@ -28,7 +28,7 @@ class ComingBack(Running):
         self.leaves_nothing(page, server)
         # An ended simulation is not resumed.
         page.tab.reload()
-        expect(page.tab.locator("#light.on")).to_be_visible()
+        expect(page.tab.locator("#availability.on")).to_be_visible()
         expect(page.tab.get_by_role("button", name="Connect", exact=True)).to_be_enabled()
 
     def test_links_of_the_header_open_another_tab_while_a_simulation_runs(self):
@@ -77,11 +77,11 @@ class ComingBack(Running):
         with server.hanging():
             expect(page.tab.locator("#notice-text")).to_contain_text("No connection since", timeout=30_000)
             expect(page.tab.locator("#notice-advice")).to_contain_text("Your simulation waits another")
-            expect(page.tab.locator("#light")).to_contain_text("No connection")
+            expect(page.tab.locator("#availability")).to_contain_text("No connection")
             expect(page.tab.locator("#mode")).to_have_text("no connection")
             self.assertEqual(page.faults(), [])
         expect(page.tab.locator("#notice")).to_be_hidden(timeout=30_000)
-        expect(page.tab.locator("#light.on")).to_be_visible()
+        expect(page.tab.locator("#availability.on")).to_be_visible()
         expect(page.tab.locator("#mode")).to_have_text("paused")
         self.assertGreaterEqual(seconds(page), before)
         self.assertEqual(self.pid(server), pid)
@@ -144,7 +144,7 @@ class Busy(Running):
         first, _ = self.running()
         second, _ = self.running()
         third = self.open(self.fleet.session.url("viewer"))
-        expect(third.tab.locator("#light")).not_to_contain_text("Connecting")
+        expect(third.tab.locator("#availability")).not_to_contain_text("Connecting")
         third.tab.get_by_role("button", name="Playground").click()
         third.tab.get_by_role("button", name="Connect", exact=True).click()
         expect(third.tab.locator("#notice-text")).to_have_text("All servers are busy.")

@@ -30,7 +30,7 @@ class TheDemo(BrowserTest):
         expect(machine_monitor.tab.get_by_text("No simulations.")).to_be_visible()
 
         page = self.open(f"http://{self.fleet.session}/viewer")
-        expect(page.tab.locator("#light.on")).to_contain_text("Available")
+        expect(page.tab.locator("#availability.on")).to_contain_text("Available")
         page.tab.get_by_role("button", name="Playground").click()
         page.tab.get_by_role("button", name="Connect", exact=True).click()
         expect(page.tab.locator("[data-step=simulation].done")).to_be_visible()

@@ -14,7 +14,7 @@ class EveryPage(BrowserTest):
         session, simulation = self.fleet.session, self.fleet.simulation
         return [
             (session.url("monitor"), "#live:text('Live')"),
-            (session.url("viewer"), "#light.on"),
+            (session.url("viewer"), "#availability.on"),
             (session.url("webots-viewer"), "#problem:not(:empty)"),
             (simulation.url("monitor"), "#charts figure:nth-of-type(3)"),
         ]
@@ -55,7 +55,7 @@ class EveryPage(BrowserTest):
 
     def test_everything_can_be_reached_by_tab(self):
         page = self.open(self.fleet.session.url("viewer"))
-        expect(page.tab.locator("#light.on")).to_be_visible()
+        expect(page.tab.locator("#availability.on")).to_be_visible()
         reached = []
         for _ in range(12):
             page.tab.keyboard.press("Tab")

@@ -21,7 +21,7 @@ class LeavingServers(BrowserTest):
         until("the session server knows that one alone", lambda: known() == [(server.address, "up")])
 
     def connect(self, page):
-        expect(page.tab.locator("#light.on")).to_contain_text("Available")
+        expect(page.tab.locator("#availability.on")).to_contain_text("Available")
         page.tab.get_by_role("button", name="Playground").click()
         page.tab.get_by_role("button", name="Connect", exact=True).click()
 

@@ -1,4 +1,4 @@
-"""The viewer: from the status light to a moving scene."""
+"""The viewer: from the availability to a moving scene."""
 
 import unittest
 
@@ -47,7 +47,7 @@ class Viewing(BrowserTest):
             ("https://github.com/demo/nothing/blob/main/worlds/a.wbt", "nothing", "Look whether"),
         ]
         page = self.open(self.fleet.session.url("viewer"))
-        expect(page.tab.locator("#light")).to_contain_text("Available")
+        expect(page.tab.locator("#availability")).to_contain_text("Available")
         for world, words, what_to_do in table:
             with self.subTest(world):
                 page.tab.get_by_label("URL of a world").fill(world)
@@ -59,7 +59,7 @@ class Viewing(BrowserTest):
 
     def test_a_session_server_that_hangs_is_told_and_its_late_answer_is_nobodys(self):
         page = self.open(self.fleet.session.url("viewer"))
-        expect(page.tab.locator("#light")).to_contain_text("Available")
+        expect(page.tab.locator("#availability")).to_contain_text("Available")
         connect = page.tab.get_by_role("button", name="Connect", exact=True)
         with self.fleet.session.hanging():
             page.tab.get_by_label("URL of a world").fill("https://github.com/stranger/worlds/blob/main/worlds/a.wbt")

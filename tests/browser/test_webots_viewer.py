@@ -65,7 +65,7 @@ class WebotsViewer(BrowserTest):
 
     def test_it_is_loaded_from_the_simulation_server_alone(self):
         page = self.open(self.fleet.session.url("viewer"))
-        expect(page.tab.locator("#light")).to_contain_text("Available")
+        expect(page.tab.locator("#availability")).to_contain_text("Available")
         page.tab.get_by_label("Shown by").select_option("webots")
         page.tab.get_by_role("button", name="Playground").click()
         page.tab.get_by_role("button", name="Connect", exact=True).click()
@@ -96,7 +96,7 @@ class BehindTheDoor(BrowserTest):
 
     def test_it_streams_through_the_door_and_an_administrator_watches_with_it(self):
         page = self.visit(self.fleet.url(f"viewer?url={WORLD.format('playground')}"))
-        expect(page.tab.locator("#light.on")).to_be_visible()
+        expect(page.tab.locator("#availability.on")).to_be_visible()
         page.tab.get_by_label("Shown by").select_option("webots")
         page.tab.get_by_role("button", name="Connect", exact=True).click()
         view = page.tab.frame_locator("#stage iframe").locator("webots-view")

@@ -55,7 +55,7 @@ def visit(browser, url, service):
     page = Page(context)
     tab = page.tab
     until("the page is there", lambda: opened(tab, url))
-    expect(tab.locator("#light")).to_contain_text("Available")
+    expect(tab.locator("#availability")).to_contain_text("Available")
     tab.get_by_role("button", name="Playground").click()
     connect_until_it_moves(tab)
     say("moves")

@@ -32,7 +32,7 @@ def visit(browser, url, own_origin):
     page = Page(context)
     tab = page.tab
     tab.goto(url)
-    expect(tab.locator("#light")).to_contain_text("Available")
+    expect(tab.locator("#availability")).to_contain_text("Available")
     tab.get_by_role("button", name="Arm").click()
     tab.get_by_role("button", name="Connect", exact=True).click()
     expect(tab.locator("[data-step=simulation].done")).to_be_visible()
