@@ -2,7 +2,7 @@
 
 import unittest
 
-from case import BrowserTest, picture
+from case import BrowserTest, picture, seconds
 from fleet import WORLD, until
 from playwright.sync_api import expect
 
@@ -71,6 +71,25 @@ class Viewing(BrowserTest):
         connect.click()
         expect(page.tab.locator("[data-step=simulation].done")).to_be_visible(timeout=20_000)
         expect(page.tab.locator("#problem")).to_be_hidden()
+
+    def test_the_scene_is_requested_once_by_the_kind_that_the_server_tells(self):
+        page = self.open(self.fleet.session.url("viewer"))
+        sent = []
+
+        def record(socket):
+            if "/client" not in socket.url and "/session" not in socket.url:
+                socket.on("framesent", lambda text: sent.append(text))
+
+        page.tab.on("websocket", record)
+        expect(page.tab.locator("#availability")).to_contain_text("Available")
+        page.tab.get_by_role("button", name="Playground").click()
+        page.tab.get_by_role("button", name="Connect", exact=True).click()
+        expect(page.tab.locator("[data-step=simulation].done")).to_be_visible()
+        # Time runs, so that updates come too.
+        page.tab.get_by_role("button", name="Play", exact=True).click()
+        until("time passes", lambda: seconds(page) > 3)
+        # The world is one of R2025a.
+        self.assertEqual(sent, ["w3d", "real-time:-1"])
 
     def test_on_a_phone_the_scene_comes_into_sight(self):
         page, _ = self.start_world(width=360, height=740)
