@@ -50,6 +50,10 @@ export const ADVICE = {
   'disk-limit': 'project',
   lost: 'general',
   ended: 'again',
+  // Why a server gets no clients: administrators read these.
+  'no-answer': 'elsewhere',
+  'invalid-answer': 'elsewhere',
+  'starts-fail': 'elsewhere',
 };
 
 /**
