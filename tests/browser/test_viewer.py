@@ -78,7 +78,7 @@ class Viewing(BrowserTest):
 
         def record(socket):
             if "/client" not in socket.url and "/session" not in socket.url:
-                socket.on("framesent", lambda text: sent.append(text))
+                socket.on("framesent", sent.append)
 
         page.tab.on("websocket", record)
         expect(page.tab.locator("#availability")).to_contain_text("Available")
