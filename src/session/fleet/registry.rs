@@ -131,7 +131,7 @@ impl Registry {
             answer.is_some_and(|answer| answer.report.check(world, answer.report.load).is_ok())
         };
         let eligible = |address: &PublicAddress| world.is_none_or(|world| admits(address, world));
-        let picked = fleet.pick(Instant::now(), self.quota.take(from, true), eligible);
+        let picked = fleet.pick(Instant::now(), self.quota.take(from), eligible);
         picked.ok_or_else(|| {
             let servers = records.values();
             refusal(

@@ -18,7 +18,7 @@ use crate::shared::config::Secret;
 #[derive(Debug)]
 pub struct BasicAuth {
     password: Secret,
-    attempts: AddressQuota,
+    failures: AddressQuota,
 }
 
 /// Why a request is refused, as text for the client.
@@ -27,36 +27,36 @@ pub enum AuthError {
     /// The request has no password, or a wrong one.
     #[error("Error: a password is needed.")]
     NoPassword,
-    /// The client's address has sent too many passwords; this one was not compared.
-    #[error("Error: too many passwords from your address.")]
+    /// The client's address has sent too many wrong passwords; this one was not compared.
+    #[error("Error: too many wrong passwords from your address.")]
     TooMany,
 }
 
 impl BasicAuth {
     /// Creates an authenticator for this password.
     pub fn new(password: Secret) -> Self {
-        // Thirty passwords at once, and twelve a minute.
+        // Thirty wrong passwords at once, and twelve a minute.
         Self {
             password,
-            attempts: AddressQuota::new(30, 12),
+            failures: AddressQuota::new(30, 12),
         }
     }
 
-    /// Checks the password of a request, in constant time. Right passwords count as attempts too, so that a client over
-    /// the limit does not learn which one is right.
+    /// Checks the password of a request, in constant time. Only wrong passwords count. Over the limit the password is not
+    /// compared, so that a client that guesses does not learn which one is right.
     ///
     /// # Errors
-    /// When the password is missing or wrong, or `peer` has sent too many.
+    /// When the password is missing or wrong, or `peer` has sent too many wrong ones.
     pub fn check(&self, request: &HttpRequest, peer: Peer) -> Result<(), AuthError> {
         let given = password_of(request).ok_or(AuthError::NoPassword)?;
         // Proxies that don't report client addresses share one quota.
-        if !self.attempts.take(
-            Some(peer.rate_limit_key().unwrap_or(Ipv6Addr::UNSPECIFIED.into())),
-            false,
-        ) {
+        let address = Some(peer.rate_limit_key().unwrap_or(Ipv6Addr::UNSPECIFIED.into()));
+        // Taken before the comparison: requests that arrive together must not all be compared.
+        if !self.failures.take(address) {
             return Err(AuthError::TooMany);
         }
         if given.as_bytes().ct_eq(self.password.reveal().as_bytes()).into() {
+            self.failures.give_back(address);
             return Ok(());
         }
         log::warn!("client {peer}: a wrong administrator password");

@@ -4,12 +4,11 @@
 use std::collections::HashMap;
 use std::collections::hash_map::Entry;
 use std::net::IpAddr;
-use std::num::NonZeroU32;
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use actix_web::HttpResponse;
 use actix_web::http::StatusCode;
-use governor::{DefaultKeyedRateLimiter, Quota, RateLimiter};
 use parking_lot::Mutex;
 
 use super::peer::Peer;
@@ -174,28 +173,64 @@ const MAX_ADDRESSES: usize = 10_000;
 
 /// Rate limit per client address.
 #[derive(Debug)]
-pub struct AddressQuota(DefaultKeyedRateLimiter<IpAddr>);
+pub struct AddressQuota {
+    /// The time in which one use becomes available again.
+    interval: Duration,
+    /// The time in which a whole quota becomes available again.
+    whole: Duration,
+    /// When the whole quota of an address is available again (GCRA: its theoretical arrival time). Other addresses have
+    /// used nothing.
+    restored: Mutex<HashMap<IpAddr, Instant>>,
+}
 
 impl AddressQuota {
     /// An unused quota: `burst` uses at once, and `per_minute` uses in each minute after that.
     pub fn new(burst: u32, per_minute: u32) -> Self {
-        let [burst, per_minute] = [burst, per_minute].map(|number| NonZeroU32::MIN.saturating_add(number - 1));
-        Self(RateLimiter::keyed(Quota::per_minute(per_minute).allow_burst(burst)))
+        let interval = Duration::from_mins(1) / per_minute.max(1);
+        Self {
+            interval,
+            whole: interval * burst,
+            restored: Mutex::default(),
+        }
     }
 
-    /// Takes one from the quota of an address. Returns whether it had one left; always true if the address is unknown,
-    /// and `when_full` if too many addresses are tracked.
-    pub fn take(&self, address: Option<IpAddr>, when_full: bool) -> bool {
+    /// Takes one use from the quota of an address. Returns whether there was one left; always true if the address is
+    /// unknown.
+    pub fn take(&self, address: Option<IpAddr>) -> bool {
         let Some(address) = address else { return true };
-        if self.0.len() >= MAX_ADDRESSES {
-            // Drops the addresses whose whole quota is available again.
-            self.0.retain_recent();
+        let now = Instant::now();
+        let mut restored = self.restored.lock();
+        if restored.len() >= MAX_ADDRESSES && !restored.contains_key(&address) {
+            make_room(&mut restored, now);
         }
-        if self.0.len() >= MAX_ADDRESSES {
-            when_full
-        } else {
-            self.0.check_key(&address).is_ok()
+        let at = restored.entry(address).or_insert(now);
+        let next = now.max(*at) + self.interval;
+        let is_left = next <= now + self.whole;
+        if is_left {
+            *at = next;
         }
+        is_left
+    }
+
+    /// Gives back one use that was taken.
+    pub fn give_back(&self, address: Option<IpAddr>) {
+        if let Some(address) = address
+            && let Some(at) = self.restored.lock().get_mut(&address)
+            && let Some(earlier) = at.checked_sub(self.interval)
+        {
+            *at = earlier;
+        }
+    }
+}
+
+/// Forgets the addresses whose whole quota is available again; if many remain, also the half that has used the least. So
+/// clients with very many addresses can neither fill the memory nor have others refused.
+fn make_room(restored: &mut HashMap<IpAddr, Instant>, now: Instant) {
+    restored.retain(|_, at| *at > now);
+    if restored.len() > MAX_ADDRESSES / 2 {
+        let mut times: Vec<Instant> = restored.values().copied().collect();
+        let (_, &mut middle, _) = times.select_nth_unstable(MAX_ADDRESSES / 2);
+        restored.retain(|_, at| *at > middle);
     }
 }
 
@@ -244,12 +279,31 @@ mod tests {
     }
 
     #[test]
-    fn the_addresses_that_are_remembered_are_bounded() {
-        let quota = AddressQuota::new(200, 12);
-        for number in 0..12_000 {
-            assert!(quota.take(Some(std::net::Ipv4Addr::from_bits(number).into()), true));
+    fn a_quota_is_used_up_and_comes_back() {
+        let address = Some("203.0.113.9".parse().unwrap());
+        let quota = AddressQuota::new(3, 6000);
+        assert_eq!([(); 4].map(|()| quota.take(address)), [true, true, true, false]);
+        quota.give_back(address);
+        assert_eq!([(); 2].map(|()| quota.take(address)), [true, false]);
+        assert!(quota.take(Some("203.0.113.10".parse().unwrap())), "another address");
+        assert!(quota.take(None));
+        let deadline = Instant::now() + Duration::from_secs(20);
+        while !quota.take(address) {
+            assert!(Instant::now() < deadline);
+            std::thread::yield_now();
         }
-        assert!(quota.0.len() <= MAX_ADDRESSES);
-        assert!(!quota.take(Some(std::net::Ipv4Addr::from_bits(12_000).into()), false));
+    }
+
+    #[test]
+    fn many_addresses_fill_no_memory_and_keep_nobody_out() {
+        let quota = AddressQuota::new(30, 12);
+        let guesser = Some("2001:db8::".parse().unwrap());
+        while quota.take(guesser) {}
+        for number in 0..50_000_u128 {
+            let other = std::net::Ipv6Addr::from_bits((0x2001_0db9 << 96) + (number << 64));
+            assert!(quota.take(Some(other.into())), "{other}");
+        }
+        assert!(quota.restored.lock().len() <= MAX_ADDRESSES);
+        assert!(!quota.take(guesser), "the one who has used most is not forgotten");
     }
 }

@@ -44,7 +44,7 @@ impl Session {
     }
 
     pub(super) fn request_slot(&mut self, url: &str, identity: ClientIdentity, ctx: &mut Context<Self>) {
-        let admitted = if self.server.start_quota.take(self.peer.rate_limit_key(), true) {
+        let admitted = if self.server.start_quota.take(self.peer.rate_limit_key()) {
             self.server.admit(url)
         } else {
             Err("Too many simulations were asked for from your address. Try again in a minute".to_owned())
