@@ -1,4 +1,4 @@
-//! The log: to a file that is rotated, or to standard output.
+//! The log: to a file that is rotated, or to standard output, which loses lines that nobody reads.
 
 use std::io::Write;
 use std::path::Path;
@@ -6,6 +6,7 @@ use std::path::Path;
 use env_logger::{Builder, Env, Target};
 
 use super::rotated_file::RotatedFile;
+use super::standard_output::StandardOutput;
 use super::timestamp::timestamp_in_milliseconds;
 use crate::shared::text::one_line;
 
@@ -15,7 +16,7 @@ const MAX_SIZE: u64 = 2_500_000;
 /// Starts logging to a rotated file, or without one to standard output with debug lines. `RUST_LOG` overrides levels.
 ///
 /// # Errors
-/// When the file or its directory can't be created.
+/// When the file or its directory can't be created, or standard output is closed.
 pub fn start(file: Option<&Path>) -> std::io::Result<()> {
     // The HTTP decoder logs each malformed message as an error. Any client could flood the log with these. Resolver
     // errors are logged by the caller.
@@ -26,7 +27,7 @@ pub fn start(file: Option<&Path>) -> std::io::Result<()> {
     let level = format!("{level},actix_http::h1::decoder=off,hickory_net=off,hickory_proto=off,hickory_resolver=off");
     let mut builder = Builder::from_env(Env::default().default_filter_or(level));
     builder.target(match file {
-        None => Target::Stdout,
+        None => Target::Pipe(Box::new(StandardOutput::open()?)),
         Some(path) => Target::Pipe(Box::new(RotatedFile::open(path, MAX_SIZE, "")?)),
     });
     builder.format(|out, record| {

@@ -6,6 +6,7 @@ pub mod permanent;
 mod rotated_file;
 pub mod service_manager;
 mod signals;
+mod standard_output;
 pub mod start;
 mod timestamp;
 
