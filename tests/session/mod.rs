@@ -9,6 +9,7 @@ mod mail;
 mod memory;
 mod placement;
 mod pushing;
+mod requests;
 mod seeing;
 mod stopping;
 mod trust;

@@ -1,5 +1,7 @@
 //! A client's TCP connection that reads the next request only after the answer to the previous one has begun. A request
-//! may have a body of up to 8 KiB.
+//! may have a body of up to 8 KiB whose length its head tells. After a head that announces a body of unknown length
+//! (`Transfer-Encoding`) nothing more is read, and the connection ends with the answer: actix would wait for the end of
+//! that body without a time limit.
 //!
 //! actix decodes all requests that it has read before it answers the first. Without this limit, a client that sends
 //! many requests and reads no answer would fill the memory.
@@ -16,7 +18,7 @@ use std::task::{Context, Poll, ready};
 use actix_http::Extensions;
 use actix_web::HttpRequest;
 use actix_web::rt::net::TcpStream;
-use actix_web::web::{Bytes, BytesMut};
+use actix_web::web::{Buf, Bytes, BytesMut};
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::sync::oneshot;
 use tokio_util::io::poll_read_buf;
@@ -30,6 +32,8 @@ const READ_AT_ONCE: usize = 4 * 1024;
 const SWITCHING_PROTOCOLS: &[u8] = b"HTTP/1.1 101 ";
 /// Size limit of the head of a request, in bytes: actix refuses one that is as large.
 const MAX_HEAD: usize = 128 * 1024;
+/// Length of the end of a head that shows that it is one: an empty line, after the end of another.
+const END_OF_HEAD: usize = 3;
 /// Limit of headers in a request, the same as that of actix.
 const MAX_HEADERS: usize = 96;
 
@@ -42,6 +46,17 @@ enum State {
     Answer,
     /// Messages go in both directions.
     WebSocket,
+    /// Nothing is read any more. The answer to the last request may still be written.
+    Ended,
+}
+
+/// The beginning of the unread bytes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Front {
+    /// A request of this length, with its body.
+    Request(usize),
+    /// The head of the last request on this connection, of this length.
+    Last(usize),
 }
 
 /// A connection that was upgraded from HTTP to another protocol.
@@ -75,6 +90,7 @@ pub struct ClientStream {
     upgrade: UpgradeSlot,
     /// Bytes that were read from the socket and not yet passed to actix.
     unread: BytesMut,
+    heads: HeadFinder,
     /// Number of bytes of the current request that were not yet passed to actix.
     left: usize,
     /// Whether the socket's send buffer is full, because the client does not read.
@@ -89,6 +105,7 @@ impl ClientStream {
             connection: Some((tcp, permit)),
             upgrade: UpgradeSlot::default(),
             unread: BytesMut::new(),
+            heads: HeadFinder::default(),
             left: 0,
             is_blocked: false,
             state: State::Request,
@@ -114,29 +131,71 @@ impl ClientStream {
         poll_read_buf(Pin::new(tcp), context, &mut self.unread)
     }
 
-    /// Reads the head of a request. Returns the length of the request; 0 if the client sends no more.
-    fn poll_head(&mut self, context: &mut Context<'_>) -> Poll<io::Result<usize>> {
+    /// Reads the head of a request; `None` if the client sends no more.
+    fn poll_head(&mut self, context: &mut Context<'_>) -> Poll<io::Result<Option<Front>>> {
         loop {
-            if let Some(length) = request_length(&self.unread) {
-                return Poll::Ready(Ok(length));
+            if let Some(front) = self.heads.find(&mut self.unread) {
+                return Poll::Ready(Ok(Some(front)));
             }
             if ready!(self.poll_fill(context))? == 0 {
-                return Poll::Ready(Ok(0));
+                return Poll::Ready(Ok(None));
             }
         }
     }
 }
 
-/// The length of the request at the start of these bytes; `None` while its head is incomplete. If the head is invalid
-/// or too large, the request is all bytes, and actix answers with the error.
-fn request_length(bytes: &[u8]) -> Option<usize> {
+/// Finds the head of a request at the start of bytes that arrive piece by piece.
+///
+/// What is no HTTP at all, such as TLS, is recognized in the first piece. After that the head is parsed once, when its
+/// last line has arrived: a client may send it byte by byte.
+#[derive(Debug, Default)]
+struct HeadFinder {
+    /// Number of bytes in which no head ends.
+    searched: usize,
+}
+
+impl HeadFinder {
+    /// The request at the start of these bytes, which are those of the last call and more; `None` while its head is
+    /// incomplete. If the head is invalid or too large, the request is all bytes, and actix answers with the error.
+    fn find(&mut self, bytes: &mut BytesMut) -> Option<Front> {
+        if self.searched == 0 {
+            // Empty lines before a request are ignored (RFC 9112, section 2.2).
+            let is_empty = |byte: &&u8| matches!(byte, b'\r' | b'\n');
+            let empty = bytes.iter().take_while(is_empty).count();
+            bytes.advance(empty);
+        }
+        let new = bytes.get(self.searched.saturating_sub(END_OF_HEAD - 1)..);
+        let is_worth_parsing = self.searched == 0 || bytes.len() >= MAX_HEAD || new.is_some_and(ends_head);
+        self.searched = bytes.len();
+        let front = (is_worth_parsing && !bytes.is_empty()).then(|| parse(bytes)).flatten();
+        if front.is_some() {
+            self.searched = 0;
+        }
+        front
+    }
+}
+
+fn parse(bytes: &[u8]) -> Option<Front> {
     let mut headers = [httparse::EMPTY_HEADER; MAX_HEADERS];
     let mut request = httparse::Request::new(&mut headers);
     match request.parse(bytes) {
-        Ok(httparse::Status::Complete(head)) => Some(head + body_length(request.headers).unwrap_or(0)),
-        Ok(httparse::Status::Partial) => (bytes.len() >= MAX_HEAD).then_some(bytes.len()),
-        Err(_) => Some(bytes.len()),
+        Ok(httparse::Status::Complete(head)) if has_transfer_encoding(request.headers) => Some(Front::Last(head)),
+        Ok(httparse::Status::Complete(head)) => Some(Front::Request(head + body_length(request.headers).unwrap_or(0))),
+        Ok(httparse::Status::Partial) => (bytes.len() >= MAX_HEAD).then_some(Front::Request(bytes.len())),
+        Err(_) => Some(Front::Request(bytes.len())),
     }
+}
+
+/// Whether a head may end in these bytes: an empty line follows a line. The parser also takes lines without a carriage
+/// return.
+fn ends_head(bytes: &[u8]) -> bool {
+    bytes.windows(2).any(|two| two == b"\n\n") || bytes.windows(3).any(|three| three == b"\n\r\n")
+}
+
+fn has_transfer_encoding(headers: &[httparse::Header<'_>]) -> bool {
+    headers
+        .iter()
+        .any(|header| header.name.eq_ignore_ascii_case("transfer-encoding"))
 }
 
 /// The length of a body, if the headers have one and it is not too large.
@@ -169,13 +228,18 @@ impl AsyncRead for ClientStream {
         if self.left == 0 {
             match self.state {
                 State::Answer => return Poll::Pending,
-                State::Request => {
-                    self.left = ready!(self.poll_head(context))?;
-                    if self.left == 0 {
-                        return Poll::Ready(Ok(()));
+                State::Ended => return Poll::Ready(Ok(())),
+                State::Request => match ready!(self.poll_head(context))? {
+                    None => return Poll::Ready(Ok(())),
+                    Some(Front::Request(length)) => {
+                        self.left = length;
+                        self.state = State::Answer;
                     }
-                    self.state = State::Answer;
-                }
+                    Some(Front::Last(length)) => {
+                        self.left = length;
+                        self.state = State::Ended;
+                    }
+                },
                 State::WebSocket if self.unread.is_empty() => return self.tcp()?.poll_read(context, buffer),
                 State::WebSocket => self.left = self.unread.len(),
             }
@@ -231,5 +295,61 @@ impl AsyncWrite for ClientStream {
             Ok(tcp) => tcp.poll_shutdown(context),
             Err(_) => Poll::Ready(Ok(())),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::{Duration, Instant};
+
+    use super::*;
+
+    /// Where the request at the start is complete, if it arrives in pieces of this size.
+    fn found(text: &str, size: usize) -> Option<(Front, usize)> {
+        let (mut heads, mut bytes) = (HeadFinder::default(), BytesMut::new());
+        let mut arrived = 0;
+        text.as_bytes().chunks(size).find_map(|piece| {
+            arrived += piece.len();
+            bytes.extend_from_slice(piece);
+            heads.find(&mut bytes).map(|front| (front, arrived))
+        })
+    }
+
+    #[test]
+    fn a_head_is_found_however_it_arrives() {
+        let long = format!("GET / HTTP/1.1\r\nX: {}\r\n\r\n", "x".repeat(5000));
+        let too_large = format!("GET / HTTP/1.1\r\nX: {}", "x".repeat(MAX_HEAD));
+        for (text, front) in [
+            ("GET / HTTP/1.1\r\n\r\n", Front::Request(18)),
+            ("GET / HTTP/1.1\nHost: x\n\n", Front::Request(24)),
+            ("GET / HTTP/1.1\nHost: x\r\n\n", Front::Request(25)),
+            (&long, Front::Request(long.len())),
+            ("POST / HTTP/1.1\r\nContent-Length: 4\r\n\r\n", Front::Request(42)),
+            ("POST / HTTP/1.1\r\nContent-Length: 9000\r\n\r\n", Front::Request(41)),
+            ("GET / HTTP/1.1\r\ntransfer-encoding: chunked\r\n\r\n", Front::Last(46)),
+        ] {
+            for size in [1, 2, 3, 7, 4096, usize::MAX] {
+                assert_eq!(found(text, size), Some((front, text.len())), "{text:?} by {size}");
+                let (cut, _) = text.split_at(text.len() - 1);
+                assert_eq!(found(cut, size), None, "{text:?} by {size}");
+            }
+            let after_empty_lines = format!("\r\n\n{text}");
+            assert_eq!(found(&after_empty_lines, 1), Some((front, after_empty_lines.len())));
+        }
+        assert_eq!(found(&too_large, 4096), Some((Front::Request(MAX_HEAD), MAX_HEAD)));
+        assert_eq!(found("\x16\x03\x01", 3), Some((Front::Request(3), 3)), "TLS");
+        assert_eq!(found(&"\r\n".repeat(1000), 7), None);
+    }
+
+    #[test]
+    fn a_head_that_arrives_byte_by_byte_costs_little() {
+        let begin = Instant::now();
+        let head = format!(
+            "GET / HTTP/1.1\r\n{}",
+            format!("X: {}\r\n", "x".repeat(1000)).repeat(80)
+        );
+        assert_eq!(found(&head, 1), None);
+        assert_eq!(found(&"\r\n".repeat(60_000), 1), None);
+        assert!(begin.elapsed() < Duration::from_secs(1), "{:?}", begin.elapsed());
     }
 }

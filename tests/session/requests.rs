@@ -1,0 +1,114 @@
+//! Requests by which a client could hold a connection or cost much, on both servers.
+
+use base64::Engine;
+use base64::prelude::BASE64_STANDARD;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
+
+use crate::support::http::{PASSWORD, get_as_administrator};
+use crate::support::program::{Server, demo_server, session_server};
+use crate::support::{SOON, http, until};
+
+/// Sends these bytes, and returns what is received until the server closes the connection.
+async fn raw(server: &Server, bytes: &[u8]) -> String {
+    let mut socket = TcpStream::connect(server.address()).await.unwrap();
+    socket.write_all(bytes).await.unwrap();
+    let mut answer = Vec::new();
+    actix_rt::time::timeout(SOON, socket.read_to_end(&mut answer))
+        .await
+        .unwrap_or_else(|_| panic!("{}: the connection is kept", String::from_utf8_lossy(bytes)))
+        .ok();
+    String::from_utf8_lossy(&answer).into_owned()
+}
+
+#[actix_rt::test]
+async fn a_body_without_a_length_holds_no_connection() {
+    for server in [session_server(&[]).start().await, demo_server(1).start().await] {
+        for (request, status) in [
+            ("GET /load", 200),
+            ("HEAD /load", 200),
+            ("GET /monitor", 200),
+            ("GET /nothing", 404),
+            ("POST /load", 405),
+            ("OPTIONS /load", 204),
+        ] {
+            let request = format!("{request} HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n");
+            // Without the body, with a part of it, and with another request behind it.
+            for rest in ["", "5\r\nab", "0\r\n\r\nGET /load HTTP/1.1\r\nHost: x\r\n\r\n"] {
+                let answer = raw(&server, format!("{request}{rest}").as_bytes()).await;
+                assert!(
+                    answer.starts_with(&format!("HTTP/1.1 {status} ")),
+                    "{request}: {answer}"
+                );
+                assert_eq!(answer.matches("HTTP/1.1 ").count(), 1, "{request}: {answer}");
+            }
+        }
+    }
+}
+
+#[actix_rt::test]
+async fn other_beginnings_of_a_request_are_answered_at_once() {
+    let server = session_server(&[]).start().await;
+    for (bytes, status) in [
+        // A client that speaks TLS.
+        (&b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03"[..], 400),
+        (
+            b"\r\n\n\r\nGET /load HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n",
+            200,
+        ),
+        (b"GET /load HTTP/1.1\nHost: x\nConnection: close\n\n", 200),
+        (b"GET /load HTTP/1.1\nHost: x\r\nConnection: close\n\r\n", 200),
+    ] {
+        let answer = raw(&server, bytes).await;
+        assert!(
+            answer.starts_with(&format!("HTTP/1.1 {status} ")),
+            "{bytes:?}: {answer}"
+        );
+    }
+}
+
+#[actix_rt::test]
+async fn guesses_from_many_addresses_lock_no_administrator_out() {
+    let server = demo_server(1).set("adminPassword", PASSWORD).start().await;
+    let guess = BASE64_STANDARD.encode("admin:guess");
+    let requests: String = (0..10_300)
+        .map(|number| {
+            format!(
+                "HEAD /status HTTP/1.1\r\nHost: x\r\nX-Forwarded-For: 2001:db8:{number:x}::1\r\nAuthorization: Basic {guess}\r\n\r\n"
+            )
+        })
+        .collect();
+    let last = "GET /health HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n";
+    let answers = raw(&server, format!("{requests}{last}").as_bytes()).await;
+    assert_eq!(answers.matches("HTTP/1.1 200 ").count(), 10_301);
+    let answer = get_as_administrator(&server.url("/sign-in")).await;
+    assert_eq!(answer.status.as_u16(), 303, "{}", answer.text());
+}
+
+#[actix_rt::test]
+async fn a_log_that_nobody_reads_stops_no_server() {
+    let folder = tempfile::tempdir().unwrap();
+    let pipe = folder.path().join("pipe");
+    let pipe = pipe.display();
+    // The server holds both ends of the pipe.
+    let unread = session_server(&[])
+        .env("RUST_LOG", "trace")
+        .before(&format!("mkfifo '{pipe}' && exec 3<>'{pipe}' >'{pipe}'"));
+    let server = unread.start().await;
+    for _ in 0..500 {
+        assert_eq!(http::get(&server.url("/health")).await.status, 200);
+    }
+    // Whoever reads again learns how much is missing.
+    let reader = tokio::net::unix::pipe::OpenOptions::new()
+        .open_receiver(folder.path().join("pipe"))
+        .unwrap();
+    let (mut log, mut buffer) = (String::new(), vec![0; 64 << 10]);
+    until("the log tells that lines are missing", async || {
+        http::get(&server.url("/health")).await;
+        while let Ok(length) = reader.try_read(&mut buffer) {
+            log += &String::from_utf8_lossy(&buffer[..length]);
+        }
+        log.contains(" lines are missing here, because nobody read standard output\n")
+    })
+    .await;
+}
