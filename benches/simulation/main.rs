@@ -10,7 +10,8 @@
 //!   and how much memory pasta takes; needs an ordinary user, as level `own` always does;
 //! - `containers`: how long starts in containers take, one and thirty at once, compared with `docker compose up` by
 //!   hand; needs root and dockerd;
-//! - `relay`: what 100 streams of 50 messages a second cost through the server, through nginx, and directly; needs
+//! - `relay`: what 100 streams of 50 messages a second cost through the server, through nginx, and directly, and how
+//!   late an echo is beside six streams that are as fast as possible; needs
 //!   nginx;
 //! - `soak`: whether a thousand starts and stops in a row leave anything: processes, file descriptors, ports, folders,
 //!   threads, memory.

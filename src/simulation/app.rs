@@ -106,10 +106,11 @@ pub async fn serve(assembly: Application) -> Result<(), AppError> {
         .launcher
         .reached()
         .unwrap_or_else(|| server.config.address_of_simulations());
-    let stream_thread = StreamThread::start()?;
+    let stream_thread = StreamThread::start(options.silence)?;
     let silence = options.silence;
+    let answer = server.config.timing.answer;
     let app = move || {
-        let upstream = Upstream::new(simulations, stream_thread.clone(), silence);
+        let upstream = Upstream::new(simulations, stream_thread.clone(), silence, answer);
         App::new()
             .app_data(shared.clone())
             .app_data(upstream)
@@ -118,7 +119,8 @@ pub async fn serve(assembly: Application) -> Result<(), AppError> {
     let http = server::serve(socket, server.connections.clone(), options, app)?;
     let handle = http.handle();
     let serving = actix_rt::spawn(http);
-    let (config, port) = (&server.config, server.config.port);
+    let config = &server.config;
+    let port = config.port;
     start::announce(
         "simulation server",
         &config.http_url(),
@@ -206,12 +208,11 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
     let metrics = Metrics::default();
     let logs = config.log_dir.0.join("simulation");
     let ends = Ends::start(logs, launcher.level.to_string(), &metrics)?;
-    let (per_address, per_user) = (config.max_places_per_address, config.max_places_per_user);
     let slots = SlotPool::new(
         config.streaming_ports(),
         config.waiting_line,
-        per_address,
-        per_user,
+        config.max_places_per_address,
+        config.max_places_per_user,
         ends.clone(),
     );
     let csv = config

@@ -266,6 +266,137 @@ async fn a_viewer_that_does_not_read_costs_nothing() {
     assert_eq!(next(&mut lazy).await, Some(frame));
 }
 
+/// The number of bytes in the send queues of a server's connections, as far as the kernel tells.
+fn send_queues(server: &Server) -> usize {
+    let table = std::fs::read_to_string("/proc/net/tcp").unwrap();
+    let queue = |line: &str| {
+        let mut columns = line.split_whitespace().skip(1);
+        let (_, port) = columns.next()?.split_once(':')?;
+        let (sending, _) = columns.nth(2)?.split_once(':')?;
+        (u16::from_str_radix(port, 16).ok()? == server.port).then(|| usize::from_str_radix(sending, 16).ok())?
+    };
+    table.lines().filter_map(queue).sum()
+}
+
+#[actix_rt::test]
+async fn streams_that_nobody_reads_are_few_and_pin_little_memory() {
+    let played = Played::new(|builder| builder.set("timing.silence", 3600)).await;
+    let (_client, path) = start(&played.server).await;
+    let mut streams = Vec::new();
+    for _ in 0..8 {
+        let (viewer, mut flood) = played.connect(&path).await;
+        let frame = Message::binary(vec![0; 1 << 20]);
+        while actix_rt::time::timeout(Duration::from_millis(500), flood.send(frame.clone()))
+            .await
+            .is_ok()
+        {}
+        streams.push((viewer, flood));
+    }
+    let pinned = send_queues(&played.server);
+    // Linux doubles the limit of 256 KiB, and counts what it needs for itself.
+    assert!(pinned > 0 && pinned < 8 * (512 << 10), "{pinned} bytes");
+    let request = format!("GET {path} HTTP/1.1\r\n{UPGRADE}\r\n");
+    let answer = raw(
+        &played.server,
+        &request.replace("upgrade\r\nUp", "upgrade, close\r\nUp"),
+    )
+    .await;
+    assert!(answer.starts_with("HTTP/1.1 429 "), "{answer}");
+    assert!(
+        answer.ends_with("\r\n\r\nError: this simulation has too many open streams."),
+        "{answer}"
+    );
+    streams.pop();
+    until("one may come again", async || {
+        let url = played.server.websocket(&path);
+        let accepted = async { played.listener.accept().await.unwrap() };
+        tokio::select! {
+            refused = Client::with_headers(&url, &[]) => { assert_eq!(refused.err(), Some(429)); false }
+            _ = accepted => true
+        }
+    })
+    .await;
+}
+
+#[actix_rt::test]
+async fn nothing_is_kept_of_a_stream_whose_client_does_not_close_it() {
+    let played = Played::new(|builder| builder.set("timing.ping", 1).set("timing.silence", 2)).await;
+    let (client, path) = start(&played.server).await;
+    let files = || {
+        std::fs::read_dir(format!("/proc/{}/fd", played.server.pid()))
+            .unwrap()
+            .count()
+    };
+    let (mut viewer, webots) = played.connect(&path).await;
+    // A second one does not read.
+    let (lazy, mut flood) = played.connect(&path).await;
+    let frame = Message::binary(vec![0; 1 << 20]);
+    while actix_rt::time::timeout(Duration::from_millis(500), flood.send(frame.clone()))
+        .await
+        .is_ok()
+    {}
+    let before = files();
+    drop((webots, flood));
+    assert_eq!(next(&mut viewer).await, None);
+    // Each has a connection to its client, and one to Webots.
+    until("both are gone", async || files() <= before - 4).await;
+    drop((viewer, lazy, client));
+}
+
+#[actix_rt::test]
+async fn a_busy_webots_keeps_its_client_waiting() {
+    // Longer than any fixed limit that a handshake may have had.
+    let patience = 12;
+    let played = Played::new(|builder| builder.set("timing.answer", patience)).await;
+    let (client, path) = start(&played.server).await;
+    let url = played.server.websocket(&path);
+    let opened = actix_rt::spawn(async move { tokio_tungstenite::connect_async(url).await });
+    let (stream, _) = played.listener.accept().await.unwrap();
+    let file = played.server.url(&format!("{path}/a.png"));
+    let asked = actix_rt::spawn(async move { http::get(&file).await });
+    let (_kept, _) = played.listener.accept().await.unwrap();
+    let answer = asked.await.unwrap();
+    assert_eq!(
+        (answer.status.as_u16(), answer.text().as_str()),
+        (
+            504,
+            "Error: the simulation is busy, and did not send this file within 12 s."
+        )
+    );
+    assert!(!opened.is_finished());
+    let mut webots = tokio_tungstenite::accept_async(stream).await.unwrap();
+    let (mut viewer, _) = opened.await.unwrap().unwrap();
+    webots.send(Message::text("a scene")).await.unwrap();
+    assert_eq!(next(&mut viewer).await, Some(Message::text("a scene")));
+    // Who waits when the simulation ends gets an answer.
+    let url = played.server.websocket(&path);
+    let waits = actix_rt::spawn(async move { Client::with_headers(&url, &[]).await.err() });
+    let (_waiting, _) = played.listener.accept().await.unwrap();
+    client.close_with(1000).await;
+    let status = actix_rt::time::timeout(SOON, waits).await.expect("an answer").unwrap();
+    assert_eq!(status, Some(502));
+}
+
+#[actix_rt::test]
+async fn a_watcher_gets_its_scene_while_time_runs() {
+    let played = Played::new(|builder| builder.set("adminPassword", PASSWORD)).await;
+    let (client, _) = start(&played.server).await;
+    let path = watched_by(&played.server, &client).await;
+    let (mut watcher, mut webots) = played.connect(&path).await;
+    // Webots sends updates to everybody.
+    let update = Message::text("application/json:{}");
+    webots.send(update.clone()).await.unwrap();
+    assert_eq!(next(&mut watcher).await, Some(update.clone()));
+    for text in ["pause", "w3d;broadcast", "w3d;broadcast", "w3d", "x3d;broadcast"] {
+        watcher.send(Message::text(text)).await.unwrap();
+    }
+    for text in ["w3d;broadcast", "x3d;broadcast"] {
+        assert_eq!(next(&mut webots).await, Some(Message::text(text)), "each kind, once");
+    }
+    webots.send(update.clone()).await.unwrap();
+    assert_eq!(next(&mut watcher).await, Some(update));
+}
+
 #[actix_rt::test]
 async fn a_viewer_that_has_vanished_is_noticed_though_nothing_is_sent() {
     let Some(network) = Network::hide_from_others() else {
@@ -285,16 +416,18 @@ async fn a_viewer_that_has_vanished_is_noticed_though_nothing_is_sent() {
 async fn streams_have_connections_of_their_own() {
     let played = Played::new(|builder| builder.set("maxClients", 2)).await;
     let (client, path) = start(&played.server).await;
+    let (_other, others) = start(&played.server).await;
     let mut streams = Vec::new();
-    for _ in 0..14 {
+    for _ in 0..7 {
         streams.push(played.connect(&path).await);
+        streams.push(played.connect(&others).await);
     }
     assert_eq!(refused(&played.server, &path).await, 503);
     assert_eq!(
         http::get(&played.server.url(&format!("{path}/a.png"))).await.status,
         503
     );
-    assert_eq!(played.server.simulations().await.len(), 1);
+    assert_eq!(played.server.simulations().await.len(), 2);
     let (mut viewer, mut webots) = streams.remove(0);
     viewer.close(None).await.unwrap();
     while next(&mut webots).await.is_some() {}

@@ -39,6 +39,9 @@ pub struct Timing {
     /// Timeout of simulations when the server stops. Default: 9.
     #[serde(with = "seconds")]
     pub stop: Duration = Duration::from_secs(9),
+    /// Timeout of a simulation's answer to a request for one of its files, through the server. Default: 60.
+    #[serde(with = "seconds")]
+    pub answer: Duration = Duration::from_mins(1),
     /// Interval between two attempts to announce the server. Default: 5.
     #[serde(with = "seconds")]
     pub announce: Duration = Duration::from_secs(5),

@@ -6,9 +6,6 @@ use std::net::{Shutdown, TcpStream};
 
 use actix_web::web::Bytes;
 
-/// Maximum number of reads of a direction before other streams have their turn.
-const MAX_READS: usize = 16;
-
 /// A stream.
 pub struct Stream {
     /// From the client to Webots.
@@ -46,7 +43,8 @@ impl Stream {
         Self { up, down, _held: held }
     }
 
-    /// Copies both directions as far as possible without waiting. Returns whether it stopped to let others continue.
+    /// Copies up to a buffer in each direction, without waiting. Returns whether more can be copied once other streams have
+    /// had their turn.
     pub fn copy(&mut self, buffer: &mut [u8]) -> bool {
         let down = self.down.copy(&self.up.from, buffer);
         let up = self.up.copy(&self.down.from, buffer);
@@ -70,9 +68,11 @@ impl Direction {
         }
     }
 
-    /// Notes what epoll reports.
-    pub fn note(&mut self, source: Source) {
+    /// Notes what epoll reports. Returns whether the connection has just closed.
+    pub fn note(&mut self, source: Source) -> bool {
+        let has_closed = source == Source::Closed && self.source != Source::Closed;
         self.source = self.source.max(source);
+        has_closed
     }
 
     fn copy(&mut self, to: &TcpStream, buffer: &mut [u8]) -> bool {
@@ -89,32 +89,28 @@ impl Direction {
 
     /// An error means that this direction has ended.
     fn try_copy(&mut self, to: &TcpStream, buffer: &mut [u8]) -> io::Result<bool> {
-        for _ in 0..MAX_READS {
-            let written = write(to, &self.pending)?;
-            drop(self.pending.split_to(written));
-            if !self.pending.is_empty() || self.source == Source::Empty {
+        let written = write(to, &self.pending)?;
+        drop(self.pending.split_to(written));
+        if !self.pending.is_empty() || self.source == Source::Empty {
+            return Ok(false);
+        }
+        let length = match self.from.read(buffer) {
+            Ok(0) => return Err(ErrorKind::UnexpectedEof.into()),
+            Err(error) if error.kind() == ErrorKind::WouldBlock => {
+                self.source = Source::Empty;
                 return Ok(false);
             }
-            let length = match self.from.read(buffer) {
-                Ok(0) => return Err(ErrorKind::UnexpectedEof.into()),
-                Err(error) if error.kind() == ErrorKind::WouldBlock => {
-                    self.source = Source::Empty;
-                    return Ok(false);
-                }
-                read => read?,
-            };
-            // epoll reports what comes after a read that did not fill the buffer.
-            if length < buffer.len() && self.source == Source::Readable {
-                self.source = Source::Empty;
-            }
-            let read = buffer.get(..length).unwrap_or_default();
-            let written = write(to, read)?;
-            let rest = read.get(written..).unwrap_or_default();
-            if !rest.is_empty() {
-                self.pending = Bytes::copy_from_slice(rest);
-            }
+            read => read?,
+        };
+        // epoll reports what comes after a read that did not fill the buffer.
+        if length < buffer.len() && self.source == Source::Readable {
+            self.source = Source::Empty;
         }
-        Ok(true)
+        let read = buffer.get(..length).unwrap_or_default();
+        let written = write(to, read)?;
+        let rest = read.get(written..).unwrap_or_default();
+        self.pending = Bytes::copy_from_slice(rest);
+        Ok(rest.is_empty() && self.source != Source::Empty)
     }
 }
 

@@ -12,9 +12,6 @@ use futures_util::StreamExt;
 
 use super::stream_thread::StreamThread;
 
-/// Timeout of a simulation's answer.
-pub(super) const ANSWER_TIMEOUT: Duration = Duration::from_secs(10);
-
 /// Headers of Webots' answer that are forwarded to the client.
 const FORWARDED_HEADERS: [HeaderName; 4] = [
     header::CONTENT_TYPE,
@@ -31,17 +28,19 @@ pub struct Upstream {
     pub(super) stream_thread: Arc<StreamThread>,
     /// Time for which a simulation may leave sent data unread. Until then it goes unnoticed that its client has left.
     pub(super) silence: Duration,
+    /// Timeout of a simulation's answer to a request for a file.
+    answer: Duration,
 }
 
-/// The response if a simulation sends no valid answer in time.
+/// The response if a simulation ends, or sends no valid answer.
 pub(super) fn no_answer() -> HttpResponse {
     HttpResponse::BadGateway().body("Error: the simulation does not answer.")
 }
 
 impl Upstream {
     /// Reaches simulations at this address, and copies their streams on this thread. A simulation has `silence` to read
-    /// what was sent to it.
-    pub fn new(address: IpAddr, stream_thread: Arc<StreamThread>, silence: Duration) -> Self {
+    /// what was sent to it, and `answer` to answer a request for a file.
+    pub fn new(address: IpAddr, stream_thread: Arc<StreamThread>, silence: Duration, answer: Duration) -> Self {
         let connector = awc::Connector::new().limit(0);
         // Redirects are not followed, and the transfer of an answer may take as long as the simulation.
         let client = awc::Client::builder()
@@ -53,6 +52,7 @@ impl Upstream {
             address,
             stream_thread,
             silence,
+            answer,
         }
     }
 
@@ -71,9 +71,14 @@ impl Upstream {
         if let Some(tag) = request.headers().get(header::IF_NONE_MATCH) {
             query = query.insert_header((header::IF_NONE_MATCH, tag));
         }
-        let answer = match timeout(ANSWER_TIMEOUT, query.send()).await {
+        let answer = match timeout(self.answer, query.send()).await {
             Ok(Ok(answer)) if !answer.status().is_informational() => answer,
-            _ => return no_answer(),
+            Ok(_) => return no_answer(),
+            Err(_) => {
+                let seconds = self.answer.as_secs_f64();
+                let words = format!("Error: the simulation is busy, and did not send this file within {seconds} s.");
+                return HttpResponse::GatewayTimeout().body(words);
+            }
         };
         let mut response = HttpResponse::build(answer.status());
         for name in FORWARDED_HEADERS {

@@ -1,5 +1,6 @@
-//! The stream of a watcher: it can only request a kind of stream, which changes nothing for others.
+//! The stream of a watcher: it can only request kinds of streams, which changes nothing for others.
 
+use std::collections::HashSet;
 use std::io::{self, ErrorKind};
 
 use actix_http::ws::{Codec, Frame, Message};
@@ -15,7 +16,8 @@ use crate::shared::http::websocket::FrameReader;
 const BUFFER: usize = 16 * 1024;
 
 /// Relays between a watcher and Webots until one of them disconnects; `sent` and `answered` were read already. Webots
-/// receives only the watcher's requests for a kind of stream, and these only until it has answered.
+/// receives only the watcher's requests for a kind of stream, and each kind only once, because Webots exports its whole
+/// scene for each. What Webots sends is no sign that it has answered one: it sends updates to everybody.
 ///
 /// # Errors
 /// When one disconnects, or the watcher violates the protocol.
@@ -25,17 +27,17 @@ pub(super) async fn relay(
 ) -> io::Result<()> {
     let (mut frames, mut to_webots) = (FrameReader::default(), Codec::new().client_mode());
     let (mut from_watcher, mut from_webots) = (BytesMut::from(sent), BytesMut::from(answered));
-    let mut has_answered = false;
+    let mut requested = HashSet::new();
     loop {
-        has_answered |= !from_webots.is_empty();
         watcher.write_all(&from_webots.split()).await?;
         frames.add(&from_watcher.split());
         let mut requests = BytesMut::new();
         while let Some(frame) = frames.take().map_err(io::Error::other)? {
             match frame {
-                Frame::Text(text) if !has_answered => {
+                Frame::Text(text) => {
                     if let Ok(text) = ByteString::try_from(text)
-                        && is_view_request(&text)
+                        && let Some(kind) = requested_kind(&text)
+                        && requested.insert(kind)
                     {
                         to_webots
                             .encode(Message::Text(text), &mut requests)
@@ -59,17 +61,16 @@ pub(super) async fn relay(
     }
 }
 
-/// Whether a text requests a kind of stream, and changes nothing for others.
-fn is_view_request(text: &str) -> bool {
+/// The kind of stream that a text requests; `None` if it is another text, or may change something for others.
+fn requested_kind(text: &str) -> Option<&'static str> {
     let is_number = |text: &str| (1..5).contains(&text.len()) && text.bytes().all(|byte| byte.is_ascii_digit());
-    let is_size = |(width, height): (&str, &str)| is_number(width) && is_number(height);
-    match text.strip_suffix(";broadcast") {
-        Some("x3d" | "w3d") => true,
-        Some(other) => other
-            .strip_prefix("mjpeg: ")
-            .and_then(|size| size.split_once('x'))
-            .is_some_and(is_size),
-        None => false,
+    match text.strip_suffix(";broadcast")? {
+        "x3d" => Some("x3d"),
+        "w3d" => Some("w3d"),
+        other => {
+            let (width, height) = other.strip_prefix("mjpeg: ")?.split_once('x')?;
+            (is_number(width) && is_number(height)).then_some("mjpeg")
+        }
     }
 }
 
@@ -78,9 +79,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn nothing_else_is_a_view_request() {
-        for text in ["x3d;broadcast", "w3d;broadcast", "mjpeg: 800x600;broadcast"] {
-            assert!(is_view_request(text), "{text}");
+    fn nothing_else_requests_a_kind_of_stream() {
+        for (text, kind) in [
+            ("x3d;broadcast", "x3d"),
+            ("w3d;broadcast", "w3d"),
+            ("mjpeg: 800x600;broadcast", "mjpeg"),
+        ] {
+            assert_eq!(requested_kind(text), Some(kind), "{text}");
         }
         for text in [
             "x3d",
@@ -92,7 +97,7 @@ mod tests {
             "mjpeg: 8x6\npause;broadcast",
             ";broadcast",
         ] {
-            assert!(!is_view_request(text), "{text}");
+            assert_eq!(requested_kind(text), None, "{text}");
         }
     }
 }

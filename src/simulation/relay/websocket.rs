@@ -4,23 +4,28 @@ use std::io::{self, ErrorKind};
 
 use actix_http::ws::hash_key;
 use actix_rt::net::TcpStream;
-use actix_rt::time::timeout;
 use actix_web::http::header;
 use actix_web::web::{Bytes, BytesMut};
 use actix_web::{HttpRequest, HttpResponse};
 use actix_web_actors::ws;
 use nix::sys::socket::{setsockopt, sockopt};
+use socket2::SockRef;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 
 use super::stream::{Direction, Stream};
-use super::upstream::{ANSWER_TIMEOUT, Upstream, no_answer};
+use super::upstream::{Upstream, no_answer};
 use super::watcher;
 use crate::shared::http::{upgrade, websocket};
 
 /// Size limit of the head of a simulation's answer, in bytes.
 const MAX_HEAD: usize = 8 * 1024;
 
-/// Connects a client to the WebSocket at this path of the simulation with this port, or responds why it can't. A client
+/// Size of the kernel's buffers of each connection of a stream, in bytes; Linux doubles it, and has a limit of its own
+/// (`net.core.wmem_max`, `rmem_max`). Without it, they grow up to several MiB for a client that does not read.
+const SOCKET_BUFFER: usize = 256 * 1024;
+
+/// Connects a client to the WebSocket at this path of the simulation with this port, or responds why it can't. It waits
+/// as long as the simulation lives: while Webots reads a world it answers nobody, and once it hangs it is ended. A client
 /// that is `read_only` can only request a kind of stream. `held` is dropped with the connection.
 pub async fn connect(
     upstream: &Upstream,
@@ -33,8 +38,7 @@ pub async fn connect(
         Ok(response) => response,
         Err(error) => return websocket::refuse(&error),
     };
-    let opened = timeout(ANSWER_TIMEOUT, open(upstream, port, path, request)).await;
-    let Ok(Ok((webots, from_webots))) = opened else {
+    let Ok((webots, from_webots)) = open(upstream, port, path, request).await else {
         return no_answer();
     };
     let upgraded = upgrade(request);
@@ -42,27 +46,37 @@ pub async fn connect(
     actix_rt::spawn(async move {
         // An error: the client has left before the answer.
         let Ok(client) = upgraded.await else { return };
-        let (to_client, from_client) = (client.tcp, client.read_buffer);
+        bound_buffers(&client.tcp);
+        bound_buffers(&webots);
         let held = (held, client.permit);
         if read_only {
             // An error: one of them has left.
-            watcher::relay((to_client, from_client), (webots, from_webots))
+            watcher::relay((client.tcp, client.read_buffer), (webots, from_webots))
                 .await
                 .ok();
             return drop(held);
         }
-        let (Ok(to_client), Ok(to_webots)) = (to_client.into_std(), webots.into_std()) else {
+        let (Ok(to_client), Ok(to_webots)) = (client.tcp.into_std(), webots.into_std()) else {
             return;
         };
-        let (up, down) = (
-            Direction::new(to_client, from_client),
-            Direction::new(to_webots, from_webots),
-        );
+        let up = Direction::new(to_client, client.read_buffer);
+        let down = Direction::new(to_webots, from_webots);
         if let Err(error) = stream_thread.add(Stream::new(up, down, Box::new(held))) {
             log::warn!("a stream is not relayed: {error}");
         }
     });
     response.finish()
+}
+
+/// Bounds what the kernel keeps for a connection whose other end does not read.
+fn bound_buffers(tcp: &TcpStream) {
+    let socket = SockRef::from(tcp);
+    let bounded = socket
+        .set_send_buffer_size(SOCKET_BUFFER)
+        .and_then(|()| socket.set_recv_buffer_size(SOCKET_BUFFER));
+    if let Err(error) = bounded {
+        log::warn!("the buffers of a stream are not bounded: {error}");
+    }
 }
 
 /// Opens the WebSocket of a simulation with the key of its client's request. Returns the connection, and what was read
@@ -72,7 +86,8 @@ async fn open(upstream: &Upstream, port: u16, path: &str, request: &HttpRequest)
         .headers()
         .get(header::SEC_WEBSOCKET_KEY)
         .and_then(|key| key.to_str().ok());
-    let (address, key) = (upstream.simulation(port), key.ok_or(ErrorKind::InvalidInput)?);
+    let key = key.ok_or(ErrorKind::InvalidInput)?;
+    let address = upstream.simulation(port);
     let mut tcp = TcpStream::connect(address).await?;
     // Messages are small, and must not wait until the one before is acknowledged.
     tcp.set_nodelay(true)?;

@@ -1,9 +1,11 @@
 //! A simulation that has a slot or waits for one: its record, and the events for its session.
 
 use std::net::IpAddr;
+use std::sync::Arc;
 use std::time::SystemTime;
 
 use actix::{Message, Recipient};
+use tokio::sync::Semaphore;
 
 use crate::shared::http::Peer;
 use crate::shared::run::{seconds_since_1970, timestamp};
@@ -25,7 +27,7 @@ pub(super) struct Present {
     /// The address and the user of its client, if their slots are limited, each with its limit.
     pub parties: Vec<(Party, usize)>,
     /// The valid tokens for its stream.
-    pub accesses: Vec<(Token, Holder)>,
+    pub accesses: Vec<Access>,
     /// How it ends. Only the first report counts.
     pub how: Option<End>,
     events: Vec<String>,
@@ -43,6 +45,28 @@ pub enum SlotEvent {
     Watched(bool),
     /// The administrator stops the simulation; the text is for its client.
     Stopped(String),
+}
+
+/// Access to the stream of a simulation.
+pub(super) struct Access {
+    pub token: Token,
+    pub holder: Holder,
+    /// Limits the connections.
+    pub connections: Arc<Semaphore>,
+}
+
+/// Limit of connections with one token: a viewer has one, and for some time the ones from before its page was reloaded.
+const MAX_CONNECTIONS: usize = 8;
+
+impl Access {
+    /// A new token.
+    pub(super) fn new(holder: Holder) -> Self {
+        Self {
+            token: Token::random(),
+            holder,
+            connections: Arc::new(Semaphore::new(MAX_CONNECTIONS)),
+        }
+    }
 }
 
 /// The holder of a token for the stream of a simulation.

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use actix::Recipient;
 
-use super::present::{Holder, Present, SlotEvent};
+use super::present::{Access, Holder, Present, SlotEvent};
 use super::slot_pool::SlotPool;
 use crate::shared::domain::ProjectUrl;
 use crate::shared::http::Peer;
@@ -79,9 +79,9 @@ impl SlotLease {
 
     /// Opens the stream of the simulation, until its end is reported. Returns the token for its client.
     pub fn open_stream(&self) -> Token {
-        let token = Token::random();
-        self.slots
-            .change(self.id, |present| present.accesses.push((token, Holder::Client)));
+        let access = Access::new(Holder::Client);
+        let token = access.token;
+        self.slots.change(self.id, |present| present.accesses.push(access));
         token
     }
 }

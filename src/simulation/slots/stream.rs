@@ -2,13 +2,15 @@
 
 use std::sync::Arc;
 
-use super::present::{Holder, Present, SlotEvent};
+use tokio::sync::Semaphore;
+
+use super::present::{Access, Holder, Present, SlotEvent};
 use super::slot_pool::SlotPool;
 use crate::simulation::sessions::Token;
 use crate::simulation::simulation_id::SimulationId;
 
 /// The stream of a token.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub struct StreamTarget {
     /// The simulation.
     pub simulation: SimulationId,
@@ -16,6 +18,8 @@ pub struct StreamTarget {
     pub port: u16,
     /// Whether the token is a watcher's, which may change nothing.
     pub read_only: bool,
+    /// Limits the WebSockets with this token. Each of them holds a permit.
+    pub connections: Arc<Semaphore>,
 }
 
 /// A watcher's connection. Dropping it invalidates its token.
@@ -31,7 +35,7 @@ impl Present {
         if self
             .accesses
             .iter()
-            .filter(|(_, holder)| *holder == Holder::Watcher)
+            .filter(|access| access.holder == Holder::Watcher)
             .count()
             == 1
         {
@@ -44,12 +48,12 @@ impl SlotPool {
     /// The stream of a token, if the token is valid.
     pub fn stream(&self, token: Token) -> Option<StreamTarget> {
         self.0.lock().present.values().find_map(|one| {
-            let (_, holder) = one.accesses.iter().find(|(access, _)| *access == token)?;
-            let read_only = *holder != Holder::Client;
+            let access = one.accesses.iter().find(|access| access.token == token)?;
             Some(StreamTarget {
                 simulation: one.shown.id,
                 port: one.shown.port?,
-                read_only,
+                read_only: access.holder != Holder::Client,
+                connections: Arc::clone(&access.connections),
             })
         })
     }
@@ -58,8 +62,12 @@ impl SlotPool {
     pub fn watch(&self, simulation: SimulationId) -> Option<Token> {
         let mut slots = self.0.lock();
         let accesses = &mut slots.present.get_mut(&simulation)?.accesses;
-        let token = Token::random();
-        (!accesses.is_empty()).then(|| accesses.push((token, Holder::Invited)))?;
+        if accesses.is_empty() {
+            return None;
+        }
+        let access = Access::new(Holder::Invited);
+        let token = access.token;
+        accesses.push(access);
         Some(token)
     }
 
@@ -70,8 +78,8 @@ impl SlotPool {
         let invited = present
             .accesses
             .iter_mut()
-            .find(|access| **access == (token, Holder::Invited))?;
-        invited.1 = Holder::Watcher;
+            .find(|access| access.token == token && access.holder == Holder::Invited)?;
+        invited.holder = Holder::Watcher;
         present.notify_of_watchers(true);
         Some(WatchGuard {
             token,
@@ -85,7 +93,7 @@ impl Drop for WatchGuard {
     fn drop(&mut self) {
         self.slots.change(self.simulation, |present| {
             present.notify_of_watchers(false);
-            present.accesses.retain(|(token, _)| *token != self.token);
+            present.accesses.retain(|access| access.token != self.token);
         });
     }
 }

@@ -6,7 +6,7 @@ use actix_web::{HttpRequest, HttpResponse, web};
 
 use super::access::check_origin;
 use crate::shared::http::ConnectionKind;
-use crate::shared::http::routing::{GET, path, refuse_body};
+use crate::shared::http::routing::{GET, path, refuse_body, retry_after};
 use crate::simulation::relay::{self, Upstream};
 use crate::simulation::slots::StreamTarget;
 use crate::simulation::state::AppState;
@@ -24,6 +24,7 @@ async fn stream(request: HttpRequest, server: web::Data<AppState>) -> actix_web:
         simulation,
         port,
         read_only,
+        connections,
     } = server.slots.stream(token).ok_or_else(nothing)?;
     if let Some(refusal) = refuse_body(&request) {
         return Ok(refusal);
@@ -45,10 +46,16 @@ async fn stream(request: HttpRequest, server: web::Data<AppState>) -> actix_web:
     if !is_websocket {
         return Ok(upstream.fetch(port, &path, &request, permit).await);
     }
+    let Ok(connection) = connections.try_acquire_owned() else {
+        return Ok(HttpResponse::TooManyRequests()
+            .insert_header(retry_after())
+            .body("Error: this simulation has too many open streams."));
+    };
+    let held = (permit, connection);
     if !read_only {
-        return Ok(relay::connect(upstream, (port, &path), &request, false, permit).await);
+        return Ok(relay::connect(upstream, (port, &path), &request, false, held).await);
     }
     let guard = server.slots.start_watching(simulation, token).ok_or_else(nothing)?;
     log::info!("{simulation}: client {peer} watches");
-    Ok(relay::connect(upstream, (port, &path), &request, true, (permit, guard)).await)
+    Ok(relay::connect(upstream, (port, &path), &request, true, (held, guard)).await)
 }
