@@ -15,7 +15,7 @@ use crate::session::web::configure;
 use crate::shared::config;
 use crate::shared::domain::{ClientUrls, Reason};
 use crate::shared::http::server::{self, HttpServerOptions};
-use crate::shared::http::{BasicAuth, ConnectionLimiter, LiveUpdates, Metrics};
+use crate::shared::http::{BasicAuth, ConnectionLimiter, LiveUpdates, Metrics, SharedPage};
 use crate::shared::run::{
     AppError, Phase, ServerCommand, Signals, limit_clients, permanent, raise_open_files, service_manager, start,
 };
@@ -142,6 +142,7 @@ fn assemble(
         connections,
         metrics,
         picks,
+        monitor: SharedPage::default(),
         live: LiveUpdates::default(),
         announcement: watch::Sender::default(),
         admin_auth: config.admin_password.clone().map(BasicAuth::new),

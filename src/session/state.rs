@@ -11,7 +11,7 @@ use tokio::sync::watch;
 use super::config::SessionConfig;
 use crate::session::fleet::{FleetStatus, GetStatus, Pick, Registry};
 use crate::shared::domain::{ClientUrls, Failure, ProjectUrl, PublicAddress, Reason};
-use crate::shared::http::{BasicAuth, ConnectionKind, ConnectionLimiter, LiveUpdates, Metrics};
+use crate::shared::http::{BasicAuth, ConnectionKind, ConnectionLimiter, LiveUpdates, Metrics, SharedPage};
 use crate::shared::run::Phase;
 
 /// The label of requests for which a simulation server is chosen; the label of the others is the code of their reason.
@@ -35,6 +35,8 @@ pub struct AppState {
     pub metrics: Metrics,
     /// Counts requests for a simulation server, by outcome: [`PLACED`] or a reason.
     pub picks: prometheus::IntCounterVec,
+    /// The monitor page.
+    pub monitor: SharedPage,
     /// The open monitor pages.
     pub live: LiveUpdates,
     /// The administrator's announcement: one line of text, never markup; empty if there is none.

@@ -16,7 +16,7 @@ use super::{announcer, readiness};
 use crate::shared::domain::AdmissionRules;
 use crate::shared::http::server::{self, HttpServerOptions};
 use crate::shared::http::{
-    AddressQuota, BasicAuth, ConnectionLimiter, LiveUpdates, Metrics, STREAMS_PER_CLIENT, TCP_PER_CLIENT,
+    AddressQuota, BasicAuth, ConnectionLimiter, LiveUpdates, Metrics, STREAMS_PER_CLIENT, SharedPage, TCP_PER_CLIENT,
 };
 use crate::shared::run::{
     AppError, Phase, ServerCommand, Signals, limit_clients, permanent, raise_open_files, service_manager, start,
@@ -260,6 +260,7 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
         starts,
         // Each start costs a checkout and a Webots. The quota lets a class take all slots, and then reload its pages.
         start_quota: AddressQuota::new(200.max(2 * u32::from(config.max_connections)), 60),
+        monitor: SharedPage::default(),
         live: LiveUpdates::default(),
         administrators: LiveUpdates::default(),
         usage: UsageMonitor::default(),

@@ -12,7 +12,7 @@ use super::readiness::FailedStarts;
 use super::sessions::Sessions;
 use super::slots::SlotPool;
 use crate::shared::domain::{AdmissionRules, Load, ProjectUrl};
-use crate::shared::http::{AddressQuota, BasicAuth, ConnectionLimiter, LiveUpdates, Metrics};
+use crate::shared::http::{AddressQuota, BasicAuth, ConnectionLimiter, LiveUpdates, Metrics, SharedPage};
 use crate::shared::run::Phase;
 use crate::simulation::checkout::CheckoutService;
 use crate::simulation::container::ContainerService;
@@ -70,6 +70,8 @@ pub struct AppState {
     pub metrics: Metrics,
     /// Counts requests for simulations, by outcome.
     pub starts: prometheus::IntCounterVec,
+    /// The monitor page of visitors without the password.
+    pub monitor: SharedPage,
     /// The open monitor pages.
     pub live: LiveUpdates,
     /// The open monitor pages of administrators, which show more.

@@ -1,5 +1,7 @@
 //! Requests by which a client could hold a connection or cost much, on both servers.
 
+use std::time::{Duration, Instant};
+
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -83,6 +85,42 @@ async fn guesses_from_many_addresses_lock_no_administrator_out() {
     assert_eq!(answers.matches("HTTP/1.1 200 ").count(), 10_301);
     let answer = get_as_administrator(&server.url("/sign-in")).await;
     assert_eq!(answer.status.as_u16(), 303, "{}", answer.text());
+}
+
+#[actix_rt::test]
+async fn a_monitor_that_has_not_changed_is_not_sent_again() {
+    for server in [session_server(&[]).start().await, demo_server(1).start().await] {
+        let url = server.url("/monitor");
+        until("the browser's page is still the current one", async || {
+            let page = http::get(&url).await;
+            assert_eq!(page.header("cache-control"), Some("private, no-cache"));
+            let tag = page.header("etag").unwrap().to_owned();
+            let again = awc::Client::new()
+                .get(&url)
+                .insert_header(("if-none-match", tag.as_str()));
+            again.send().await.unwrap().status() == 304
+        })
+        .await;
+        let other = awc::Client::new().get(&url).insert_header(("if-none-match", "\"x\""));
+        assert_eq!(other.send().await.unwrap().status(), 200);
+    }
+}
+
+#[actix_rt::test]
+async fn a_monitor_that_is_requested_in_a_row_is_rendered_ten_times_a_second() {
+    let server = session_server(&[]).start().await;
+    let url = server.url("/monitor");
+    http::get(&url).await;
+    let begin = Instant::now();
+    for _ in 0..10 {
+        http::get(&url).await;
+    }
+    assert!(begin.elapsed() > Duration::from_millis(950), "{:?}", begin.elapsed());
+    // Many visitors share a rendering.
+    let begin = Instant::now();
+    let all = futures_util::future::join_all((0..100).map(|_| http::get(&url))).await;
+    assert!(all.iter().all(|page| page.status == 200));
+    assert!(begin.elapsed() < Duration::from_secs(5), "{:?}", begin.elapsed());
 }
 
 #[actix_rt::test]

@@ -38,15 +38,17 @@ pub fn configure(app: &mut web::ServiceConfig) {
         .service(path("/assets/{name}", READ, asset));
 }
 
-async fn monitor(server: web::Data<AppState>) -> Result<HttpResponse> {
-    let view = view(&server, &*server.status().await?).map_err(ErrorInternalServerError)?;
-    let started = timestamp(SystemTime::now() - server.started.elapsed());
-    let page = Monitor {
-        started,
-        has_actions: server.admin_auth.is_some(),
-        view,
+async fn monitor(request: HttpRequest, server: web::Data<AppState>) -> Result<HttpResponse> {
+    let page = async {
+        let view = view(&server, &*server.status().await?).map_err(ErrorInternalServerError)?;
+        let page = Monitor {
+            started: timestamp(SystemTime::now() - server.started.elapsed()),
+            has_actions: server.admin_auth.is_some(),
+            view,
+        };
+        page.render().map_err(ErrorInternalServerError)
     };
-    Ok(html(page.render(), OWN_FILES))
+    server.monitor.answer(&request, OWN_FILES, page).await
 }
 
 async fn events(request: HttpRequest, server: web::Data<AppState>) -> Result<HttpResponse> {

@@ -1,7 +1,14 @@
-//! Responses with pages: their type, and headers that restrict them to what they need.
+//! Responses with pages: their type, headers that restrict them to what they need, and a page that is rendered for all
+//! its visitors.
 
-use actix_web::HttpResponse;
-use actix_web::http::header;
+use std::hash::{DefaultHasher, Hash, Hasher};
+use std::time::{Duration, Instant};
+
+use actix_web::http::header::{self, EntityTag, IfNoneMatch};
+use actix_web::web::Bytes;
+use actix_web::{HttpMessage, HttpRequest, HttpResponse, HttpResponseBuilder};
+use tokio::sync::Mutex;
+use tokio::time::sleep_until;
 
 /// The policy (`Content-Security-Policy`) of a page that loads only files of its own server, and no inline script or
 /// style.
@@ -37,12 +44,89 @@ pub fn width(percent: &f64) -> String {
 /// Answers with a page and its policy.
 pub fn html(page: Result<String, askama::Error>, policy: &str) -> HttpResponse {
     match page {
-        Ok(page) => HttpResponse::Ok()
-            .insert_header((header::CONTENT_SECURITY_POLICY, policy))
-            .insert_header((header::REFERRER_POLICY, "no-referrer"))
-            .insert_header(("Cross-Origin-Opener-Policy", "same-origin"))
-            .content_type("text/html; charset=utf-8")
-            .body(page),
+        Ok(page) => restricted(policy).body(page),
         Err(error) => HttpResponse::InternalServerError().body(format!("Error: {error}.")),
+    }
+}
+
+fn restricted(policy: &str) -> HttpResponseBuilder {
+    let mut response = HttpResponse::Ok();
+    response
+        .insert_header((header::CONTENT_SECURITY_POLICY, policy))
+        .insert_header((header::REFERRER_POLICY, "no-referrer"))
+        .insert_header(("Cross-Origin-Opener-Policy", "same-origin"))
+        .content_type("text/html; charset=utf-8");
+    response
+}
+
+/// Interval between two renderings of a page. Requests in between wait and share the next one, so that no request gets what
+/// has changed since, and requests in a row cost little.
+const PERIOD: Duration = Duration::from_millis(100);
+
+/// A page that all its visitors share.
+#[derive(Default)]
+pub struct SharedPage(Mutex<Option<Rendered>>);
+
+/// A page as it was rendered last.
+struct Rendered {
+    /// When this began.
+    at: Instant,
+    html: Bytes,
+    tag: EntityTag,
+}
+
+impl SharedPage {
+    /// Answers with the page and its policy; with 304 if the client has it (`If-None-Match`). `render` is used unless the
+    /// page was rendered for another request that was waiting, too.
+    ///
+    /// # Errors
+    /// When it can't be rendered.
+    pub async fn answer(
+        &self,
+        request: &HttpRequest,
+        policy: &str,
+        render: impl Future<Output = actix_web::Result<String>>,
+    ) -> actix_web::Result<HttpResponse> {
+        let asked = Instant::now();
+        let mut last = self.0.lock().await;
+        let rendered = match last.take() {
+            Some(shared) if shared.at >= asked => shared,
+            before => {
+                let next = before.map(|before| before.at + PERIOD);
+                sleep_until(next.unwrap_or(asked).into()).await;
+                let at = Instant::now();
+                Rendered::new(at, render.await?)
+            }
+        };
+        let rendered = last.insert(rendered);
+        let is_known = request.get_header::<IfNoneMatch>().is_some_and(|known| match known {
+            IfNoneMatch::Any => true,
+            IfNoneMatch::Items(tags) => tags.iter().any(|tag| tag.weak_eq(&rendered.tag)),
+        });
+        let mut response = if is_known {
+            HttpResponse::NotModified()
+        } else {
+            restricted(policy)
+        };
+        response.insert_header(header::ETag(rendered.tag.clone()));
+        // Browsers may keep it, and ask each time whether it has changed.
+        response.insert_header((header::CACHE_CONTROL, "private, no-cache"));
+        Ok(if is_known {
+            response.finish()
+        } else {
+            response.body(rendered.html.clone())
+        })
+    }
+}
+
+impl Rendered {
+    fn new(at: Instant, html: String) -> Self {
+        let mut hasher = DefaultHasher::new();
+        html.hash(&mut hasher);
+        Self {
+            at,
+            tag: EntityTag::new_strong(format!("{:016x}", hasher.finish())),
+            html: html.into(),
+        }
     }
 }

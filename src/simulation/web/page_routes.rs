@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 
 use actix_files::NamedFile;
-use actix_web::error::ErrorNotFound;
+use actix_web::error::{ErrorInternalServerError, ErrorNotFound};
 use actix_web::http::header::{self, HeaderValue};
 use actix_web::{HttpRequest, HttpResponse, web};
 use askama::Template;
@@ -63,10 +63,18 @@ pub fn configure(app: &mut web::ServiceConfig) {
 
 async fn monitor(request: HttpRequest, server: web::Data<AppState>) -> actix_web::Result<HttpResponse> {
     let visitor = Visitor::of(&request, &server)?;
-    let page = view(&server, visitor)
-        .await
-        .and_then(|view| pages::monitor(&server, &view, visitor));
-    Ok(html(page, OWN_FILES))
+    let page = async {
+        let view = view(&server, visitor).await?;
+        pages::monitor(&server, &view, visitor)
+    };
+    if visitor == Visitor::Administrator {
+        return Ok(html(page.await, OWN_FILES));
+    }
+    let page = async {
+        page.await
+            .map_err(|error| ErrorInternalServerError(format!("Error: {error}.")))
+    };
+    server.monitor.answer(&request, OWN_FILES, page).await
 }
 
 async fn view(server: &AppState, visitor: Visitor) -> Result<PageView, askama::Error> {
@@ -186,11 +194,11 @@ async fn watch(
     let found = one.and_then(|one| Some((one, server.slots.watch(one.id)?)));
     let (one, token) = found.ok_or_else(|| ErrorNotFound("Error: this simulation does not stream."))?;
     let installed = webots_viewer::folder(&server.config).map(|_| webots_viewer::PATH);
-    let (stream, script) = (
-        format!("stream/{}", token.reveal()),
-        installed.filter(|_| which.viewer != "small"),
-    );
-    let page = Watch { one, stream, script };
+    let page = Watch {
+        one,
+        stream: format!("stream/{}", token.reveal()),
+        script: installed.filter(|_| which.viewer != "small"),
+    };
     Ok(html(page.render(), VIEWER))
 }
 
