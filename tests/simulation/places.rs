@@ -9,6 +9,43 @@ use super::scene::nothing_left;
 use crate::support::{Client, arm, demo_server, until};
 
 #[actix_rt::test]
+async fn simulations_left_behind_make_room_for_who_waits() {
+    let server = demo_server(8).start().await;
+    let leave_behind = async |address| {
+        let client = Client::from_address(&server, address).await.unwrap();
+        let (client, token) = client.start_resumable().await;
+        drop(client);
+        token
+    };
+    let mut tokens = Vec::new();
+    for _ in 0..7 {
+        tokens.push(leave_behind("203.0.113.1").await);
+    }
+    let neighbour = leave_behind("203.0.113.2").await;
+    server.until_away(8).await;
+    // Somebody who asks gets a slot as soon as a simulation has ended, though each would wait a minute for its client.
+    let mut others = Vec::new();
+    for _ in 0..5 {
+        let mut other = Client::start_from(&server, "203.0.113.3", &arm()).await;
+        other.until("webots:").await;
+        others.push(other);
+    }
+    // A quarter of the slots remains for the clients of one address that were away, those that left last.
+    let mut waits = Client::start_from(&server, "203.0.113.3", &arm()).await;
+    assert_eq!(waits.until("queue:").await, "queue: 0");
+    let mut back = Client::resuming(&server, &tokens[5]).await;
+    back.until("webots:").await;
+    back.close_with(1000).await;
+    waits.until("webots:").await;
+    let mut late = Client::resuming(&server, &tokens[0]).await;
+    let told = late.until("loading: Error:").await;
+    assert!(told.contains("Others wait for a place"), "{told}");
+    for token in [&tokens[6], &neighbour] {
+        Client::resuming(&server, token).await.until("webots:").await;
+    }
+}
+
+#[actix_rt::test]
 async fn the_waiting_line_is_served_in_order_and_forgets_who_leaves() {
     let server = demo_server(2).set("waitingLine", 4).start().await;
     // A class behind one address gets all free slots and the whole queue.

@@ -254,6 +254,13 @@ impl Handler<SlotEvent> for Session {
                 self.end(EndReason::Administrator, "The administrator has stopped it");
                 self.finish(protocol::error(&why), &why, CloseCode::Normal, ctx);
             }
+            // Its client may have come back meanwhile.
+            SlotEvent::MakeRoom if self.client.is_none() => {
+                let why = "Others wait for a place, and your address has left several simulations behind";
+                self.end(EndReason::Left, why);
+                self.finish(protocol::error(why), why, CloseCode::Normal, ctx);
+            }
+            SlotEvent::MakeRoom => {}
         }
     }
 }

@@ -28,6 +28,8 @@ pub(super) struct Present {
     pub parties: Vec<(Party, usize)>,
     /// The valid tokens for its stream.
     pub accesses: Vec<Access>,
+    /// Whether it was told to make room for a client that waits.
+    pub makes_room: bool,
     /// How it ends. Only the first report counts.
     pub how: Option<End>,
     events: Vec<String>,
@@ -45,6 +47,8 @@ pub enum SlotEvent {
     Watched(bool),
     /// The administrator stops the simulation; the text is for its client.
     Stopped(String),
+    /// Another client waits for a slot, and too many simulations of the address wait for clients that are away.
+    MakeRoom,
 }
 
 /// Access to the stream of a simulation.
@@ -117,11 +121,17 @@ impl Present {
             client,
             parties: Vec::new(),
             accesses: Vec::new(),
+            makes_room: false,
             how: None,
             events: Vec::new(),
         };
         present.note(&event);
         present
+    }
+
+    /// Whether it has a slot and waits for its client, which has lost its connection.
+    pub(super) fn is_away(&self) -> bool {
+        self.shown.port.is_some() && self.shown.away_until.is_some()
     }
 
     /// Grants it a port.

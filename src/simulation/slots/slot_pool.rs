@@ -6,7 +6,7 @@
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::io::ErrorKind;
-use std::net::{Ipv4Addr, Ipv6Addr, TcpListener};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, TcpListener};
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 use std::time::Duration;
@@ -82,7 +82,8 @@ impl SlotPool {
             .zip(slots.per_address);
         let user = present.shown.identity.user.clone().map(Party::User).zip(slots.per_user);
         present.parties = address.into_iter().chain(user).collect();
-        let (id, refusal) = (present.shown.id, slots.refusal(&present));
+        let id = present.shown.id;
+        let refusal = slots.refusal(&present);
         slots.present.insert(id, present);
         slots.grant();
         if let Some(refusal) = refusal
@@ -146,8 +147,8 @@ impl Slots {
         self.present.values().filter(|one| one.shown.port.is_none())
     }
 
-    /// The first simulation in the queue whose client's address and user may have another slot.
-    fn next_in_queue(&self) -> Option<SimulationId> {
+    /// The simulations in the queue whose client's address and user may have another slot.
+    fn eligible(&self) -> impl Iterator<Item = &Present> {
         let mut lent: HashMap<&Party, usize> = HashMap::new();
         for (party, _) in self
             .present
@@ -157,10 +158,14 @@ impl Slots {
         {
             *lent.entry(party).or_default() += 1;
         }
-        let may_have_one = |(party, most): &(Party, usize)| lent.get(party).is_none_or(|slots| slots < most);
-        self.queue()
-            .find(|waiting| waiting.parties.iter().all(may_have_one))
-            .map(|waiting| waiting.shown.id)
+        self.queue().filter(move |waiting| {
+            let may_have_one = |(party, most): &(Party, usize)| lent.get(party).is_none_or(|slots| slots < most);
+            waiting.parties.iter().all(may_have_one)
+        })
+    }
+
+    fn next_in_queue(&self) -> Option<SimulationId> {
+        self.eligible().next().map(|next| next.shown.id)
     }
 
     /// Why one more simulation may not wait, as text for its client; `None` if it may.
@@ -173,7 +178,8 @@ impl Slots {
                 return Some(party.0.refusal(all - waiting, waiting));
             }
         }
-        let (places, waiting) = (self.ports.len(), self.queue().count());
+        let places = self.ports.len();
+        let waiting = self.queue().count();
         (waiting >= self.queue_capacity).then(|| {
             format!(
                 "All {places} places of this simulation server are taken, and {waiting} clients are waiting already. Try \
@@ -182,9 +188,10 @@ impl Slots {
         })
     }
 
-    /// Grants free slots to the clients in the queue, and sends the others their position.
+    /// Grants free slots to the clients in the queue, makes room for the others, and sends them their position.
     fn serve(&mut self) {
         self.grant();
+        self.make_room();
         for (ahead, waiting) in self
             .present
             .values_mut()
@@ -204,6 +211,39 @@ impl Slots {
         {
             first.lend(port);
         }
+    }
+
+    /// While clients wait because all slots are taken, ends simulations that wait for their own clients: one for each, the
+    /// longest absent first, of addresses for which more than a quarter of the slots waits. So somebody who leaves one
+    /// simulation after the other can't keep all slots.
+    fn make_room(&mut self) {
+        let waiting = self.eligible().count();
+        if waiting == 0 || self.free_port().is_some() {
+            return;
+        }
+        let leaving = self.present.values().filter(|one| one.is_away() && one.makes_room);
+        for _ in leaving.count()..waiting {
+            let Some(longest_away) = self.longest_away() else {
+                return;
+            };
+            longest_away.makes_room = true;
+            longest_away.listener.do_send(SlotEvent::MakeRoom);
+        }
+    }
+
+    /// The simulation that waits for its client the longest, of addresses for which more than their share waits.
+    fn longest_away(&mut self) -> Option<&mut Present> {
+        let share = (self.ports.len() / 4).max(1);
+        let mut away: HashMap<IpAddr, usize> = HashMap::new();
+        let address = |one: &Present| one.client.rate_limit_key().filter(|_| one.is_away() && !one.makes_room);
+        for address in self.present.values().filter_map(address) {
+            *away.entry(address).or_default() += 1;
+        }
+        let has_too_many = |one: &&mut Present| address(one).is_some_and(|address| away.get(&address) > Some(&share));
+        self.present
+            .values_mut()
+            .filter(has_too_many)
+            .min_by_key(|one| one.shown.away_until)
     }
 
     /// The lowest port that is neither leased nor used by another program.
