@@ -378,6 +378,47 @@ async fn a_busy_webots_keeps_its_client_waiting() {
 }
 
 #[actix_rt::test]
+async fn a_stream_that_the_server_ends_is_closed_with_1000_and_the_reason() {
+    // Webots' own code when it is told to end is 1001.
+    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/support/going_away.py");
+    let webots = || Webots::script(&format!("exec python3 '{script}' \"$@\""));
+    let change = |builder: Builder| builder.set("isolation", "none").set("adminPassword", PASSWORD);
+    let close = async |viewer: &mut Socket<MaybeTlsStream<TcpStream>>| loop {
+        match next(viewer).await {
+            Some(Message::Close(Some(close))) => return (u16::from(close.code), close.reason.to_string()),
+            Some(Message::Text(text)) => assert_eq!(text.as_str(), "an update", "a whole frame"),
+            other => panic!("{other:?}"),
+        }
+    };
+    let server = relaying(webots(), change).await;
+    let (client, path) = start(&server).await;
+    let (mut viewer, _) = tokio_tungstenite::connect_async(server.websocket(&path)).await.unwrap();
+    assert_eq!(next(&mut viewer).await, Some(Message::text("an update")));
+    let stop = server.url(&format!("/simulations/{}/stop", client.id()));
+    assert_eq!(http::post(&stop, Some(PASSWORD), "").await, 202);
+    let reason = "The administrator has stopped it".to_owned();
+    assert_eq!(close(&mut viewer).await, (1000, reason));
+
+    let (client, path) = start(&server).await;
+    let (mut viewer, _) = tokio_tungstenite::connect_async(server.websocket(&path)).await.unwrap();
+    assert_eq!(next(&mut viewer).await, Some(Message::text("an update")));
+    let all = server.simulations().await;
+    let pid = all.iter().find(|one| one["id"] == client.id()).unwrap()["pid"]
+        .as_i64()
+        .unwrap();
+    let webots = nix::unistd::Pid::from_raw(pid.try_into().unwrap());
+    nix::sys::signal::kill(webots, nix::sys::signal::Signal::SIGTERM).unwrap();
+    assert_eq!(close(&mut viewer).await, (1001, String::new()), "not the server's will");
+    drop(client);
+
+    let (_client, path) = start(&server).await;
+    let (mut viewer, _) = tokio_tungstenite::connect_async(server.websocket(&path)).await.unwrap();
+    assert_eq!(next(&mut viewer).await, Some(Message::text("an update")));
+    server.signal(nix::sys::signal::Signal::SIGTERM);
+    assert_eq!(close(&mut viewer).await, (1000, "The server was stopped".to_owned()));
+}
+
+#[actix_rt::test]
 async fn a_watcher_gets_its_scene_while_time_runs() {
     let played = Played::new(|builder| builder.set("adminPassword", PASSWORD)).await;
     let (client, _) = start(&played.server).await;

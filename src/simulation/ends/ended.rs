@@ -59,6 +59,14 @@ impl EndReason {
             .map_or("", |(_, label)| label)
     }
 
+    /// Whether the server or the client wants the end. Otherwise something has failed, or Webots has ended by itself.
+    pub fn is_intended(self) -> bool {
+        matches!(
+            self,
+            Self::Left | Self::TimeLimit | Self::Idle | Self::Stopped | Self::Administrator
+        )
+    }
+
     /// Whether an administrator may have to find its cause, so that its events are kept even without output. A failed
     /// checkout does not count.
     pub fn is_abnormal(self) -> bool {

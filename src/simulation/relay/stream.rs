@@ -1,10 +1,14 @@
 //! One stream between a client and its Webots. The bytes are copied as they are: frames, their kinds and close codes are not
-//! parsed. Each direction is read only as fast as the other end takes it.
+//! parsed, except for the last frame of a simulation that the server ends. Each direction is read only as fast as the
+//! other end takes it.
 
 use std::io::{self, ErrorKind, Read, Write};
 use std::net::{Shutdown, TcpStream};
+use std::sync::{Arc, OnceLock};
 
 use actix_web::web::Bytes;
+
+use super::last_frame::LastFrame;
 
 /// A stream.
 pub struct Stream {
@@ -12,6 +16,8 @@ pub struct Stream {
     pub up: Direction,
     /// From Webots to the client.
     pub down: Direction,
+    /// Why the server ends the simulation, once it does.
+    ending: Arc<OnceLock<String>>,
     /// Dropped with the stream.
     _held: Box<dyn Send>,
 }
@@ -22,6 +28,8 @@ pub struct Direction {
     pub from: TcpStream,
     /// Data that was read and is not yet written.
     pending: Bytes,
+    /// What may be the last frame, while the server ends the simulation.
+    last: Option<LastFrame>,
     source: Source,
     has_ended: bool,
 }
@@ -38,16 +46,22 @@ pub enum Source {
 }
 
 impl Stream {
-    /// A stream with these directions. `held` is dropped with it.
-    pub fn new(up: Direction, down: Direction, held: Box<dyn Send>) -> Self {
-        Self { up, down, _held: held }
+    /// A stream with these directions. `ending` tells why the server ends the simulation; `held` is dropped with the stream.
+    pub fn new(up: Direction, down: Direction, ending: Arc<OnceLock<String>>, held: Box<dyn Send>) -> Self {
+        Self {
+            up,
+            down,
+            ending,
+            _held: held,
+        }
     }
 
     /// Copies up to a buffer in each direction, without waiting. Returns whether more can be copied once other streams have
     /// had their turn.
     pub fn copy(&mut self, buffer: &mut [u8]) -> bool {
-        let down = self.down.copy(&self.up.from, buffer);
-        let up = self.up.copy(&self.down.from, buffer);
+        let ending = self.ending.get().map(String::as_str);
+        let down = self.down.copy(&self.up.from, ending, buffer);
+        let up = self.up.copy(&self.down.from, None, buffer);
         up || down
     }
 
@@ -63,6 +77,7 @@ impl Direction {
         Self {
             from,
             pending,
+            last: None,
             source: Source::Readable,
             has_ended: false,
         }
@@ -75,11 +90,11 @@ impl Direction {
         has_closed
     }
 
-    fn copy(&mut self, to: &TcpStream, buffer: &mut [u8]) -> bool {
+    fn copy(&mut self, to: &TcpStream, ending: Option<&str>, buffer: &mut [u8]) -> bool {
         if self.has_ended {
             return false;
         }
-        self.try_copy(to, buffer).unwrap_or_else(|_| {
+        self.try_copy(to, ending, buffer).unwrap_or_else(|_| {
             self.has_ended = true;
             // That end then closes, and the other direction ends, too. An error: it has closed already.
             to.shutdown(Shutdown::Write).ok();
@@ -88,25 +103,34 @@ impl Direction {
     }
 
     /// An error means that this direction has ended.
-    fn try_copy(&mut self, to: &TcpStream, buffer: &mut [u8]) -> io::Result<bool> {
+    fn try_copy(&mut self, to: &TcpStream, ending: Option<&str>, buffer: &mut [u8]) -> io::Result<bool> {
         let written = write(to, &self.pending)?;
         drop(self.pending.split_to(written));
         if !self.pending.is_empty() || self.source == Source::Empty {
             return Ok(false);
         }
         let length = match self.from.read(buffer) {
-            Ok(0) => return Err(ErrorKind::UnexpectedEof.into()),
             Err(error) if error.kind() == ErrorKind::WouldBlock => {
                 self.source = Source::Empty;
                 return Ok(false);
             }
-            read => read?,
+            Ok(0) | Err(_) => {
+                let last = self.last.take().ok_or(ErrorKind::UnexpectedEof)?;
+                self.pending = last.finish();
+                return Ok(true);
+            }
+            Ok(length) => length,
         };
         // epoll reports what comes after a read that did not fill the buffer.
         if length < buffer.len() && self.source == Source::Readable {
             self.source = Source::Empty;
         }
-        let read = buffer.get(..length).unwrap_or_default();
+        let mut read = buffer.get(..length).unwrap_or_default();
+        let passed;
+        if let Some(reason) = ending {
+            passed = self.last.get_or_insert_with(|| LastFrame::new(reason)).pass(read);
+            read = &passed;
+        }
         let written = write(to, read)?;
         let rest = read.get(written..).unwrap_or_default();
         self.pending = Bytes::copy_from_slice(rest);

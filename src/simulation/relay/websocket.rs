@@ -16,6 +16,7 @@ use super::stream::{Direction, Stream};
 use super::upstream::{Upstream, no_answer};
 use super::watcher;
 use crate::shared::http::{upgrade, websocket};
+use crate::simulation::slots::StreamTarget;
 
 /// Size limit of the head of a simulation's answer, in bytes.
 const MAX_HEAD: usize = 8 * 1024;
@@ -24,21 +25,21 @@ const MAX_HEAD: usize = 8 * 1024;
 /// (`net.core.wmem_max`, `rmem_max`). Without it, they grow up to several MiB for a client that does not read.
 const SOCKET_BUFFER: usize = 256 * 1024;
 
-/// Connects a client to the WebSocket at this path of the simulation with this port, or responds why it can't. It waits
-/// as long as the simulation lives: while Webots reads a world it answers nobody, and once it hangs it is ended. A client
-/// that is `read_only` can only request a kind of stream. `held` is dropped with the connection.
+/// Connects a client to the WebSocket at this path of a simulation, or responds why it can't. It waits as long as the
+/// simulation lives: while Webots reads a world it answers nobody, and once it hangs it is ended. A client that is
+/// `read_only` can only request a kind of stream. `held` is dropped with the connection.
 pub async fn connect(
     upstream: &Upstream,
-    (port, path): (u16, &str),
+    target: StreamTarget,
+    path: &str,
     request: &HttpRequest,
-    read_only: bool,
     held: impl Send + 'static,
 ) -> HttpResponse {
     let mut response = match ws::handshake(request) {
         Ok(response) => response,
         Err(error) => return websocket::refuse(&error),
     };
-    let Ok((webots, from_webots)) = open(upstream, port, path, request).await else {
+    let Ok((webots, from_webots)) = open(upstream, target.port, path, request).await else {
         return no_answer();
     };
     let upgraded = upgrade(request);
@@ -49,7 +50,7 @@ pub async fn connect(
         bound_buffers(&client.tcp);
         bound_buffers(&webots);
         let held = (held, client.permit);
-        if read_only {
+        if target.read_only {
             // An error: one of them has left.
             watcher::relay((client.tcp, client.read_buffer), (webots, from_webots))
                 .await
@@ -61,7 +62,7 @@ pub async fn connect(
         };
         let up = Direction::new(to_client, client.read_buffer);
         let down = Direction::new(to_webots, from_webots);
-        if let Err(error) = stream_thread.add(Stream::new(up, down, Box::new(held))) {
+        if let Err(error) = stream_thread.add(Stream::new(up, down, target.ending, Box::new(held))) {
             log::warn!("a stream is not relayed: {error}");
         }
     });

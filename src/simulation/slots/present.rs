@@ -1,7 +1,7 @@
 //! A simulation that has a slot or waits for one: its record, and the events for its session.
 
 use std::net::IpAddr;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 use std::time::SystemTime;
 
 use actix::{Message, Recipient};
@@ -28,6 +28,8 @@ pub(super) struct Present {
     pub parties: Vec<(Party, usize)>,
     /// The valid tokens for its stream.
     pub accesses: Vec<Access>,
+    /// Why the server ends it, once it does, as text for those at its streams.
+    pub ending: Arc<OnceLock<String>>,
     /// Whether it was told to make room for a client that waits.
     pub makes_room: bool,
     /// How it ends. Only the first report counts.
@@ -121,6 +123,7 @@ impl Present {
             client,
             parties: Vec::new(),
             accesses: Vec::new(),
+            ending: Arc::default(),
             makes_room: false,
             how: None,
             events: Vec::new(),

@@ -64,6 +64,13 @@ impl SlotLease {
         self.slots.change(self.id, |present| present.note(shown));
     }
 
+    /// Notes why the server is about to end the simulation: those at its streams are told when Webots closes these.
+    pub fn ending(&self, why: &str) {
+        self.slots.change(self.id, |present| {
+            present.ending.get_or_init(|| why.to_owned());
+        });
+    }
+
     /// Reports how the simulation ends, before the lease is dropped. Only the first report counts. Its tokens become
     /// invalid, because another simulation may soon have its port.
     pub fn end(&self, reason: EndReason, why: &str, taken: Taken) {

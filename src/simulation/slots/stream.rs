@@ -1,6 +1,6 @@
 //! The streams of running simulations and their tokens: for simulations' clients, and for watching administrators.
 
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use tokio::sync::Semaphore;
 
@@ -20,6 +20,8 @@ pub struct StreamTarget {
     pub read_only: bool,
     /// Limits the WebSockets with this token. Each of them holds a permit.
     pub connections: Arc<Semaphore>,
+    /// Why the server ends the simulation, once it does.
+    pub ending: Arc<OnceLock<String>>,
 }
 
 /// A watcher's connection. Dropping it invalidates its token.
@@ -54,6 +56,7 @@ impl SlotPool {
                 port: one.shown.port?,
                 read_only: access.holder != Holder::Client,
                 connections: Arc::clone(&access.connections),
+                ending: Arc::clone(&one.ending),
             })
         })
     }

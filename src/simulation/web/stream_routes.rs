@@ -1,5 +1,7 @@
 //! The streams of simulations, `/stream/TOKEN/...`: WebSockets, and the files that Webots serves.
 
+use std::sync::Arc;
+
 use actix_web::error::ErrorNotFound;
 use actix_web::http::header;
 use actix_web::{HttpRequest, HttpResponse, web};
@@ -8,7 +10,6 @@ use super::access::check_origin;
 use crate::shared::http::ConnectionKind;
 use crate::shared::http::routing::{GET, path, refuse_body, retry_after};
 use crate::simulation::relay::{self, Upstream};
-use crate::simulation::slots::StreamTarget;
 use crate::simulation::state::AppState;
 
 /// Adds the paths to an app.
@@ -20,12 +21,7 @@ async fn stream(request: HttpRequest, server: web::Data<AppState>) -> actix_web:
     let nothing = || ErrorNotFound("Error: there is no such stream.");
     // The path as the client has sent it: what is percent-encoded stays so.
     let (token, path) = relay::parse_path(request.uri().path()).ok_or_else(nothing)?;
-    let StreamTarget {
-        simulation,
-        port,
-        read_only,
-        connections,
-    } = server.slots.stream(token).ok_or_else(nothing)?;
+    let target = server.slots.stream(token).ok_or_else(nothing)?;
     if let Some(refusal) = refuse_body(&request) {
         return Ok(refusal);
     }
@@ -44,18 +40,19 @@ async fn stream(request: HttpRequest, server: web::Data<AppState>) -> actix_web:
         .query()
         .map_or(path.to_owned(), |query| format!("{path}?{query}"));
     if !is_websocket {
-        return Ok(upstream.fetch(port, &path, &request, permit).await);
+        return Ok(upstream.fetch(target.port, &path, &request, permit).await);
     }
-    let Ok(connection) = connections.try_acquire_owned() else {
+    let Ok(connection) = Arc::clone(&target.connections).try_acquire_owned() else {
         return Ok(HttpResponse::TooManyRequests()
             .insert_header(retry_after())
             .body("Error: this simulation has too many open streams."));
     };
     let held = (permit, connection);
-    if !read_only {
-        return Ok(relay::connect(upstream, (port, &path), &request, false, held).await);
+    if !target.read_only {
+        return Ok(relay::connect(upstream, target, &path, &request, held).await);
     }
-    let guard = server.slots.start_watching(simulation, token).ok_or_else(nothing)?;
-    log::info!("{simulation}: client {peer} watches");
-    Ok(relay::connect(upstream, (port, &path), &request, true, (held, guard)).await)
+    let watching = server.slots.start_watching(target.simulation, token);
+    let guard = watching.ok_or_else(nothing)?;
+    log::info!("{}: client {peer} watches", target.simulation);
+    Ok(relay::connect(upstream, target, &path, &request, (held, guard)).await)
 }

@@ -214,6 +214,9 @@ impl Webots {
             &format!("ending: {why}"),
         );
         self.stopped_for = Some((kind, why.to_owned()));
+        if kind.is_intended() {
+            self.spec.slot.lease.ending(why);
+        }
         self.spec.slot.lease.update(|one| one.stage = Stage::Stopping);
         if kind == EndReason::Limit {
             self.group = None;
