@@ -28,8 +28,8 @@ fn main() -> ExitCode {
     let arguments = Arguments::parse();
     let loaded = start::read::<SessionConfig>(&arguments.config);
     if arguments.options.check {
-        start::check(&loaded);
-        return ExitCode::SUCCESS;
+        start::print(&loaded);
+        return start::conclude(&loaded);
     }
     if arguments.test_mail {
         return test_mail(&loaded.config);
@@ -37,7 +37,7 @@ fn main() -> ExitCode {
     let log = loaded.config.log_dir.0.join("session/output.log");
     let log = (!loaded.config.debug).then_some(log.as_path());
     let server = app::run(loaded.config.clone(), arguments.config);
-    start::serve(log, &arguments.options, &loaded.warnings, server)
+    start::serve(log, &arguments.options, &loaded.remarks(), server)
 }
 
 /// Sends one mail to the administrator and a test to the webhook, if they are configured, and prints the outcomes.

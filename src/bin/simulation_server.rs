@@ -54,14 +54,14 @@ fn main() -> ExitCode {
     }
     let loaded = start::read::<SimulationConfig>(&arguments.config);
     if arguments.options.check {
-        start::check(&loaded);
+        start::print(&loaded);
         for finding in preflight::check(&loaded.config) {
             eprintln!("{finding}");
         }
-        return ExitCode::SUCCESS;
+        return start::conclude(&loaded);
     }
     let log = loaded.config.log_dir.0.join("simulation/output.log");
     let log = (!loaded.config.debug).then_some(log.as_path());
     let server = async { app::serve(Application::new(loaded.config.clone())?).await };
-    start::serve(log, &arguments.options, &loaded.warnings, server)
+    start::serve(log, &arguments.options, &loaded.remarks(), server)
 }

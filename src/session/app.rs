@@ -155,7 +155,7 @@ fn assemble(
 fn reload(file: &Path, server: &AppState) {
     match config::load::<SessionConfig>(file) {
         Ok(loaded) => {
-            for warning in &loaded.warnings {
+            for warning in loaded.remarks() {
                 log::warn!("{warning}");
             }
             let entries = loaded.config.simulation_servers.len();

@@ -101,9 +101,9 @@ fn is_read_or_refused<C: Configuration>(file: &Path) {
     match load::<C>(file) {
         Ok(loaded) => {
             assert!(
-                loaded.warnings.iter().all(|warning| is_one_line(warning)),
+                loaded.remarks().iter().all(|warning| is_one_line(warning)),
                 "{:?}",
-                loaded.warnings
+                loaded.remarks()
             )
         }
         Err(told) => {

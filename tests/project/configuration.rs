@@ -179,6 +179,36 @@ fn the_examples_of_the_page_are_taken_without_a_warning() {
 }
 
 #[test]
+fn a_mistyped_key_is_told_last_and_fails_the_check() {
+    for kind in kinds() {
+        let mut config = kind.smallest.clone();
+        for key in ["maxClinets", "adminPasword", "colour", "$schema"] {
+            config[key] = json!("x");
+        }
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), config.to_string()).unwrap();
+        let output = Command::new(kind.program)
+            .arg("--check")
+            .arg(file.path())
+            .output()
+            .unwrap();
+        assert_eq!(output.status.code(), Some(2), "{output:?}");
+        let told = String::from_utf8(output.stderr).unwrap();
+        let lines: Vec<&str> = told.lines().collect();
+        let expected = [
+            "unknown key \"adminPasword\" is ignored; did you mean \"adminPassword\"?",
+            "unknown key \"colour\" is ignored",
+            "unknown key \"maxClinets\" is ignored; did you mean \"maxClients\"?",
+        ];
+        let expected = expected.map(|words| format!("error: {}: {words}", file.path().display()));
+        assert!(lines.ends_with(&expected.each_ref().map(String::as_str)), "{told}");
+        assert!(!told.contains("$schema"), "{told}");
+        let shown: Value = serde_json::from_slice(&output.stdout).unwrap();
+        assert!(shown["port"].is_number(), "the effective configuration is printed too");
+    }
+}
+
+#[test]
 fn values_come_from_files_and_the_environment() {
     let [session, simulation] = kinds();
     let secret = tempfile::NamedTempFile::new().unwrap();

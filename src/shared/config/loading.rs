@@ -1,6 +1,7 @@
 //! Reads configuration files: JSON with camelCase keys.
 //!
-//! An error is one line with the file, the key, what was found and what is expected. An unknown key is a warning.
+//! An error is one line with the file, the key, what was found and what is expected. An unknown key does not prevent a
+//! start, because files of the original may have such keys; `--check` fails.
 
 use std::path::Path;
 
@@ -44,7 +45,29 @@ pub struct LoadedConfig<C> {
     pub config: C,
     /// Warnings for the administrator, one line each.
     pub warnings: Vec<String>,
+    /// The unknown keys, one line each, which are ignored.
+    pub unknown: Vec<String>,
 }
+
+impl<C> LoadedConfig<C> {
+    /// The warnings, and last the unknown keys.
+    pub fn remarks(&self) -> Vec<String> {
+        self.warnings.iter().chain(&self.unknown).cloned().collect()
+    }
+}
+
+/// What was read from a file, with lines that do not name the file.
+struct Parsed<C> {
+    config: C,
+    warnings: Vec<String>,
+    unknown: Vec<String>,
+}
+
+/// The key with which an editor finds the schema of a file.
+const SCHEMA: &str = "$schema";
+/// A key with at most this many typing errors is recognized; a long one with one more for each `LETTERS` letters.
+const TYPING_ERRORS: usize = 2;
+const LETTERS: usize = 6;
 
 /// Reads a configuration file.
 ///
@@ -52,14 +75,15 @@ pub struct LoadedConfig<C> {
 /// When the file can't be read, or a value is not allowed: one line, with the file.
 pub fn load<C: Configuration>(file: &Path) -> Result<LoadedConfig<C>, String> {
     let of_file = |line: String| format!("{}: {line}", file.display());
-    let (config, warnings) = parse(file).map_err(of_file)?;
+    let parsed = parse(file).map_err(of_file)?;
     Ok(LoadedConfig {
-        config,
-        warnings: warnings.into_iter().map(of_file).collect(),
+        config: parsed.config,
+        warnings: parsed.warnings.into_iter().map(of_file).collect(),
+        unknown: parsed.unknown.into_iter().map(of_file).collect(),
     })
 }
 
-fn parse<C: Configuration>(file: &Path) -> Result<(C, Vec<String>), String> {
+fn parse<C: Configuration>(file: &Path) -> Result<Parsed<C>, String> {
     let text = read_file(file).map_err(|error| format!("can't be read: {error}"))?;
     if !text.trim_start().starts_with('{') {
         return Err("it is not a JSON object; allowed is {\"KEY\": VALUE, ...}".to_owned());
@@ -83,11 +107,35 @@ fn parse<C: Configuration>(file: &Path) -> Result<(C, Vec<String>), String> {
         return Err(format!("{key}: it is missing"));
     }
     let values = serde_json::to_value(&config).unwrap_or_default();
-    let is_known = |key: &String| values.get(key).is_some() || C::ALIASES.contains(&key.as_str());
-    let unknown = given.keys().filter(|key| !is_known(key));
-    let mut warnings: Vec<String> = unknown.map(|key| format!("unknown key {key:?} is ignored")).collect();
-    warnings.extend(config.complete(file)?);
-    Ok((config, warnings))
+    let own = values.as_object().into_iter().flat_map(serde_json::Map::keys);
+    let known: Vec<&str> = own.map(String::as_str).chain(C::ALIASES.iter().copied()).collect();
+    let unknown = given
+        .keys()
+        .filter(|key| *key != SCHEMA && !known.contains(&key.as_str()))
+        .map(|key| match alike(key, &known) {
+            Some(meant) => format!("unknown key {key:?} is ignored; did you mean {meant:?}?"),
+            None => format!("unknown key {key:?} is ignored"),
+        })
+        .collect();
+    let warnings = config.complete(file)?;
+    Ok(Parsed {
+        config,
+        warnings,
+        unknown,
+    })
+}
+
+/// The key that is most likely meant by an unknown one.
+fn alike<'a>(key: &str, known: &[&'a str]) -> Option<&'a str> {
+    // A text of any length would take long to compare.
+    let longest = known.iter().map(|one| one.len()).max().unwrap_or_default();
+    if key.len() > 2 * longest {
+        return None;
+    }
+    let key = key.to_lowercase();
+    let errors = |one: &str| strsim::damerau_levenshtein(&key, &one.to_lowercase());
+    let (fewest, best) = known.iter().map(|one| (errors(one), *one)).min()?;
+    (fewest <= TYPING_ERRORS.max(key.len() / LETTERS)).then_some(best)
 }
 
 #[cfg(test)]
@@ -111,10 +159,10 @@ mod tests {
         let file = tempfile::NamedTempFile::new().unwrap();
         let again = r#""loadRefrsh": 1, "#.repeat(100);
         std::fs::write(file.path(), format!(r#"{{"loadRefresh": 1, {again} "colour": 2}}"#)).unwrap();
-        let told = load::<Small>(file.path()).unwrap().warnings;
+        let told = load::<Small>(file.path()).unwrap().unknown;
         let expected = [
             r#"unknown key "colour" is ignored"#,
-            r#"unknown key "loadRefrsh" is ignored"#,
+            r#"unknown key "loadRefrsh" is ignored; did you mean "loadRefresh"?"#,
         ];
         assert_eq!(
             told,

@@ -16,7 +16,7 @@ pub type AppError = Box<dyn std::error::Error + Send + Sync>;
 /// Exit code: the server failed at run time, for example because its port is in use.
 pub const FAILED: u8 = 1;
 /// Exit code: the configuration is invalid.
-const WRONG_CONFIGURATION: i32 = 2;
+const WRONG_CONFIGURATION: u8 = 2;
 
 /// The options that both programs have.
 #[derive(clap::Args)]
@@ -37,17 +37,30 @@ pub fn read<C: Configuration>(file: &Path) -> LoadedConfig<C> {
 fn refuse(why: &str) -> ! {
     // A key may contain any text.
     eprintln!("error: {}", one_line(why));
-    std::process::exit(WRONG_CONFIGURATION)
+    std::process::exit(WRONG_CONFIGURATION.into())
 }
 
-/// Prints the effective configuration to standard output, and warnings to the error output.
-pub fn check<C: Configuration>(loaded: &LoadedConfig<C>) {
-    for warning in &loaded.warnings {
-        eprintln!("warning: {}", one_line(warning));
-    }
+/// Prints the effective configuration to standard output.
+pub fn print<C: Configuration>(loaded: &LoadedConfig<C>) {
     let text = serde_json::to_string_pretty(&loaded.config).unwrap_or_else(|error| refuse(&error.to_string()));
     // The reader may have closed the pipe.
     writeln!(io::stdout(), "{text}").ok();
+}
+
+/// Prints the warnings about a configuration to the error output. Returns the exit code of `--check`: an unknown key is
+/// probably mistyped, so that the configuration is not what its author means.
+pub fn conclude<C: Configuration>(loaded: &LoadedConfig<C>) -> ExitCode {
+    for warning in &loaded.warnings {
+        eprintln!("warning: {}", one_line(warning));
+    }
+    for unknown in &loaded.unknown {
+        eprintln!("error: {}", one_line(unknown));
+    }
+    if loaded.unknown.is_empty() {
+        ExitCode::SUCCESS
+    } else {
+        ExitCode::from(WRONG_CONFIGURATION)
+    }
 }
 
 /// Writes the PID file if requested, starts the log (without a file on standard output), and runs a server to its end.
