@@ -121,9 +121,6 @@ fn shown(path: impl AsRef<Path>) -> String {
 /// Deeds with files, and whether they succeed at each level.
 fn files(stage: &Stage) -> Vec<(&'static str, String, [bool; 2])> {
     let (folder, home, elsewhere) = (shown(&stage.folder), shown(&stage.home), shown(&stage.elsewhere));
-    let number = if cfg!(target_arch = "aarch64") { 219 } else { 250 };
-    let keyring = format!("python3 -c 'import ctypes; assert ctypes.CDLL(None).syscall({number}, 0, -3, 1) > 0'");
-    let has_keyrings = Command::new("sh").args(["-c", &keyring]).status().unwrap().success();
     vec![
         (
             "read and write the project",
@@ -195,12 +192,55 @@ fn files(stage: &Stage) -> Vec<(&'static str, String, [bool; 2])> {
             "grep -ls simulation-serv /proc/[0-9]*/comm | grep .".to_owned(),
             [true, false],
         ),
-        ("use a keyring", keyring, [has_keyrings, false]),
     ]
 }
 
-async fn compare(stage: &Stage, change: impl Fn(Builder) -> Builder, levels: &[usize]) {
-    let table = files(stage);
+/// Deeds with system calls, and whether they succeed at each level.
+fn system_calls() -> Vec<(&'static str, String, [bool; 2])> {
+    let works = |deed: &str| Command::new("sh").args(["-c", deed]).output().unwrap().status.success();
+    let call = |arguments: &str, succeeds: &str| {
+        format!("python3 -c 'import ctypes; assert ctypes.CDLL(None).syscall({arguments}) {succeeds}'")
+    };
+    let (keyctl, userfaultfd, unshare) = if cfg!(target_arch = "aarch64") {
+        (219, 282, 97)
+    } else {
+        (250, 323, 272)
+    };
+    let keyring = call(&format!("{keyctl}, 0, -3, 1"), "> 0");
+    let io_uring = call("425, 1, ctypes.create_string_buffer(120)", ">= 0");
+    let faults = call(&format!("{userfaultfd}, 1"), ">= 0");
+    let host = "python3 -c 'import socket; socket.socket(40, socket.SOCK_STREAM)'".to_owned();
+    let namespaces = call(&format!("{unshare}, 0"), "== 0");
+    // What such a kernel does not have can't be kept from worlds.
+    let (has_keyrings, has_io_uring) = (works(&keyring), works(&io_uring));
+    let (has_faults, has_host) = (works(&faults), works(&host));
+    vec![
+        ("use a keyring", keyring, [has_keyrings, false]),
+        ("use io_uring", io_uring, [has_io_uring, false]),
+        ("handle page faults", faults, [has_faults, false]),
+        ("reach the host of a virtual machine", host, [has_host, false]),
+        ("leave namespaces", namespaces, [true, false]),
+        (
+            "start threads and processes",
+            "python3 -c 'import threading, subprocess; t = threading.Thread(target=subprocess.check_call, args=[[\"true\"]]); t.start(); t.join()'"
+                .to_owned(),
+            [true, true],
+        ),
+        (
+            "find that a system call of tomorrow is not there",
+            "python3 -c 'import ctypes, errno; c = ctypes.CDLL(None, use_errno=True); assert c.syscall(1000) < 0 and ctypes.get_errno() == errno.ENOSYS'"
+                .to_owned(),
+            [true, true],
+        ),
+    ]
+}
+
+async fn compare(
+    stage: &Stage,
+    table: Vec<(&'static str, String, [bool; 2])>,
+    change: impl Fn(Builder) -> Builder,
+    levels: &[usize],
+) {
     let deeds: Vec<(&str, String)> = table.iter().map(|(name, line, _)| (*name, line.clone())).collect();
     for level in levels {
         let expected: Vec<&str> = table
@@ -221,7 +261,8 @@ async fn compare(stage: &Stage, change: impl Fn(Builder) -> Builder, levels: &[u
 async fn a_world_sees_and_changes_what_its_level_allows() {
     needs!("bwrap");
     let Some(stage) = Stage::apart() else { return };
-    compare(&stage, |builder| builder.set("limits.output", 10_000), &[1, 0]).await;
+    let change = |builder: Builder| builder.set("limits.output", 10_000);
+    compare(&stage, files(&stage), change, &[1, 0]).await;
 }
 
 /// The command that runs a server as an ordinary user; `None` if that is not possible.
@@ -236,10 +277,17 @@ pub fn as_nobody() -> Option<&'static str> {
 }
 
 #[actix_rt::test]
+async fn a_sandbox_refuses_what_reaches_more_of_the_kernel() {
+    needs!("bwrap");
+    compare(&Stage::new(), system_calls(), |builder| builder, &[1, 0]).await;
+}
+
+#[actix_rt::test]
 async fn a_sandbox_holds_for_an_ordinary_user_too() {
     let Some(nobody) = as_nobody() else { return };
     let Some(stage) = Stage::apart() else { return };
-    compare(&stage, |builder| builder.before(nobody), &[1]).await;
+    compare(&stage, files(&stage), |builder| builder.before(nobody), &[1]).await;
+    compare(&stage, system_calls(), |builder| builder.before(nobody), &[1]).await;
     // bubblewrap is one more process.
     let processes = [("be bounded by the kernel", "test $(ulimit -u) = 71".to_owned())];
     let done = stage
