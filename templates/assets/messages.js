@@ -39,17 +39,20 @@ export function after(text, prefix) {
 }
 
 /**
- * Reads a reason. One that is malformed counts as none.
+ * Reads a reason, with the sentence alone if the one that follows has more in it for older pages. A malformed one counts
+ * as none.
  * @param {string} json
- * @returns {Reason | undefined}
+ * @returns {{ reason: Reason, message: string | undefined } | undefined}
  */
 function parseReason(json) {
   try {
-    const { code, blame, retry, output } = JSON.parse(json);
+    const { code, blame, retry, message, output } = JSON.parse(json);
     if (![code, blame, retry].every((value) => typeof value === 'string')) {
       return undefined;
     }
-    return typeof output === 'string' && output !== '' ? { code, blame, retry, output } : { code, blame, retry };
+    const text = (/** @type {unknown} */ value) => (typeof value === 'string' && value !== '' ? value : undefined);
+    const printed = text(output);
+    return { reason: { code, blame, retry, ...(printed && { output: printed }) }, message: text(message) };
   } catch {
     return undefined;
   }
@@ -57,8 +60,8 @@ function parseReason(json) {
 
 /** Reads reasons, each of which belongs to the sentence that follows it. */
 class Reasons {
-  /** @type {Reason | undefined} */
-  #reason;
+  /** @type {ReturnType<typeof parseReason>} */
+  #next;
 
   /**
    * Whether the text was a reason.
@@ -67,14 +70,14 @@ class Reasons {
   take(text) {
     const json = after(text, 'reason:');
     if (json !== undefined) {
-      this.#reason = parseReason(json);
+      this.#next = parseReason(json);
     }
     return json !== undefined;
   }
 
   /** Whether the next sentence has a reason. */
   get isPending() {
-    return this.#reason !== undefined;
+    return this.#next !== undefined;
   }
 
   /**
@@ -83,9 +86,9 @@ class Reasons {
    * @returns {Failure}
    */
   failure(sentence) {
-    const reason = this.#reason;
-    this.#reason = undefined;
-    return { sentence, reason };
+    const { reason, message } = this.#next ?? {};
+    this.#next = undefined;
+    return { sentence: message ?? sentence, reason };
   }
 }
 

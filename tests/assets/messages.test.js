@@ -36,6 +36,19 @@ test('a reason belongs to the sentence after it', () => {
   });
 });
 
+test('the sentence is that of the reason, without what older pages get with it', () => {
+  const output = 'no licence';
+  const sent = { ...DRAINING, message: 'Webots has ended', output };
+  const [, failed] = read(
+    `reason: ${JSON.stringify(sent)}`,
+    `loading: Error: Webots has ended. Its last output: ${output}`,
+  );
+  assert.deepEqual(failed, {
+    is: 'failed',
+    failure: { sentence: 'Webots has ended', reason: { ...DRAINING, output } },
+  });
+});
+
 test('an end without an error has a reason too', () => {
   const finished = { code: 'finished', blame: 'project', retry: 'here' };
   const [, failed] = read(`reason: ${JSON.stringify(finished)}`, 'loading: Webots has ended');

@@ -78,7 +78,8 @@ class Viewing(BrowserTest):
 
         def record(socket):
             if "/client" not in socket.url and "/session" not in socket.url:
-                socket.on("framesent", sent.append)
+                # Playwright takes no methods of builtin types.
+                socket.on("framesent", lambda text: sent.extend([text]))
 
         page.tab.on("websocket", record)
         expect(page.tab.locator("#availability")).to_contain_text("Available")
