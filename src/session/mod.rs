@@ -3,6 +3,7 @@
 pub mod app;
 pub mod config;
 pub mod fleet;
+pub mod line;
 pub mod mail;
 pub mod placement;
 mod state;

@@ -3,6 +3,7 @@
 use std::net::{IpAddr, Ipv6Addr};
 use std::time::Duration;
 
+use actix_web::http::header::HeaderName;
 use lettre::message::Mailbox;
 use serde::{Deserialize, Serialize};
 
@@ -12,8 +13,8 @@ use super::timing::Timing;
 use crate::session::placement::PlacementPolicy;
 use crate::shared::config::keys::keys;
 use crate::shared::config::{
-    Configuration, ExpandedPath, Secret, expanded, is_web_url, one_or_many, optional_whole, percent, require, seconds,
-    whole,
+    Configuration, ExpandedPath, Secret, check_fleet_key, expanded, is_web_url, one_or_many, optional_whole, percent,
+    require, seconds, whole,
 };
 use crate::shared::domain::{PublicAddress, PublicUrl, complete_host};
 use crate::shared::http::TrustedProxies;
@@ -64,6 +65,12 @@ pub struct SessionConfig {
     pub webhook: Option<Secret> = None,
     /// Password for actions such as `/announcement`. Default: none, and actions are off.
     pub admin_password: Option<Secret> = None,
+    /// Secret of at least 16 letters that all servers of a fleet share: it signs the passes and tickets of the line.
+    /// Default: none, and a free slot is for the first client that comes.
+    pub fleet_key: Option<Secret> = None,
+    /// The header in which a reverse proxy of `trustedProxies` sends the user's name, such as `X-Forwarded-User`: a user
+    /// has one place in the line. Default: none.
+    pub user_header: Option<String> = None,
     /// Folder of `session/output.log`. Default: `log`.
     pub log_dir: ExpandedPath = ExpandedPath("log".into()),
     /// Log to standard output. Default: false.
@@ -160,9 +167,15 @@ impl Configuration for SessionConfig {
     fn complete(&mut self, _: &std::path::Path) -> Result<Vec<String>, String> {
         let warning = complete_host(&mut self.server, self.port_rewrite)?;
         self.check_servers()?;
+        check_fleet_key(self.fleet_key.as_ref())?;
         require(self.timing.silence > self.timing.ping, "timing.silence", || {
             format!("{} s is not more than timing.ping", self.timing.silence.as_secs_f64())
         })?;
+        if let Some(header) = &self.user_header {
+            require(HeaderName::try_from(header).is_ok(), "userHeader", || {
+                format!("{header:?} is no name of a header, such as X-Forwarded-User")
+            })?;
+        }
         let allowed = "no URL of a web server; allowed are http and https";
         if let Some(script) = &self.viewer_script {
             require(is_web_url(script.as_str()), "viewerScript", || {

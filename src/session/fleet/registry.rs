@@ -77,7 +77,7 @@ impl Registry {
 
     /// Publishes a change of availability.
     fn publish(&mut self) {
-        let available = self.servers.fleet.available(Instant::now());
+        let available = self.servers.fleet.available(Instant::now(), |_| true);
         if *self.available.borrow() != available {
             log::info!("{} simulation server is available", if available { "a" } else { "no" });
             self.available.send_replace(available);

@@ -65,6 +65,8 @@ pub(super) struct Backend {
     pub(super) up: bool,
     /// Whether it takes new clients; `false` while it is drained.
     accepting: bool,
+    /// Whether it has no free slot, as it has said since its last report.
+    pub(super) is_filled: bool,
     /// The last report; kept while the server is down, to know what is new when it comes back.
     last: Option<LastReport>,
     /// The placements whose clients have neither been seen nor given up, oldest first.
@@ -121,6 +123,7 @@ impl Backend {
         };
         self.note_changes(report, replicas);
         self.fresh = 0;
+        self.is_filled = false;
         // Changes that the load shows by now are dropped.
         self.settling.retain(|change| change.unseen(now) != 0.0);
         self.unseen = self.settling.iter().map(|change| change.unseen(now)).sum();
@@ -151,6 +154,14 @@ impl Backend {
         self.fresh += usize::from(takes_room);
     }
 
+    /// Takes back the last client that was sent here.
+    pub(super) fn withdraw_placement(&mut self) {
+        if self.in_flight.pop_back().is_some_and(|placed| placed.takes_room) {
+            self.reserved = self.reserved.saturating_sub(1);
+            self.fresh = self.fresh.saturating_sub(1);
+        }
+    }
+
     /// Ends an ejection, and gives up overdue clients. Returns the number of those that reserved room.
     pub(super) fn expire(&mut self, now: Instant, policy: &PlacementPolicy) -> usize {
         self.ejection.expire(now);
@@ -164,12 +175,19 @@ impl Backend {
     /// Whether a client can be sent here.
     fn has_room(&self, policy: &PlacementPolicy) -> bool {
         let has_slot = |instances: Instances| {
-            let taken = f64::from(instances.present()) + count(self.reserved) + self.sent_by_others();
+            // The slots that the server has reserved are for clients in flight, from here or elsewhere.
+            let on_their_way = count(self.reserved).max(f64::from(instances.reserved));
+            let taken = f64::from(instances.present()) + on_their_way + self.sent_by_others();
             taken < f64::from(instances.places)
         };
-        self.accepting
-            && self.effective_load().is_some_and(|load| load < self.limit(policy))
+        self.would_take(policy)
+            && !self.is_filled
             && self.last.is_some_and(|report| report.instances.is_none_or(has_slot))
+    }
+
+    /// Whether a client can be sent here as soon as there is a free slot.
+    pub(super) fn would_take(&self, policy: &PlacementPolicy) -> bool {
+        self.accepting && self.effective_load().is_some_and(|load| load < self.limit(policy))
     }
 
     /// The load, in percent, from which this server gets no clients.

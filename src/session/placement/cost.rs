@@ -312,7 +312,7 @@ mod tests {
         for second in 0..300_u32 {
             let now = start + Duration::from_secs(second.into());
             fleet.report(&0, now, &report(100.0, 20 + second, 20 + second), true);
-            assert!(!fleet.available(now));
+            assert!(!fleet.available(now, |_| true));
         }
         assert!(fleet.client_cost(&0).is_some_and(|cost| cost >= 2.0));
     }

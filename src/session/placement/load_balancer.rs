@@ -110,6 +110,39 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
         Some(id)
     }
 
+    /// Counts a client as sent to a server that has promised it a slot.
+    pub fn place(&mut self, id: &Id, now: Instant) {
+        let Some(server) = self.servers.get_mut(id) else { return };
+        server.add_placement(now, true);
+        sort_in(server, id, &self.policy, &mut self.ranking);
+    }
+
+    /// Takes back the last client that was counted as sent to a server.
+    pub fn withdraw(&mut self, id: &Id) {
+        let Some(server) = self.servers.get_mut(id) else { return };
+        server.withdraw_placement();
+        sort_in(server, id, &self.policy, &mut self.ranking);
+    }
+
+    /// Records that a server has no free slot, until its next report.
+    pub fn fill(&mut self, id: &Id) {
+        let Some(server) = self.servers.get_mut(id) else { return };
+        server.is_filled = true;
+        sort_in(server, id, &self.policy, &mut self.ranking);
+    }
+
+    /// Whether a server has room for one more client.
+    pub fn has_room(&self, id: &Id) -> bool {
+        self.servers.get(id).is_some_and(|server| server.rank.is_some())
+    }
+
+    /// Whether a server takes clients as soon as it has a free slot.
+    pub fn would_take(&self, id: &Id) -> bool {
+        self.servers
+            .get(id)
+            .is_some_and(|server| server.would_take(&self.policy))
+    }
+
     /// Gives up overdue placements, and ends ejections.
     fn expire(&mut self, now: Instant) {
         if self.checked.is_some_and(|checked| now < checked + CHECK_INTERVAL) {
@@ -124,10 +157,10 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
         self.replicas.count(0.0, count(given_up));
     }
 
-    /// Whether some server can take a client.
-    pub fn available(&mut self, now: Instant) -> bool {
+    /// Whether some server that is `eligible` can take a client.
+    pub fn available(&mut self, now: Instant, eligible: impl Fn(&Id) -> bool) -> bool {
         self.expire(now);
-        !self.ranking.is_empty()
+        self.ranking.values().any(eligible)
     }
 
     /// Whether others are preferred to a server, because its last starts have failed.
@@ -230,7 +263,7 @@ mod tests {
             let mut fleet = fleet(2.0, now, []);
             fleet.add(0);
             fleet.report(&0, now, &report(load, instances), accepting);
-            assert_eq!(fleet.available(now), available, "{why}");
+            assert_eq!(fleet.available(now, |_| true), available, "{why}");
             assert_eq!(fleet.pick(now, true, |_| true).is_some(), available, "{why}");
         }
     }
@@ -248,7 +281,7 @@ mod tests {
                 }
                 let id = fleet.pick(at, false, |_| true).unwrap();
                 got[usize::try_from(id).unwrap()] += 1;
-                assert!(fleet.available(at));
+                assert!(fleet.available(at, |_| true));
             }
             assert!(got.iter().all(|got| (400..600).contains(got)), "{got:?}");
             let end = now + Duration::from_secs(15);
@@ -281,7 +314,7 @@ mod tests {
                 ..load_only(load)
             }),
         );
-        assert!(fleet.available(now));
+        assert!(fleet.available(now, |_| true));
         assert_eq!(fleet.pick(now, true, |_| true), Some(0));
         assert_eq!(fleet.pick(now, true, |id| *id == 1), Some(1));
     }
@@ -344,7 +377,7 @@ mod tests {
                 prop_assert!(placed == 0 || level(id) <= lowest + 2.0 + 1e-9);
                 prop_assert!(level(id) < 95.0 + 2.0);
             }
-            prop_assert_eq!(fleet.available(now), lowest < 95.0);
+            prop_assert_eq!(fleet.available(now, |_| true), lowest < 95.0);
         }
 
         #[test]
@@ -364,8 +397,8 @@ mod tests {
                 match action {
                     0 => fleet.lose(&id),
                     1 => { fleet.remove(&id); fleet.add(id); }
-                    2 => prop_assert_eq!(fleet.available(now), fleet.pick(now, true, |_| true).is_some()),
-                    3 => prop_assert_eq!(fleet.available(now), fleet.pick(now, false, |_| true).is_some()),
+                    2 => prop_assert_eq!(fleet.available(now, |_| true), fleet.pick(now, true, |_| true).is_some()),
+                    3 => prop_assert_eq!(fleet.available(now, |_| true), fleet.pick(now, false, |_| true).is_some()),
                     _ => fleet.report(&id, now, &report(load, instances.map(counts)), action > 4),
                 }
                 for id in 0..3 {

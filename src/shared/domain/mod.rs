@@ -3,17 +3,23 @@
 mod address;
 mod admission;
 mod client_urls;
+mod fleet_key;
 mod load;
+mod pass;
 mod project_url;
 mod reason;
 mod server_report;
+mod slot_link;
 mod url_prefix;
 
 pub use address::{PublicAddress, complete_host};
 pub use admission::AdmissionRules;
 pub use client_urls::{ClientUrls, PublicUrl};
+pub use fleet_key::{FleetKey, Purpose, SIGNATURE};
 pub use load::Load;
+pub use pass::{Pass, ReservationId, ServerRun};
 pub use project_url::{ProjectUrl, ProjectUrlError, Reading};
 pub use reason::{Blame, Failure, Reason, Retry};
 pub use server_report::{Instances, ServerReport};
+pub use slot_link::{Hello, Offer, Offers, Proof, Wish, Wishes};
 pub use url_prefix::UrlPrefix;

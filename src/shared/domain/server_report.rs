@@ -63,6 +63,10 @@ pub struct Instances {
     pub places: u32,
     /// Clients that have requested a start since the server started; it only grows.
     pub arrivals: u64,
+    /// Slots that are reserved for clients with a pass.
+    pub reserved: u32,
+    /// Slots that have become free since the server started; it only grows.
+    pub freed: u64,
 }
 
 /// Ignores prefixes that this version can't parse: the server that reports them enforces them itself.

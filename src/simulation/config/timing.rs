@@ -36,6 +36,9 @@ pub struct Timing {
     /// Time for which a simulation waits for a disconnected client; 0: not at all. Default: 60.
     #[serde(with = "seconds_or_zero")]
     pub absence: Duration = Duration::from_mins(1),
+    /// Time for which a slot is reserved for a client with a pass, whose turn it is in the line. Default: 10.
+    #[serde(with = "seconds")]
+    pub pass: Duration = Duration::from_secs(10),
     /// Timeout of simulations when the server stops. Default: 9.
     #[serde(with = "seconds")]
     pub stop: Duration = Duration::from_secs(9),

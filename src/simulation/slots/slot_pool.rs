@@ -268,6 +268,7 @@ impl Slots {
             running: count(&[Stage::Running]),
             places: u32::try_from(self.ports.len()).unwrap_or(u32::MAX),
             arrivals: self.arrivals,
+            ..Instances::default()
         }
     }
 }
