@@ -13,7 +13,7 @@ use super::state::{AppState, PLACED};
 use crate::session::fleet::{GetStatus, Reconfigure, Registry};
 use crate::session::web::configure;
 use crate::shared::config;
-use crate::shared::domain::{ClientUrls, Reason};
+use crate::shared::domain::{ClientUrls, FleetKey, Reason};
 use crate::shared::http::server::{self, HttpServerOptions};
 use crate::shared::http::{BasicAuth, ConnectionLimiter, LiveUpdates, Metrics, SharedPage};
 use crate::shared::run::{
@@ -22,11 +22,14 @@ use crate::shared::run::{
 
 /// Open files that the server itself needs: logs, threads, mail.
 const OWN_FILES: usize = 128;
-/// Connections to one simulation server: one in use, one that is closing.
-const FILES_PER_SERVER: usize = 2;
+/// Connections to one simulation server: one in use, one that is closing, and one for the slots of the line.
+const FILES_PER_SERVER: usize = 3;
 
 /// Timeout for closing open connections at shutdown, which takes at most five seconds in all.
 const STOP_TIMEOUT: Duration = Duration::from_secs(4);
+
+/// Upper bounds of the histogram of waiting times, in seconds.
+const WAITED: [f64; 10] = [0.1, 1.0, 5.0, 15.0, 60.0, 180.0, 600.0, 1800.0, 3600.0, 7200.0];
 
 /// The reasons for which no simulation server is chosen. The metric of each is exported from the start.
 const REFUSALS: [Reason; 5] = [
@@ -130,8 +133,15 @@ fn assemble(
     }
     let (available_sender, available) = watch::channel(false);
     let config = Arc::new(config);
-    let registry = Registry::start(Arc::clone(&config), available_sender);
+    let waited = metrics.histogram(
+        "webots_session_waited_seconds",
+        "How long clients have waited in the line until it was their turn",
+        &WAITED,
+    )?;
+    let registry = Registry::start(Arc::clone(&config), available_sender, waited);
+    let key = config.fleet_key.as_ref().map(|key| FleetKey::new(key.reveal()));
     Ok(AppState {
+        key: key.unwrap_or_else(FleetKey::random),
         registry,
         available,
         client_urls: ClientUrls {
@@ -160,9 +170,10 @@ fn reload(file: &Path, server: &AppState) {
             }
             let entries = loaded.config.simulation_servers.len();
             log::info!("read {} again: {entries} entries in simulationServers", file.display());
-            // `client_urls` keeps the value of `ssl` from the start, so the probes keep it too.
+            // What clients have got follows the values of these keys from the start, so the monitors keep them too.
             let config = SessionConfig {
                 ssl: server.config.ssl,
+                fleet_key: server.config.fleet_key.clone(),
                 ..loaded.config
             };
             server.registry.do_send(Reconfigure(Arc::new(config)));

@@ -9,8 +9,9 @@ use actix_web::error::ErrorServiceUnavailable;
 use tokio::sync::watch;
 
 use super::config::SessionConfig;
-use crate::session::fleet::{FleetStatus, GetStatus, Pick, Registry};
-use crate::shared::domain::{ClientUrls, Failure, ProjectUrl, PublicAddress, Reason};
+use crate::session::fleet::{FleetStatus, GetStatus, Pick, Registry, Wait};
+use crate::session::line::Place;
+use crate::shared::domain::{ClientUrls, Failure, FleetKey, ProjectUrl, PublicAddress, Reason};
 use crate::shared::http::{BasicAuth, ConnectionKind, ConnectionLimiter, LiveUpdates, Metrics, SharedPage};
 use crate::shared::run::Phase;
 
@@ -23,6 +24,8 @@ pub struct AppState {
     pub registry: Addr<Registry>,
     /// Whether a simulation server can take a client; the registry publishes it.
     pub available: watch::Receiver<bool>,
+    /// Signs tickets and passes.
+    pub key: FleetKey,
     /// The configuration from the start of the server: only the registry applies a reloaded one.
     pub config: Arc<SessionConfig>,
     /// Forms the URLs of simulation servers for clients.
@@ -78,11 +81,37 @@ impl AppState {
 
     async fn pick_address(&self, world: Option<&str>, from: Option<IpAddr>) -> Result<PublicAddress, Failure> {
         let named = world.filter(|text| !text.is_empty());
-        let world = named.map(ProjectUrl::parse).transpose().map_err(|error| {
-            let text = error.to_string();
-            Failure::new(Reason::InvalidWorld, text.trim_end_matches('.'))
-        })?;
-        let stopping = |_| Err(Failure::new(Reason::Draining, "the session server stops"));
-        self.registry.send(Pick { world, from }).await.unwrap_or_else(stopping)
+        let world = named.map(read_world).transpose()?;
+        self.registry
+            .send(Pick { world, from })
+            .await
+            .unwrap_or_else(|_| Err(stopping()))
     }
+
+    /// Asks the registry for a place in the line. Counts a refusal like those of [`AppState::pick`].
+    ///
+    /// # Errors
+    /// Why the client may not wait.
+    pub async fn wait(&self, wait: Wait) -> Result<Option<Place>, Failure> {
+        let entered = self.registry.send(wait).await.unwrap_or_else(|_| Err(stopping()));
+        if let Err(failure) = &entered {
+            self.picks.with_label_values(&[failure.reason.code()]).inc();
+        }
+        entered
+    }
+}
+
+/// Reads the URL of a world.
+///
+/// # Errors
+/// When it is not valid.
+pub fn read_world(text: &str) -> Result<ProjectUrl, Failure> {
+    ProjectUrl::parse(text).map_err(|error| {
+        let text = error.to_string();
+        Failure::new(Reason::InvalidWorld, text.trim_end_matches('.'))
+    })
+}
+
+fn stopping() -> Failure {
+    Failure::new(Reason::Draining, "the session server stops")
 }

@@ -1,5 +1,6 @@
 //! The simulation servers: their list, the last report of each, and the choice of one for the next client.
 
+mod line_keeper;
 mod name_table;
 mod refusal;
 mod registry;
@@ -7,8 +8,10 @@ mod resolver;
 mod server_monitor;
 mod server_record;
 mod server_table;
+mod slot_link;
 mod state_history;
 
+pub use line_keeper::{LineEvent, LineStatus, StopWaiting, Wait};
 pub use registry::{GetStatus, Pick, Reconfigure, Registry};
 pub use server_record::{
     Answer, FleetStatus, Intake, NameStatus, ServerRecord, ServerState, ServerStatus, StateChange, StateName,

@@ -8,15 +8,19 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use actix::prelude::*;
+use prometheus::Histogram;
 use tokio::sync::watch;
 
+use super::line_keeper::{LineKeeper, StopWaiting, Wait};
 use super::name_table::look_up_all;
 use super::refusal::refusal;
-use super::server_monitor::ProbeResult;
+use super::server_monitor::{Parent, ProbeResult};
 use super::server_record::{Answer, FleetStatus, Intake, ServerRecord, ServerState, ServerStatus};
 use super::server_table::ServerTable;
+use super::slot_link::LinkEvent;
 use super::state_history::StateHistory;
 use crate::session::config::SessionConfig;
+use crate::session::line::Place;
 use crate::session::placement::LoadBalancer;
 use crate::shared::domain::{Failure, Load, ProjectUrl, PublicAddress, Reason, ServerReport};
 use crate::shared::http::AddressQuota;
@@ -49,6 +53,7 @@ pub struct Registry {
     /// take room only once their clients have arrived.
     quota: AddressQuota,
     servers: ServerTable,
+    line: LineKeeper,
     /// Whether a simulation server can take a client; all web clients follow it.
     available: watch::Sender<bool>,
     changes: StateHistory,
@@ -60,24 +65,32 @@ const LOOKUP_INTERVAL: Duration = Duration::from_secs(1);
 const TICK: Duration = Duration::from_millis(250);
 
 impl Registry {
-    /// Starts the registry and its monitors. It publishes in `available` whether a server can take a client.
-    pub fn start(config: Arc<SessionConfig>, available: watch::Sender<bool>) -> Addr<Self> {
+    /// Starts the registry and its monitors. It publishes in `available` whether a server can take a client, and observes
+    /// in `waited` how long clients have waited in the line.
+    pub fn start(config: Arc<SessionConfig>, available: watch::Sender<bool>, waited: Histogram) -> Addr<Self> {
         Self::create(|ctx| {
-            let servers = ServerTable::new(&config, ctx.address().recipient());
+            let parent = Parent {
+                probes: ctx.address().recipient(),
+                links: ctx.address().recipient(),
+            };
+            let servers = ServerTable::new(&config, parent);
             Self {
                 // A large class behind one address may reserve room at once.
                 quota: AddressQuota::new(200, 12),
                 changes: StateHistory::new(&config),
                 config,
                 servers,
+                line: LineKeeper::new(waited),
                 available,
             }
         })
     }
 
-    /// Publishes a change of availability.
+    /// Publishes a change of availability, to those who are not in the line.
     fn publish(&mut self) {
-        let available = self.servers.fleet.available(Instant::now(), |_| true);
+        let ServerTable { records, fleet, .. } = &mut self.servers;
+        let is_left = |server: &PublicAddress| !self.line.claims(records, server);
+        let available = fleet.available(Instant::now(), is_left);
         if *self.available.borrow() != available {
             log::info!("{} simulation server is available", if available { "a" } else { "no" });
             self.available.send_replace(available);
@@ -121,6 +134,7 @@ impl Registry {
         if let Some(change) = change {
             self.changes.add(change);
         }
+        self.line.reported(&mut self.servers, server);
     }
 
     /// Chooses a server for a client of this address.
@@ -130,7 +144,10 @@ impl Registry {
             let answer = records.get(address).and_then(|record| record.state.last_answer());
             answer.is_some_and(|answer| answer.report.check(world, answer.report.load).is_ok())
         };
-        let eligible = |address: &PublicAddress| world.is_none_or(|world| admits(address, world));
+        let line = &self.line;
+        let eligible = |address: &PublicAddress| {
+            world.is_none_or(|world| admits(address, world)) && !line.claims(records, address)
+        };
         let picked = fleet.pick(Instant::now(), self.quota.take(from), eligible);
         picked.ok_or_else(|| {
             let servers = records.values();
@@ -162,6 +179,7 @@ impl Registry {
             .map(|answers, registry, ctx| {
                 if registry.servers.names.record(answers) {
                     registry.servers.follow_names(&registry.config);
+                    registry.line.forget_others(&registry.servers);
                     registry.publish();
                 }
                 ctx.run_later(LOOKUP_INTERVAL, Self::look_up_names);
@@ -179,7 +197,7 @@ fn ejected(failed: u32) -> Failure {
 }
 
 /// The load of a server with the clients that its last report does not show; `None` if it is down.
-fn effective_load(fleet: &LoadBalancer<PublicAddress>, server: &PublicAddress) -> Option<Load> {
+pub(super) fn effective_load(fleet: &LoadBalancer<PublicAddress>, server: &PublicAddress) -> Option<Load> {
     Load::try_from(fleet.effective_load(server)?).ok()
 }
 
@@ -192,6 +210,7 @@ impl Actor for Registry {
         self.servers.apply(&self.config);
         ctx.run_interval(TICK, |registry, _| {
             registry.servers.restart_monitors(&registry.config);
+            registry.line.tick(&mut registry.servers);
             registry.publish();
         });
         self.look_up_names(ctx);
@@ -225,6 +244,34 @@ impl Handler<Pick> for Registry {
     }
 }
 
+impl Handler<Wait> for Registry {
+    type Result = Result<Option<Place>, Failure>;
+
+    fn handle(&mut self, wait: Wait, _: &mut Self::Context) -> Self::Result {
+        let entered = self.line.enter(&mut self.servers, wait);
+        self.publish();
+        entered
+    }
+}
+
+impl Handler<StopWaiting> for Registry {
+    type Result = ();
+
+    fn handle(&mut self, stop: StopWaiting, _: &mut Self::Context) {
+        self.line.leave(stop);
+        self.publish();
+    }
+}
+
+impl Handler<LinkEvent> for Registry {
+    type Result = ();
+
+    fn handle(&mut self, event: LinkEvent, _: &mut Self::Context) {
+        self.line.link(&mut self.servers, event);
+        self.publish();
+    }
+}
+
 impl Handler<GetStatus> for Registry {
     type Result = MessageResult<GetStatus>;
 
@@ -240,6 +287,7 @@ impl Handler<GetStatus> for Registry {
             servers: self.servers.in_order().map(|record| self.status_of(record)).collect(),
             names: self.servers.names.status(),
             changes: self.changes.recent.clone(),
+            line: self.line.status(),
         }))
     }
 }
@@ -249,6 +297,7 @@ impl Handler<Reconfigure> for Registry {
 
     fn handle(&mut self, Reconfigure(config): Reconfigure, _: &mut Self::Context) {
         self.servers.apply(&config);
+        self.line.forget_others(&self.servers);
         self.config = config;
         self.publish();
     }

@@ -4,6 +4,8 @@
 //! server's state, one request at a time, and sends the result to its parent. If the parent's mailbox is full, the result
 //! is dropped: the next probe replaces it. It ends when it receives [`Stop`]; after a panic its parent starts a new one.
 //!
+//! In a fleet with a key it also keeps the link over which the server reserves slots for the line (`slot_link`).
+//!
 //! It requests `/status`, or `/load` if the server has no `/status`, as the original. No answer is trusted: the whole
 //! probe has a timeout, the answer a size limit, and the load must be plausible.
 
@@ -20,11 +22,13 @@ use awc::error::{ConnectError, SendRequestError};
 use awc::http::StatusCode;
 use awc::http::header::CONTENT_LENGTH;
 use rustls::ClientConfig;
+use tokio::sync::mpsc::{UnboundedSender, unbounded_channel};
 use tokio::time::{sleep_until, timeout};
 
 use super::resolver::HostResolver;
+use super::slot_link::{LinkEvent, SlotLink};
 use crate::session::config::SessionConfig;
-use crate::shared::domain::{Failure, Load, PublicAddress, Reason, ServerReport};
+use crate::shared::domain::{Failure, FleetKey, Load, PublicAddress, Reason, ServerReport, Wishes};
 use crate::shared::http::tls;
 use crate::shared::text::excerpt;
 
@@ -80,6 +84,20 @@ fn client(interval: Duration, tls: Option<Arc<ClientConfig>>) -> awc::Client {
         .finish()
 }
 
+/// Tells the server who waits for its slots.
+#[derive(Message)]
+#[rtype(result = "()")]
+pub struct Ask(pub Wishes);
+
+/// The parent of a monitor, which receives what it finds.
+#[derive(Clone)]
+pub struct Parent {
+    /// Receives the results of probes.
+    pub probes: Recipient<ProbeResult>,
+    /// Receives what happens to the link.
+    pub links: Recipient<LinkEvent>,
+}
+
 /// Ends the monitor.
 #[derive(Message)]
 #[rtype(result = "()")]
@@ -92,7 +110,11 @@ pub struct ServerMonitor {
     /// When the probe after the immediate one is due; the others follow every `interval`.
     first: Instant,
     interval: Duration,
-    results: Recipient<ProbeResult>,
+    parent: Parent,
+    /// The link before it is opened.
+    link: Option<SlotLink>,
+    /// Sends wishes over the link.
+    wishes: Option<UnboundedSender<Wishes>>,
 }
 
 /// What a probe needs.
@@ -107,20 +129,25 @@ struct Target {
 
 impl ServerMonitor {
     /// The monitor of a server. It must be created in the thread in which it runs.
-    pub fn new(
-        server: PublicAddress,
-        config: &SessionConfig,
-        tls: Option<Arc<ClientConfig>>,
-        results: Recipient<ProbeResult>,
-    ) -> Self {
+    pub fn new(server: PublicAddress, config: &SessionConfig, tls: Option<Arc<ClientConfig>>, parent: Parent) -> Self {
         let interval = config.load_refresh;
         // The slot is random: reports of all servers in the same slot would delay the requests of clients.
         let slot = (BEGIN.elapsed() + interval.mul_f64(rand::random()))
             .div_duration_f64(SLOT)
             .ceil();
+        let client = client(interval, tls);
+        let link = config.fleet_key.as_ref().map(|key| SlotLink {
+            server: server.clone(),
+            url: format!("{}/slots", server.websocket_url(config.ssl)),
+            client: client.clone(),
+            key: FleetKey::new(key.reveal()),
+            events: parent.links.clone(),
+        });
         Self {
+            link,
+            wishes: None,
             target: Rc::new(Target {
-                client: client(interval, tls),
+                client,
                 url: server.http_url(config.ssl),
                 limit: config.timing.answer,
                 without_status: Cell::new(None),
@@ -128,7 +155,7 @@ impl ServerMonitor {
             server,
             first: *BEGIN + SLOT.mul_f64(slot),
             interval,
-            results,
+            parent,
         }
     }
 
@@ -167,7 +194,7 @@ impl ServerMonitor {
             latency,
             answer,
         };
-        match self.results.try_send(result) {
+        match self.parent.probes.try_send(result) {
             Ok(()) => {}
             Err(SendError::Full(_)) => log::warn!("{}: a report is lost, too many are waiting", self.server),
             // The registry has stopped, and the server with it.
@@ -181,6 +208,22 @@ impl Actor for ServerMonitor {
 
     fn started(&mut self, ctx: &mut Self::Context) {
         self.probe_at(Instant::now(), ctx);
+        if let Some(link) = self.link.take() {
+            let (sender, wishes) = unbounded_channel();
+            self.wishes = Some(sender);
+            link.keep(wishes).into_actor(self).spawn(ctx);
+        }
+    }
+}
+
+impl Handler<Ask> for ServerMonitor {
+    type Result = ();
+
+    fn handle(&mut self, Ask(wishes): Ask, _: &mut Self::Context) {
+        if let Some(sender) = &self.wishes {
+            // The link ends with this monitor.
+            sender.send(wishes).ok();
+        }
     }
 }
 

@@ -7,6 +7,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use serde::{Serialize, Serializer};
 
+use super::line_keeper::LineStatus;
 use crate::session::mail::{Notice, NoticeKind};
 use crate::shared::domain::{Failure, PublicAddress, ServerReport};
 use crate::shared::run::timestamp;
@@ -289,6 +290,8 @@ pub struct FleetStatus {
     pub names: Vec<NameStatus>,
     /// The last changes of state, the newest first.
     pub changes: VecDeque<StateChange>,
+    /// The clients that wait.
+    pub line: LineStatus,
 }
 
 impl FleetStatus {

@@ -8,11 +8,12 @@ use actix::prelude::*;
 use rustls::ClientConfig;
 
 use super::name_table::NameTable;
-use super::server_monitor::{ProbeResult, ServerMonitor, Stop};
+use super::server_monitor::{Ask, Parent, ServerMonitor, Stop};
 use super::server_record::ServerRecord;
+use super::slot_link::{LinkChange, LinkEvent};
 use crate::session::config::SessionConfig;
 use crate::session::placement::LoadBalancer;
-use crate::shared::domain::PublicAddress;
+use crate::shared::domain::{PublicAddress, Wishes};
 use crate::shared::http::tls;
 use crate::shared::run::permanent::PanicCounter;
 
@@ -33,12 +34,12 @@ pub struct ServerTable {
     tls: Option<Arc<ClientConfig>>,
     /// The thread of the monitors, so that requests of clients do not wait for them.
     thread: Arbiter,
-    results: Recipient<ProbeResult>,
+    parent: Parent,
 }
 
 impl ServerTable {
-    /// No servers yet; `results` receives each probe.
-    pub fn new(config: &Arc<SessionConfig>, results: Recipient<ProbeResult>) -> Self {
+    /// No servers yet; `parent` receives what their monitors find.
+    pub fn new(config: &Arc<SessionConfig>, parent: Parent) -> Self {
         Self {
             names: NameTable::default(),
             fleet: LoadBalancer::new(config.policy()),
@@ -48,7 +49,7 @@ impl ServerTable {
             listed: Vec::new(),
             tls: None,
             thread: Arbiter::new(),
-            results,
+            parent,
         }
     }
 
@@ -90,9 +91,14 @@ impl ServerTable {
         let key = server.clone();
         let config = Arc::clone(config);
         let tls = self.tls.clone();
-        let results = self.results.clone();
+        let parent = self.parent.clone();
+        // That of an earlier monitor.
+        parent.links.do_send(LinkEvent {
+            server: server.clone(),
+            change: LinkChange::Down,
+        });
         let monitor = ServerMonitor::start_in_arbiter(&self.thread.handle(), move |_| {
-            ServerMonitor::new(server, &config, tls, results)
+            ServerMonitor::new(server, &config, tls, parent)
         });
         if let Some(before) = self.monitors.insert(key, monitor) {
             before.do_send(Stop);
@@ -110,6 +116,18 @@ impl ServerTable {
         }
     }
 
+    /// Tells a server who waits for its slots.
+    pub fn ask(&self, server: &PublicAddress, wishes: Wishes) {
+        if let Some(monitor) = self.monitors.get(server) {
+            monitor.do_send(Ask(wishes));
+        }
+    }
+
+    /// The addresses of all servers, in the order of the configuration.
+    pub fn addresses(&self) -> &[PublicAddress] {
+        &self.listed
+    }
+
     /// What is known of all servers, in the order of the configuration.
     pub fn in_order(&self) -> impl Iterator<Item = &ServerRecord> {
         self.listed.iter().filter_map(|server| self.records.get(server))
@@ -121,6 +139,7 @@ mod tests {
     use std::time::Duration;
 
     use super::*;
+    use crate::session::fleet::server_monitor::ProbeResult;
 
     /// A monitor that receives this panics.
     #[derive(Message)]
@@ -137,18 +156,24 @@ mod tests {
     }
 
     /// Takes the results of the monitors.
-    struct Parent(tokio::sync::mpsc::UnboundedSender<PublicAddress>);
+    struct Found(tokio::sync::mpsc::UnboundedSender<PublicAddress>);
 
-    impl Actor for Parent {
+    impl Actor for Found {
         type Context = Context<Self>;
     }
 
-    impl Handler<ProbeResult> for Parent {
+    impl Handler<ProbeResult> for Found {
         type Result = ();
 
         fn handle(&mut self, result: ProbeResult, _: &mut Self::Context) {
             self.0.send(result.server).unwrap();
         }
+    }
+
+    impl Handler<LinkEvent> for Found {
+        type Result = ();
+
+        fn handle(&mut self, _: LinkEvent, _: &mut Self::Context) {}
     }
 
     #[actix_rt::test]
@@ -159,7 +184,12 @@ mod tests {
             serde_json::from_str(r#"{"simulationServers": ["127.0.0.1:1", "127.0.0.1:2"], "loadRefresh": 0.1}"#)
                 .unwrap();
         let config = Arc::new(config);
-        let mut table = ServerTable::new(&config, Parent(sender).start().recipient());
+        let found = Found(sender).start();
+        let parent = Parent {
+            probes: found.clone().recipient(),
+            links: found.recipient(),
+        };
+        let mut table = ServerTable::new(&config, parent);
         table.apply(&config);
         let first: PublicAddress = "127.0.0.1:1".parse().unwrap();
         let second: PublicAddress = "127.0.0.1:2".parse().unwrap();

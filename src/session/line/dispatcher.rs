@@ -59,7 +59,9 @@ struct PastTurn<Server> {
     turn: Turn<Server>,
     /// Until when its pass is valid.
     until: Instant,
-    /// Until when its ticket must be known as used.
+    /// Whether the server has seen its client with it.
+    is_used: bool,
+    /// Until when its ticket must be known.
     kept: Instant,
 }
 
@@ -103,12 +105,16 @@ impl<Server, Client> Default for Dispatcher<Server, Client> {
 }
 
 impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
-    /// A client asks for a slot. With a valid ticket it has the place in that; `number` is that of a new ticket.
+    /// A client asks for a slot. With a valid ticket it has the place in that; `number` is that of a new ticket. `is_up`
+    /// is whether a server answers.
+    ///
+    /// A ticket whose turn has come is not valid any more, unless the server is gone that had to take its client.
     pub fn enter(
         &mut self,
         ticket: Option<Ticket>,
         entry: Entry<Client>,
         number: u64,
+        is_up: impl Fn(&Server) -> bool,
         now: Moment,
     ) -> Entered<Server, Client> {
         let mut place = Place {
@@ -117,13 +123,29 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
         };
         if let Some(ticket) = ticket {
             match self.turns.get(&ticket.place.number) {
+                None => place = ticket.place,
+                Some(past) if past.is_used => {}
+                Some(past) if !self.still_takes(&past.turn, is_up) => {
+                    place = ticket.place;
+                    self.turns.remove(&place.number);
+                }
                 Some(past) if now.instant < past.until => return Entered::Again(past.turn.clone()),
                 Some(_) => {}
-                None => place = ticket.place,
             }
         }
         let (place, displaced) = self.line.enter(place, entry, now.instant);
         Entered::Waits(place, displaced)
+    }
+
+    /// Whether the server of a turn is the one that it was.
+    fn still_takes(&self, turn: &Turn<Server>, is_up: impl Fn(&Server) -> bool) -> bool {
+        match turn.pass {
+            None => is_up(&turn.server),
+            Some(pass) => self
+                .links
+                .get(&turn.server)
+                .is_some_and(|link| link.server == pass.server),
+        }
     }
 
     /// The client of a connection leaves its place.
@@ -141,10 +163,10 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
         self.links.remove(server);
     }
 
-    /// A server is not in the fleet any more.
-    pub fn forget(&mut self, server: &Server) {
-        self.links.remove(server);
-        self.rates.remove(server);
+    /// Keeps what is known of these servers only.
+    pub fn retain(&mut self, is_known: impl Fn(&Server) -> bool) {
+        self.links.retain(|server, _| is_known(server));
+        self.rates.retain(|server, _| is_known(server));
     }
 
     /// A server reports how many slots have become free since its start.
@@ -173,6 +195,14 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
             fleet.fill(server);
         }
         let (run, valid) = (link.server, link.pass);
+        for past in self.turns.values_mut().filter(|_| !offers.used.is_empty()) {
+            let reservation = past
+                .turn
+                .pass
+                .filter(|pass| pass.server == run)
+                .map(|pass| pass.reservation);
+            past.is_used |= reservation.is_some_and(|reservation| offers.used.contains(&reservation));
+        }
         let mut turns = Vec::new();
         for offer in &offers.offers {
             let pass = Pass {
@@ -189,11 +219,13 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
         turns
     }
 
-    /// Gives turns on servers that only report, and says what the others must be told.
+    /// Gives turns on servers that only report, and says what the others must be told: of these, only one if only its
+    /// state has changed.
     pub fn serve(
         &mut self,
         fleet: &mut LoadBalancer<Server>,
         accepts: impl Fn(&Server, &ProjectUrl) -> bool,
+        only: Option<&Server>,
         now: Moment,
     ) -> Served<Server, Client> {
         self.turns.retain(|_, past| now.instant < past.kept);
@@ -209,7 +241,11 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
         let line = &self.line;
         let mut wishes = Vec::new();
         for (server, link) in &mut self.links {
-            let mut first = assigned.remove(server).unwrap_or_default();
+            let room = assigned.remove(server);
+            if room.is_none() && only.is_some_and(|only| only != server) {
+                continue;
+            }
+            let mut first = room.unwrap_or_default();
             let mut all = first.len();
             if !starved.is_empty() && fleet.would_take(server) {
                 let taken: HashSet<&str> = starved
@@ -303,12 +339,13 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
             pass: pass.map(|(pass, _)| pass),
             waited: Duration::from_millis(now.unix.saturating_sub(place.since)),
         };
-        let past = PastTurn {
+        let given = PastTurn {
             turn: turn.clone(),
             until: now.instant + valid,
+            is_used: false,
             kept: now.instant + valid.max(KEPT),
         };
-        self.turns.insert(place.number, past);
+        self.turns.insert(place.number, given);
         Some((waiting.client, turn))
     }
 
@@ -353,6 +390,19 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
         self.line.renewals(now, Ticket::RENEWAL)
     }
 
+    /// How a client stands that has just come, if it waits.
+    pub fn first_news(
+        &mut self,
+        place: Place,
+        servers: &[Server],
+        accepts: impl Fn(&Server, &ProjectUrl) -> bool,
+        now: Instant,
+    ) -> Option<Progress> {
+        self.standings(servers, accepts, now, |line, progress| {
+            line.first_news(place, now, progress)
+        })
+    }
+
     /// For each client the progress that it has to hear now, if any.
     pub fn news(
         &mut self,
@@ -360,6 +410,17 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
         accepts: impl Fn(&Server, &ProjectUrl) -> bool,
         now: Instant,
     ) -> Vec<(Client, Progress)> {
+        self.standings(servers, accepts, now, |line, progress| line.news(now, progress))
+    }
+
+    /// Calls `tell` with how clients stand, which it must ask in the order of the line.
+    fn standings<News>(
+        &mut self,
+        servers: &[Server],
+        accepts: impl Fn(&Server, &ProjectUrl) -> bool,
+        now: Instant,
+        tell: impl FnOnce(&mut WaitingLine<Client>, &mut dyn FnMut(&Place, &Arc<Group>) -> Progress) -> News,
+    ) -> News {
         let classes = Classes::new(&self.line, servers, accepts);
         let queue_of = |server: &Server| {
             self.links
@@ -388,7 +449,7 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
             }
             rates.push(of_class);
         }
-        self.line.news(now, |place, group| {
+        tell(&mut self.line, &mut |place, group| {
             let class = classes.of(group);
             let competing = classes.competitors.get(class).into_iter().flatten();
             let of_line: u32 = competing.filter_map(|other| ahead.get(*other)).sum();
@@ -586,7 +647,7 @@ mod tests {
                 address: None,
                 user: None,
             };
-            let entered = self.dispatcher.enter(ticket, entry, number, self.now);
+            let entered = self.dispatcher.enter(ticket, entry, number, |_| true, self.now);
             if let Entered::Waits(place, _) = entered {
                 self.waiting.insert((place, owner));
             }
@@ -598,7 +659,7 @@ mod tests {
         fn serve(&mut self) {
             loop {
                 let accepts = accepts(&self.servers);
-                let Served { turns, wishes } = self.dispatcher.serve(&mut self.balancer, accepts, self.now);
+                let Served { turns, wishes } = self.dispatcher.serve(&mut self.balancer, accepts, None, self.now);
                 if turns.is_empty() && wishes.is_empty() {
                     return;
                 }
@@ -631,7 +692,7 @@ mod tests {
                 number,
                 offers,
                 free: server.slots - server.taken,
-                queue: Vec::new(),
+                ..Offers::default()
             };
             // The slots of turns are counted above.
             let turns = self.dispatcher.offered(&id, &offers, &mut self.balancer, self.now);
@@ -822,6 +883,36 @@ mod tests {
     }
 
     #[test]
+    fn whose_server_is_gone_has_its_place_again_and_whose_pass_is_used_has_not() {
+        let mut fleet = Fleet::new(&[(&[0], true, 2)]);
+        let Entered::Waits(first, None) = fleet.enter(0, None, 1) else {
+            panic!()
+        };
+        fleet.pass_time(Duration::from_millis(1));
+        let Entered::Waits(second, None) = fleet.enter(0, None, 2) else {
+            panic!()
+        };
+        fleet.free(0);
+        fleet.free(0);
+        let used = Offers {
+            number: u64::MAX,
+            used: vec![ReservationId(2)],
+            ..Offers::default()
+        };
+        fleet.dispatcher.offered(&0, &used, &mut fleet.balancer, fleet.now);
+        fleet.dispatcher.unlink(&0);
+        let sent = fleet.now.unix;
+        let again = |place| Some(Ticket { place, sent });
+        fleet.pass_time(Duration::from_millis(1));
+        assert_eq!(fleet.enter(0, again(first), 3), Entered::Waits(first, None));
+        let since = fleet.now.unix;
+        assert_eq!(
+            fleet.enter(0, again(second), 4),
+            Entered::Waits(Place { since, number: 4 }, None)
+        );
+    }
+
+    #[test]
     fn a_server_that_is_full_contrary_to_its_report_keeps_nobody_waiting() {
         let mut fleet = Fleet::new(&[(&[0], true, 5), (&[0], true, 5)]);
         // Both report room; another session server has taken that of the first.
@@ -852,7 +943,7 @@ mod tests {
                 address: None,
                 user: None,
             };
-            fleet.dispatcher.enter(None, entry, number, fleet.now);
+            fleet.dispatcher.enter(None, entry, number, |_| true, fleet.now);
         }
         let accepts = accepts(&fleet.servers);
         fleet.dispatcher.news(&[0, 1], &accepts, fleet.now.instant);

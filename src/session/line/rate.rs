@@ -55,8 +55,11 @@ impl Rate {
         while self.counts.len() > KEPT {
             self.counts.pop_front();
         }
-        let oldest = self.begun - STEP * u32::try_from(self.counts.len() - 1).unwrap_or_default();
-        self.since = self.since.max(oldest);
+        let before = STEP * u32::try_from(self.counts.len() - 1).unwrap_or_default();
+        self.since = self
+            .begun
+            .checked_sub(before)
+            .map_or(self.since, |oldest| self.since.max(oldest));
     }
 }
 

@@ -203,6 +203,22 @@ impl<Client: Clone> WaitingLine<Client> {
         news
     }
 
+    /// How a client stands that has just come, as the first that it hears; `None` if it does not wait.
+    pub(super) fn first_news(
+        &mut self,
+        place: Place,
+        now: Instant,
+        mut progress: impl FnMut(&Place, &Arc<Group>) -> Progress,
+    ) -> Option<Progress> {
+        let mut stands = None;
+        for (before, waiting) in self.waiting.range(..=place) {
+            stands = Some(progress(before, &waiting.group));
+        }
+        let waiting = self.waiting.get_mut(&place)?;
+        waiting.heard = stands.map(|stands| (stands, now));
+        stands
+    }
+
     /// The clients whose tickets must be sent again.
     pub(super) fn renewals(&mut self, now: Instant, after: Duration) -> Vec<(Client, Place)> {
         let mut due = Vec::new();

@@ -1,9 +1,11 @@
 //! Actor: the WebSocket of one web client, which receives the fleet's availability and requests simulation servers.
 //!
 //! Created by the route for each connection; ends with it. It sends the fleet's availability when it changes: only the
-//! latest value, and never the same twice in a row. A text from the client requests a simulation server.
+//! latest value, and never the same twice in a row. A text from the client requests a simulation server, at once or when
+//! it is its turn in the line.
 
 use std::sync::Arc;
+use std::time::SystemTime;
 
 use actix::prelude::*;
 use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
@@ -15,7 +17,10 @@ use serde_json::Value;
 use tokio::sync::watch;
 
 use super::refusal;
-use crate::session::state::AppState;
+use crate::session::fleet::{LineEvent, StopWaiting, Wait};
+use crate::session::line::{Place, Progress, Ticket};
+use crate::session::state::{AppState, PLACED, read_world};
+use crate::shared::domain::{Failure, ProjectUrl};
 use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::websocket::wrong_message;
 use crate::shared::http::{ConnectionPermit, Peer};
@@ -27,21 +32,44 @@ pub struct WebClient {
     server: Arc<AppState>,
     peer: Peer,
     liveness: Liveness,
+    /// Its user, if a trusted reverse proxy names one.
+    user: Option<String>,
     /// Whether it has requested announcements.
     wants_announcements: bool,
+    /// Identifies this connection in the line.
+    connection: u64,
+    /// Its place in the line.
+    waiting: Option<Waiting>,
     _permit: ConnectionPermit,
+}
+
+/// A client that waits in the line.
+struct Waiting {
+    world: ProjectUrl,
+    /// Its place; `None` until the registry has answered.
+    place: Option<Place>,
+    /// The seconds until its turn, as last sent.
+    estimate: Option<u32>,
 }
 
 type Context = WebsocketContext<WebClient>;
 
 impl WebClient {
     /// A client that has just connected; `permit` counts it.
-    pub fn new(server: Arc<AppState>, peer: Peer, wants_announcements: bool, permit: ConnectionPermit) -> Self {
+    pub fn new(
+        server: Arc<AppState>,
+        (peer, user): (Peer, Option<String>),
+        wants_announcements: bool,
+        permit: ConnectionPermit,
+    ) -> Self {
         Self {
             server,
             peer,
+            user,
             liveness: Liveness::default(),
             wants_announcements,
+            connection: rand::random(),
+            waiting: None,
             _permit: permit,
         }
     }
@@ -54,9 +82,16 @@ impl WebClient {
         ctx.stop();
     }
 
-    fn pick(&self, text: &str, ctx: &mut Context) {
+    fn handle_text(&mut self, text: &str, ctx: &mut Context) {
+        match Request::parse(text) {
+            Request::Pick(request) => self.pick(request, ctx),
+            Request::Wait(request, ticket) => self.wait(&request, ticket.as_deref(), ctx),
+            Request::StopWaiting => self.stop_waiting(),
+        }
+    }
+
+    fn pick(&self, request: ServerRequest, ctx: &mut Context) {
         let server = Arc::clone(&self.server);
-        let request = ServerRequest::parse(text);
         let from = self.peer.rate_limit_key();
         let picked = async move {
             let picked = server.pick(request.world.as_deref(), from).await;
@@ -67,18 +102,89 @@ impl WebClient {
             .into_actor(self)
             .map(|(picked, wants_reason), _, ctx| match picked {
                 Ok(url) => ctx.text(url),
-                Err(failure) => {
-                    if wants_reason {
-                        ctx.text(refusal::reason_text(failure.reason));
-                    }
-                    ctx.text(refusal::sentence(&failure));
+                Err(failure) => Self::refuse(&failure, wants_reason, ctx),
+            })
+            .wait(ctx);
+    }
+
+    /// Enters the line. What happens there follows as messages.
+    fn wait(&mut self, request: &ServerRequest, ticket: Option<&str>, ctx: &mut Context) {
+        self.stop_waiting();
+        let world = match read_world(request.world.as_deref().unwrap_or_default()) {
+            Ok(world) => world,
+            Err(failure) => return Self::refuse(&failure, request.wants_reason, ctx),
+        };
+        self.waiting = Some(Waiting {
+            world: world.clone(),
+            place: None,
+            estimate: None,
+        });
+        let wait = Wait {
+            world,
+            ticket: ticket.and_then(|text| Ticket::read(text, &self.server.key, now())),
+            client: ctx.address().recipient(),
+            connection: self.connection,
+            from: self.peer.rate_limit_key(),
+            user: self.user.clone(),
+        };
+        let wants_reason = request.wants_reason;
+        let server = Arc::clone(&self.server);
+        async move { server.wait(wait).await }
+            .into_actor(self)
+            .map(move |entered, client, ctx| match (entered, &mut client.waiting) {
+                (Ok(Some(place)), Some(waiting)) => {
+                    waiting.place = Some(place);
+                    client.send_ticket(place, ctx);
+                }
+                (Ok(_), _) => {}
+                (Err(failure), _) => {
+                    client.waiting = None;
+                    Self::refuse(&failure, wants_reason, ctx);
                 }
             })
             .wait(ctx);
     }
+
+    fn stop_waiting(&mut self) {
+        if let Some(place) = self.waiting.take().and_then(|waiting| waiting.place) {
+            self.server.registry.do_send(StopWaiting {
+                place,
+                connection: self.connection,
+            });
+        }
+    }
+
+    fn send_ticket(&self, place: Place, ctx: &mut Context) {
+        let ticket = Ticket { place, sent: now() };
+        ctx.text(format!("ticket: {}", ticket.write(&self.server.key)));
+    }
+
+    fn refuse(failure: &Failure, wants_reason: bool, ctx: &mut Context) {
+        if wants_reason {
+            ctx.text(refusal::reason_text(failure.reason));
+        }
+        ctx.text(refusal::sentence(failure));
+    }
 }
 
-/// A client's text: a request for a simulation server.
+/// Milliseconds since 1970.
+fn now() -> u64 {
+    let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+    since.map_or(0, |since| u64::try_from(since.as_millis()).unwrap_or(u64::MAX))
+}
+
+/// What a client's text requests.
+#[derive(Debug, PartialEq)]
+enum Request {
+    /// A simulation server now.
+    Pick(ServerRequest),
+    /// A simulation server when it is the client's turn; it may have a ticket.
+    Wait(ServerRequest, Option<String>),
+    /// To leave the line.
+    StopWaiting,
+}
+
+/// A request for a simulation server.
 #[derive(Debug, PartialEq)]
 struct ServerRequest {
     /// The URL of its world, if it names one.
@@ -87,25 +193,35 @@ struct ServerRequest {
     wants_reason: bool,
 }
 
-impl ServerRequest {
-    /// Reads a URL or `{"url": ...}`; anything else names no world.
+impl Request {
+    /// Reads a URL, `{"url": ...}` or `{"wait": ...}`; anything else requests a server without naming a world.
     fn parse(text: &str) -> Self {
         #[derive(Deserialize)]
         struct Wanted {
-            url: Value,
+            url: Option<Value>,
             #[serde(default)]
             reason: Value,
+            #[serde(default)]
+            wait: Value,
+            #[serde(default)]
+            ticket: Value,
         }
         let text = text.trim();
-        match serde_json::from_str(text) {
-            Ok(Wanted { url, reason }) => Self {
-                world: Some(url.as_str().map_or_else(|| url.to_string(), str::to_owned)),
-                wants_reason: reason == true,
-            },
-            Err(_) => Self {
+        let Ok(wanted) = serde_json::from_str::<Wanted>(text) else {
+            return Self::Pick(ServerRequest {
                 world: text.contains("://").then(|| text.to_owned()),
                 wants_reason: false,
-            },
+            });
+        };
+        let url = wanted.url;
+        let request = ServerRequest {
+            world: url.map(|url| url.as_str().map_or_else(|| url.to_string(), str::to_owned)),
+            wants_reason: wanted.reason == true,
+        };
+        match wanted.wait {
+            Value::Bool(true) => Self::Wait(request, wanted.ticket.as_str().map(str::to_owned)),
+            Value::Bool(false) if request.world.is_none() => Self::StopWaiting,
+            _ => Self::Pick(request),
         }
     }
 }
@@ -119,6 +235,41 @@ impl Actor for WebClient {
         ctx.add_stream(updates(self.server.available.clone(), self.server.phase.clone()));
         if self.wants_announcements {
             ctx.add_stream(announcements(self.server.announcement.subscribe()));
+        }
+    }
+
+    fn stopped(&mut self, _: &mut Self::Context) {
+        self.stop_waiting();
+    }
+}
+
+impl Handler<LineEvent> for WebClient {
+    type Result = ();
+
+    fn handle(&mut self, event: LineEvent, ctx: &mut Context) {
+        // It has left the line meanwhile.
+        let Some(waiting) = &mut self.waiting else { return };
+        match event {
+            LineEvent::Ticket(place) => self.send_ticket(place, ctx),
+            LineEvent::Progress(Progress { ahead, estimate }) => {
+                ctx.text(format!("queue: {ahead}"));
+                if let Some(seconds) = estimate.filter(|_| waiting.estimate != estimate) {
+                    ctx.text(format!("estimate: {seconds}"));
+                }
+                waiting.estimate = estimate;
+            }
+            LineEvent::Turn(turn) => {
+                if let Some(pass) = turn.pass {
+                    ctx.text(format!("pass: {}", pass.write(&self.server.key, &waiting.world)));
+                }
+                ctx.text(self.server.client_urls.websocket_url(&turn.server));
+                self.server.picks.with_label_values(&[PLACED]).inc();
+                self.waiting = None;
+            }
+            LineEvent::TakenOver => {
+                ctx.text("Error: another connection has this place in the line.");
+                self.waiting = None;
+            }
         }
     }
 }
@@ -167,7 +318,7 @@ impl StreamHandler<Option<ByteString>> for WebClient {
 impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
     fn handle(&mut self, message: Result<Message, ProtocolError>, ctx: &mut Self::Context) {
         match message {
-            Ok(Message::Text(text)) if self.liveness.may_answer() => self.pick(&text, ctx),
+            Ok(Message::Text(text)) if self.liveness.may_answer() => self.handle_text(&text, ctx),
             Ok(Message::Ping(data)) if self.liveness.may_answer() => ctx.pong(&data),
             Ok(Message::Pong(content)) => self.liveness.pong(&content),
             Ok(Message::Close(reason)) => {
@@ -192,6 +343,17 @@ impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
 mod tests {
     use super::*;
 
+    fn pick(world: Option<&str>, wants_reason: bool) -> Request {
+        Request::Pick(request(world, wants_reason))
+    }
+
+    fn request(world: Option<&str>, wants_reason: bool) -> ServerRequest {
+        ServerRequest {
+            world: world.map(str::to_owned),
+            wants_reason,
+        }
+    }
+
     #[test]
     fn a_message_may_name_a_world() {
         let world = "https://github.com/u/r/blob/main/worlds/a.wbt";
@@ -205,21 +367,44 @@ mod tests {
             ("http://no.world", Some("http://no.world")),
         ];
         for (text, expected) in table {
-            let request = ServerRequest::parse(text);
-            assert_eq!(request.world.as_deref(), expected, "{text:?}");
-            assert!(!request.wants_reason, "{text:?}");
+            assert_eq!(Request::parse(text), pick(expected, false), "{text:?}");
         }
     }
 
     #[test]
     fn only_a_client_that_asks_for_the_reason_gets_it() {
         for (text, expected) in [
-            (r#"{"url": "x", "reason": true}"#, true),
-            (r#"{"url": "x", "reason": false}"#, false),
-            (r#"{"url": "x", "reason": "true"}"#, false),
-            (r#"{"reason": true}"#, false),
+            (r#"{"url": "x", "reason": true}"#, pick(Some("x"), true)),
+            (r#"{"url": "x", "reason": false}"#, pick(Some("x"), false)),
+            (r#"{"url": "x", "reason": "true"}"#, pick(Some("x"), false)),
+            (r#"{"reason": true}"#, pick(None, true)),
         ] {
-            assert_eq!(ServerRequest::parse(text).wants_reason, expected, "{text}");
+            assert_eq!(Request::parse(text), expected, "{text}");
+        }
+    }
+
+    #[test]
+    fn a_client_may_ask_to_wait() {
+        let ticket = Some("abc".to_owned());
+        for (text, expected) in [
+            (
+                r#"{"url": "x", "wait": true}"#,
+                Request::Wait(request(Some("x"), false), None),
+            ),
+            (
+                r#"{"url": "x", "wait": true, "ticket": "abc", "reason": true}"#,
+                Request::Wait(request(Some("x"), true), ticket),
+            ),
+            (
+                r#"{"url": "x", "wait": true, "ticket": 5}"#,
+                Request::Wait(request(Some("x"), false), None),
+            ),
+            (r#"{"url": "x", "wait": "true"}"#, pick(Some("x"), false)),
+            (r#"{"url": "x", "wait": false}"#, pick(Some("x"), false)),
+            (r#"{"wait": false}"#, Request::StopWaiting),
+            (r#"{"wait": true}"#, Request::Wait(request(None, false), None)),
+        ] {
+            assert_eq!(Request::parse(text), expected, "{text}");
         }
     }
 }

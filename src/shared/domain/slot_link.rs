@@ -81,6 +81,9 @@ pub struct Offers {
     pub offers: Vec<Offer>,
     /// Number of slots that are free now.
     pub free: u32,
+    /// Reservations whose clients have come.
+    #[serde(default)]
+    pub used: Vec<ReservationId>,
     /// How long each client at its own door has waited, in milliseconds.
     #[serde(default)]
     pub queue: Vec<u64>,

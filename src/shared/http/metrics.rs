@@ -1,6 +1,6 @@
 //! Counters and gauges in Prometheus' text format.
 
-use prometheus::{Encoder, GaugeVec, IntCounterVec, Opts, Registry, TextEncoder};
+use prometheus::{Encoder, GaugeVec, Histogram, HistogramOpts, IntCounterVec, Opts, Registry, TextEncoder};
 
 /// The metrics of one server.
 ///
@@ -47,6 +47,16 @@ impl Metrics {
         let counter = IntCounterVec::new(Opts::new(name, help), &[label])?;
         self.counters.register(Box::new(counter.clone()))?;
         Ok(counter)
+    }
+
+    /// Adds a histogram with these upper bounds.
+    ///
+    /// # Errors
+    /// When the name is not a valid metric name, or is taken.
+    pub fn histogram(&self, name: &str, help: &str, bounds: &[f64]) -> Result<Histogram, prometheus::Error> {
+        let histogram = Histogram::with_opts(HistogramOpts::new(name, help).buckets(bounds.to_vec()))?;
+        self.counters.register(Box::new(histogram.clone()))?;
+        Ok(histogram)
     }
 
     /// Writes the counters and these gauges.

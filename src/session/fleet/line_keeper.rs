@@ -1,0 +1,236 @@
+//! The line of the fleet: passes what happens to it between clients, monitors and the dispatcher. Part of the registry.
+
+use std::collections::HashMap;
+use std::net::IpAddr;
+use std::time::{Duration, Instant, SystemTime};
+
+use actix::prelude::*;
+use prometheus::Histogram;
+
+use super::refusal::refusal;
+use super::registry::effective_load;
+use super::server_record::ServerRecord;
+use super::server_table::ServerTable;
+use super::slot_link::{LinkChange, LinkEvent};
+use crate::session::line::{Dispatcher, Entered, Entry, Moment, Place, Progress, Served, Ticket, Turn, WaitingFor};
+use crate::shared::domain::{Failure, ProjectUrl, PublicAddress, Reason};
+
+/// Asks for a slot, and waits for it in the line. The answer is the place, unless it is the client's turn already.
+#[derive(Message, Debug)]
+#[rtype(result = "Result<Option<Place>, Failure>")]
+pub struct Wait {
+    /// The client's world.
+    pub world: ProjectUrl,
+    /// The place that the client had.
+    pub ticket: Option<Ticket>,
+    /// Receives what happens to the client.
+    pub client: Recipient<LineEvent>,
+    /// Identifies its connection.
+    pub connection: u64,
+    /// The client's address, if it is known.
+    pub from: Option<IpAddr>,
+    /// The client's user, if it is known.
+    pub user: Option<String>,
+}
+
+/// A client waits no longer.
+#[derive(Message, Debug)]
+#[rtype(result = "()")]
+pub struct StopWaiting {
+    /// Its place.
+    pub place: Place,
+    /// Its connection, unless another one has that place by now.
+    pub connection: u64,
+}
+
+/// What happens to a client in the line.
+#[derive(Message, Debug, Clone)]
+#[rtype(result = "()")]
+pub enum LineEvent {
+    /// Its place, for which it needs a new ticket.
+    Ticket(Place),
+    /// How it stands.
+    Progress(Progress),
+    /// It is its turn.
+    Turn(Turn<PublicAddress>),
+    /// Another connection has its place.
+    TakenOver,
+}
+
+/// What is known of the line.
+#[derive(Debug, Clone, Default)]
+pub struct LineStatus {
+    /// Number of clients that wait.
+    pub waiting: usize,
+    /// What they wait for, those that have waited longest first.
+    pub worlds: Vec<WaitingFor>,
+}
+
+/// The line, and how long clients have waited in it.
+pub(super) struct LineKeeper {
+    dispatcher: Dispatcher<PublicAddress, Recipient<LineEvent>>,
+    waited: Histogram,
+    /// When the clients were last told how they stand.
+    told: Instant,
+}
+
+/// What is known of each server.
+type Records = HashMap<PublicAddress, ServerRecord>;
+
+/// Interval between two looks at who must be told how it stands.
+const NEWS: Duration = Duration::from_secs(1);
+
+impl LineKeeper {
+    /// Nobody waits. Observes in `waited` how long each client has waited, in seconds.
+    pub(super) fn new(waited: Histogram) -> Self {
+        Self {
+            dispatcher: Dispatcher::default(),
+            waited,
+            told: Instant::now(),
+        }
+    }
+
+    /// Whether the free slots of a server belong to the line.
+    pub(super) fn claims(&self, records: &Records, server: &PublicAddress) -> bool {
+        self.dispatcher.claims(server, accepts(records))
+    }
+
+    /// A client asks for a slot.
+    pub(super) fn enter(&mut self, servers: &mut ServerTable, wait: Wait) -> Result<Option<Place>, Failure> {
+        let records = servers.records.values();
+        let loads = records.map(|record| (record, effective_load(&servers.fleet, &record.address)));
+        let refused = refusal(loads, Some(&wait.world));
+        if matches!(refused.reason, Reason::RepositoryNotAllowed | Reason::RepositoryBlocked) {
+            return Err(refused);
+        }
+        let (now, client) = (moment(), wait.client);
+        let entry = Entry {
+            world: wait.world,
+            client: client.clone(),
+            connection: wait.connection,
+            address: wait.from,
+            user: wait.user,
+        };
+        let is_up = |server: &PublicAddress| {
+            let record = servers.records.get(server);
+            record.is_some_and(|record| record.state.report().is_some())
+        };
+        match self.dispatcher.enter(wait.ticket, entry, rand::random(), is_up, now) {
+            Entered::Again(turn) => {
+                client.do_send(LineEvent::Turn(turn));
+                Ok(None)
+            }
+            Entered::Waits(place, displaced) => {
+                if let Some(displaced) = displaced {
+                    displaced.do_send(LineEvent::TakenOver);
+                }
+                self.serve(servers, None);
+                if let Some(ahead) =
+                    self.dispatcher
+                        .first_news(place, servers.addresses(), accepts(&servers.records), now.instant)
+                {
+                    client.do_send(LineEvent::Progress(ahead));
+                }
+                Ok(Some(place))
+            }
+        }
+    }
+
+    /// A client waits no longer.
+    pub(super) fn leave(&mut self, StopWaiting { place, connection }: StopWaiting) {
+        self.dispatcher.leave(place, connection);
+    }
+
+    /// Something has happened to the link of a server.
+    pub(super) fn link(&mut self, servers: &mut ServerTable, LinkEvent { server, change }: LinkEvent) {
+        if !servers.records.contains_key(&server) {
+            return;
+        }
+        match change {
+            LinkChange::Up(hello) => self.dispatcher.link(server.clone(), &hello),
+            LinkChange::Down => self.dispatcher.unlink(&server),
+            LinkChange::Offers(offers) => {
+                let turns = self.dispatcher.offered(&server, &offers, &mut servers.fleet, moment());
+                self.give(turns);
+            }
+        }
+        self.serve(servers, Some(&server));
+    }
+
+    /// A server has reported.
+    pub(super) fn reported(&mut self, servers: &mut ServerTable, server: &PublicAddress) {
+        let record = servers.records.get(server);
+        let report = record.and_then(|record| record.state.report());
+        if let Some(instances) = report.and_then(|report| report.instances) {
+            self.dispatcher.count_freed(server, instances.freed, Instant::now());
+        }
+        if !self.dispatcher.is_empty() {
+            self.serve(servers, Some(server));
+        }
+    }
+
+    /// Forgets the servers that are no longer in the fleet.
+    pub(super) fn forget_others(&mut self, servers: &ServerTable) {
+        self.dispatcher.retain(|server| servers.records.contains_key(server));
+    }
+
+    /// Looks after what changes with time alone.
+    pub(super) fn tick(&mut self, servers: &mut ServerTable) {
+        self.serve(servers, None);
+        let now = Instant::now();
+        if now.duration_since(self.told) < NEWS || self.dispatcher.is_empty() {
+            return;
+        }
+        self.told = now;
+        for (client, progress) in self
+            .dispatcher
+            .news(servers.addresses(), accepts(&servers.records), now)
+        {
+            client.do_send(LineEvent::Progress(progress));
+        }
+        for (client, place) in self.dispatcher.renewals(now) {
+            client.do_send(LineEvent::Ticket(place));
+        }
+    }
+
+    /// What is known of the line.
+    pub(super) fn status(&self) -> LineStatus {
+        LineStatus {
+            waiting: self.dispatcher.len(),
+            worlds: self.dispatcher.waiting_for(moment().unix),
+        }
+    }
+
+    /// Gives turns, and tells servers who waits: this one, or all.
+    fn serve(&mut self, servers: &mut ServerTable, only: Option<&PublicAddress>) {
+        let ServerTable { records, fleet, .. } = servers;
+        let Served { turns, wishes } = self.dispatcher.serve(fleet, accepts(records), only, moment());
+        self.give(turns);
+        for (server, wishes) in wishes {
+            servers.ask(&server, wishes);
+        }
+    }
+
+    fn give(&self, turns: Vec<(Recipient<LineEvent>, Turn<PublicAddress>)>) {
+        for (client, turn) in turns {
+            self.waited.observe(turn.waited.as_secs_f64());
+            client.do_send(LineEvent::Turn(turn));
+        }
+    }
+}
+
+/// Whether a server accepts a world, by its last report.
+fn accepts(records: &Records) -> impl Fn(&PublicAddress, &ProjectUrl) -> bool {
+    |server, world| {
+        let answer = records.get(server).and_then(|record| record.state.last_answer());
+        answer.is_some_and(|answer| answer.report.check(world, answer.report.load).is_ok())
+    }
+}
+
+fn moment() -> Moment {
+    let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+    Moment {
+        instant: Instant::now(),
+        unix: since.map_or(0, |since| u64::try_from(since.as_millis()).unwrap_or(u64::MAX)),
+    }
+}
