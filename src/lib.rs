@@ -11,8 +11,9 @@
 //! | [`shared::run`] | start, readiness, log, stop |
 //! | [`shared::http`] | pages, live updates, WebSockets, limits, certificates, metrics |
 //! | [`session::placement`] | which server gets the next client: the load of a server and the key that servers are sorted by (`backend`), the choice of the first (`load_balancer`), cost |
+//! | [`session::line`] | the clients that wait for a slot of the fleet: tickets (`ticket`), the order (`waiting_line`), who gets the next slot of which server (`dispatcher`) |
 //! | [`session::mail`] | notices: to whom (`smtp`, one address, from the key `administrator` in `config/session_config`) and how (`channel`), what is in them (`notice_text`), when they are sent (`outbox`) |
-//! | [`session::fleet`] | the registry and the monitors of simulation servers |
+//! | [`session::fleet`] | the registry and the monitors of simulation servers, and what connects them with the line (`line_keeper`, `slot_link`) |
 //! | [`session::web`] | routes, pages, `/status`, Prometheus metrics (gauges in `metrics`, counters in `app`) and the WebSocket of the session server |
 //! | [`simulation::process`] | process trees: how they start and end (`process_group`: SIGTERM, grace period, SIGKILL; leftovers of a dead server: `process_tree`, `guardian`); directories of simulations |
 //! | [`simulation::machine`] | readings of the machine (`sensors`) and its GPUs (`gpus`), the load and `monitor.csv` (`load_monitor`); which GPU a simulation gets (`spread`) |
@@ -48,9 +49,11 @@
 //!
 //!   routes ----------- Pick, GetStatus ------------> Registry --- Notice --> mailer --> SMTP
 //!     | one per WebSocket                             ^  |  | one per simulation server
-//!   WebClient ---------- Pick ------------------------'  |  v
+//!   WebClient ------- Pick, Wait ---------------------'  |  v
 //!     |  ^                                               | ServerMonitor -- GET /status, /load --> simulation server
-//!     |  '- availability (watch channel) -- Registry     '-- ProbeResult --> Registry
+//!     |  '- availability (watch channel) -- Registry     |  |           <- WebSocket /slots --->
+//!     |  '- LineEvent -- Registry                        |  '- Ask (Wishes) -- Registry
+//!                                                        '-- ProbeResult, LinkEvent --> Registry
 //!
 //!   Mailers are tasks. The monitors share a thread of their own, so that clients never wait for them.
 //!

@@ -13,6 +13,7 @@ mod requests;
 mod seeing;
 mod stopping;
 mod trust;
+mod waiting;
 mod watching;
 mod webhook;
 

@@ -66,6 +66,13 @@ pub struct LineStatus {
     pub worlds: Vec<WaitingFor>,
 }
 
+impl LineStatus {
+    /// How long the first client has waited.
+    pub fn longest(&self) -> Duration {
+        self.worlds.first().map_or(Duration::ZERO, |first| first.longest)
+    }
+}
+
 /// The line, and how long clients have waited in it.
 pub(super) struct LineKeeper {
     dispatcher: Dispatcher<PublicAddress, Recipient<LineEvent>>,

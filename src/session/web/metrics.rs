@@ -31,6 +31,16 @@ pub fn gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> 
         ),
         Gauge::plain("webots_session_clients", "Web clients connected", number(clients)),
         Gauge::plain(
+            "webots_session_waiting",
+            "Clients that wait in the line",
+            number(status.line.waiting),
+        ),
+        Gauge::plain(
+            "webots_session_waiting_longest_seconds",
+            "How long the first client of the line has waited",
+            status.line.longest().as_secs_f64(),
+        ),
+        Gauge::plain(
             "webots_session_load_percent",
             "Mean load of the servers that answer, -1 where none does",
             status.mean_load.unwrap_or(-1.0),

@@ -4,7 +4,8 @@ use std::time::Duration;
 
 use serde_json::{Value, json};
 
-use crate::session::fleet::{FleetStatus, ServerStatus};
+use crate::session::fleet::{FleetStatus, LineStatus, ServerStatus};
+use crate::session::line::WaitingFor;
 use crate::session::state::AppState;
 use crate::shared::domain::{ClientUrls, Failure};
 
@@ -19,6 +20,25 @@ pub fn status_page(server: &AppState, status: &FleetStatus) -> Value {
         "servers": status.servers.iter().map(|one| server_status(one, &server.client_urls)).collect::<Vec<_>>(),
         "names": status.names,
         "changes": status.changes,
+        "line": line_status(&status.line),
+    })
+}
+
+/// Most repositories that are listed.
+const MAX_LISTED: usize = 50;
+
+fn line_status(line: &LineStatus) -> Value {
+    let world = |one: &WaitingFor| {
+        json!({
+            "repository": one.repository,
+            "waiting": one.waiting,
+            "longest": one.longest.as_secs_f64(),
+        })
+    };
+    json!({
+        "waiting": line.waiting,
+        "longest": line.longest().as_secs_f64(),
+        "worlds": line.worlds.iter().take(MAX_LISTED).map(world).collect::<Vec<_>>(),
     })
 }
 

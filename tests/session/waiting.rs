@@ -1,0 +1,206 @@
+//! The line: clients that wait for a slot, at simulation servers that only report.
+
+use serde_json::json;
+
+use super::stand_in::{Manner, StandIn};
+use super::{addresses, until_states};
+use crate::support::client::Client;
+use crate::support::git::world;
+use crate::support::program::{Builder, Server, session_server};
+use crate::support::{http, until};
+
+/// A client in the line, and its ticket.
+struct Waiting(Client, String);
+
+impl Waiting {
+    async fn enter(session: &Server, owner: &str) -> Self {
+        Self::come_back(session, owner, "").await
+    }
+
+    async fn come_back(session: &Server, owner: &str, ticket: &str) -> Self {
+        let mut client = Client::connect(&session.websocket("/session")).await;
+        let url = world(&format!("{owner}/arm"), "main", "worlds/a.wbt");
+        client
+            .send(&json!({"url": url, "wait": true, "ticket": ticket}).to_string())
+            .await;
+        let ticket = client.until("ticket: ").await.replace("ticket: ", "");
+        Self(client, ticket)
+    }
+
+    async fn position(&mut self) -> String {
+        self.0.until("queue: ").await
+    }
+
+    async fn address(&mut self) -> String {
+        self.0.until("ws://").await
+    }
+}
+
+fn full() -> Manner {
+    Manner::status(10.0, 1, 1)
+}
+
+async fn one_full_server(builder: impl Fn(Builder) -> Builder) -> (StandIn, Server) {
+    let server = StandIn::start(full());
+    let session = builder(session_server(&[server.address()])).start().await;
+    until_states(&session, &["full"]).await;
+    (server, session)
+}
+
+#[actix_rt::test]
+async fn clients_get_their_turn_in_the_order_in_which_they_came() {
+    let (server, session) = one_full_server(|builder| builder).await;
+    let mut line = Vec::new();
+    for ahead in 0..3 {
+        let mut client = Waiting::enter(&session, "lab").await;
+        assert_eq!(client.position().await, format!("queue: {ahead}"));
+        line.push(client);
+    }
+    // Whoever asks without waiting gets nothing, and hears that nothing is free.
+    let mut listener = Client::connect(&session.websocket("/")).await;
+    listener.until("0").await;
+    for arrivals in 2.. {
+        let Some(mut next) = (!line.is_empty()).then(|| line.remove(0)) else {
+            break;
+        };
+        let free = json!({"load": 10, "instances": {"running": 0, "places": 1, "arrivals": arrivals - 1}});
+        server.set(Manner::Status(free));
+        assert_eq!(next.address().await, server.url());
+        assert!(
+            !next.0.heard.iter().any(|text| text.starts_with("pass:")),
+            "{:?}",
+            next.0.heard
+        );
+        let taken = json!({"load": 10, "instances": {"running": 1, "places": 1, "arrivals": arrivals}});
+        server.set(Manner::Status(taken));
+        for (ahead, one) in line.iter_mut().enumerate() {
+            assert_eq!(one.position().await, format!("queue: {ahead}"));
+        }
+        until_states(&session, &["full"]).await;
+    }
+    assert_eq!(listener.heard, ["0"]);
+}
+
+#[actix_rt::test]
+async fn a_free_slot_is_given_at_once() {
+    let server = StandIn::start(Manner::idle(3.0, 10));
+    let session = session_server(&[server.address()]).start().await;
+    until_states(&session, &["up"]).await;
+    let mut client = Waiting::enter(&session, "lab").await;
+    assert_eq!(client.address().await, server.url());
+    assert!(
+        !client.0.heard.iter().any(|text| text.starts_with("queue:")),
+        "{:?}",
+        client.0.heard
+    );
+    let mut wrong = Client::connect(&session.websocket("/session")).await;
+    wrong
+        .send(r#"{"url": "https://github.com/lab", "wait": true, "reason": true}"#)
+        .await;
+    assert!(wrong.until("reason: ").await.contains("invalid-world"));
+    assert!(wrong.until("Error: ").await.contains("Wrong Webots simulation URL"));
+}
+
+#[actix_rt::test]
+async fn a_ticket_keeps_the_place_over_a_reload_and_a_restart_of_the_session_server() {
+    let (_server, mut session) = one_full_server(|builder| builder.set("fleetKey", "a secret of this test")).await;
+    let Waiting(first, ticket) = Waiting::enter(&session, "lab").await;
+    let mut second = Waiting::enter(&session, "lab").await;
+    assert_eq!(second.position().await, "queue: 1");
+    first.leave().await;
+    assert_eq!(second.position().await, "queue: 0");
+    let mut first = Waiting::come_back(&session, "lab", &ticket).await;
+    assert_eq!(first.position().await, "queue: 0");
+    assert_eq!(second.position().await, "queue: 1");
+    // The ticket on a second connection: the first one loses the place.
+    let mut again = Waiting::come_back(&session, "lab", &first.1).await;
+    assert_eq!(again.position().await, "queue: 0");
+    first.0.until("Error: another connection has this place").await;
+    session.signal(nix::sys::signal::Signal::SIGKILL);
+    assert_eq!(session.ended().await, None);
+    let folder = &session.folder;
+    let config: serde_json::Value =
+        serde_json::from_str(&std::fs::read_to_string(folder.join("config.json")).unwrap()).unwrap();
+    let server = config["simulationServers"][0].as_str().unwrap().to_owned();
+    let session = session_server(&[server])
+        .set("fleetKey", "a secret of this test")
+        .start()
+        .await;
+    until_states(&session, &["full"]).await;
+    // They come back in another order, and a new one in between.
+    let mut second = Waiting::come_back(&session, "lab", &second.1).await;
+    assert_eq!(second.position().await, "queue: 0");
+    let mut third = Waiting::enter(&session, "lab").await;
+    assert_eq!(third.position().await, "queue: 1");
+    let mut again = Waiting::come_back(&session, "lab", &again.1).await;
+    assert_eq!(again.position().await, "queue: 0");
+    assert_eq!(second.position().await, "queue: 1");
+    assert_eq!(third.position().await, "queue: 2");
+    // A forged one is worth nothing.
+    let mut forged = Waiting::come_back(&session, "lab", &again.1.replace(|_| true, "A")).await;
+    assert_eq!(forged.position().await, "queue: 3");
+}
+
+#[actix_rt::test]
+async fn free_slots_belong_to_those_who_wait_for_them_and_to_nobody_else() {
+    let servers = [Manner::of_owner("lab"), Manner::of_owner("school")].map(StandIn::start);
+    let taken = |owner: &str| {
+        let allowed = [format!("https://github.com/{owner}")];
+        Manner::Status(
+            json!({"load": 1, "instances": {"running": 1, "places": 1}, "docker": false,
+            "allowedRepositories": allowed}),
+        )
+    };
+    servers[0].set(taken("lab"));
+    let session = session_server(&addresses(&servers)).start().await;
+    until_states(&session, &["full", "up"]).await;
+    let mut waits = Waiting::enter(&session, "lab").await;
+    assert_eq!(waits.position().await, "queue: 0");
+    // A world that another server takes is not blocked by it.
+    let mut lucky = Waiting::enter(&session, "school").await;
+    assert_eq!(lucky.address().await, servers[1].url());
+    let request = async |owner: &str| {
+        let url = world(&format!("{owner}/arm"), "main", "worlds/a.wbt");
+        http::get(&session.url(&format!("/session?url={url}"))).await.text()
+    };
+    assert_eq!(request("school").await, servers[1].url());
+    assert!(
+        request("lab")
+            .await
+            .starts_with("Error: no simulation server available")
+    );
+    let mut refused = Client::connect(&session.websocket("/session")).await;
+    let url = world("stranger/arm", "main", "worlds/a.wbt");
+    refused.send(&json!({"url": url, "wait": true}).to_string()).await;
+    refused.until("Error: no simulation server accepts").await;
+    // One who gives up leaves nothing behind.
+    waits.0.send(r#"{"wait": false}"#).await;
+    until("nobody waits", async || session.status().await["line"]["waiting"] == 0).await;
+    servers[0].set(Manner::of_owner("lab"));
+    until_states(&session, &["up", "up"]).await;
+    assert_eq!(request("lab").await, servers[0].url());
+}
+
+#[actix_rt::test]
+async fn a_user_has_one_place() {
+    let builder = |builder: Builder| builder.set("userHeader", "X-User");
+    let (_server, session) = one_full_server(builder).await;
+    let enter = async || {
+        let url = session.websocket("/session");
+        let mut client = Client::with_headers(&url, &[("x-user", "anna")]).await.unwrap();
+        let url = world("lab/arm", "main", "worlds/a.wbt");
+        client.send(&json!({"url": url, "wait": true}).to_string()).await;
+        client.until("ticket: ").await;
+        client
+    };
+    let mut first = enter().await;
+    assert_eq!(first.until("queue: ").await, "queue: 0");
+    let mut other = Waiting::enter(&session, "lab").await;
+    assert_eq!(other.position().await, "queue: 1");
+    let mut second = enter().await;
+    first.until("Error: another connection has this place").await;
+    assert_eq!(second.until("queue: ").await, "queue: 0");
+    assert_eq!(session.status().await["line"]["waiting"], 2);
+    let metrics = session.metrics().await;
+    assert!(metrics.contains("webots_session_waiting 2"), "{metrics}");
+}
