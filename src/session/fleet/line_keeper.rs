@@ -7,10 +7,8 @@ use std::time::{Duration, Instant, SystemTime};
 use actix::prelude::*;
 use prometheus::Histogram;
 
-use super::refusal::refusal;
-use super::registry::effective_load;
 use super::server_record::ServerRecord;
-use super::server_table::ServerTable;
+use super::server_table::{ServerTable, accepts};
 use super::slot_link::{LinkChange, LinkEvent};
 use crate::session::line::{Dispatcher, Entered, Entry, Moment, Place, Progress, Served, Ticket, Turn, WaitingFor};
 use crate::shared::domain::{Failure, ProjectUrl, PublicAddress, Reason};
@@ -104,9 +102,7 @@ impl LineKeeper {
 
     /// A client asks for a slot.
     pub(super) fn enter(&mut self, servers: &mut ServerTable, wait: Wait) -> Result<Option<Place>, Failure> {
-        let records = servers.records.values();
-        let loads = records.map(|record| (record, effective_load(&servers.fleet, &record.address)));
-        let refused = refusal(loads, Some(&wait.world));
+        let refused = servers.refusal(Some(&wait.world));
         if matches!(refused.reason, Reason::RepositoryNotAllowed | Reason::RepositoryBlocked) {
             return Err(refused);
         }
@@ -223,14 +219,6 @@ impl LineKeeper {
             self.waited.observe(turn.waited.as_secs_f64());
             client.do_send(LineEvent::Turn(turn));
         }
-    }
-}
-
-/// Whether a server accepts a world, by its last report.
-fn accepts(records: &Records) -> impl Fn(&PublicAddress, &ProjectUrl) -> bool {
-    |server, world| {
-        let answer = records.get(server).and_then(|record| record.state.last_answer());
-        answer.is_some_and(|answer| answer.report.check(world, answer.report.load).is_ok())
     }
 }
 

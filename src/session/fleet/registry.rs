@@ -13,15 +13,13 @@ use tokio::sync::watch;
 
 use super::line_keeper::{LineKeeper, StopWaiting, Wait};
 use super::name_table::look_up_all;
-use super::refusal::refusal;
 use super::server_monitor::{Parent, ProbeResult};
 use super::server_record::{Answer, FleetStatus, Intake, ServerRecord, ServerState, ServerStatus};
-use super::server_table::ServerTable;
+use super::server_table::{ServerTable, accepts};
 use super::slot_link::LinkEvent;
 use super::state_history::StateHistory;
 use crate::session::config::SessionConfig;
 use crate::session::line::Place;
-use crate::session::placement::LoadBalancer;
 use crate::shared::domain::{Failure, Load, ProjectUrl, PublicAddress, Reason, ServerReport};
 use crate::shared::http::AddressQuota;
 
@@ -140,22 +138,14 @@ impl Registry {
     /// Chooses a server for a client of this address.
     fn pick(&mut self, world: Option<&ProjectUrl>, from: Option<IpAddr>) -> Result<PublicAddress, Failure> {
         let ServerTable { records, fleet, .. } = &mut self.servers;
-        let admits = |address: &PublicAddress, world: &ProjectUrl| {
-            let answer = records.get(address).and_then(|record| record.state.last_answer());
-            answer.is_some_and(|answer| answer.report.check(world, answer.report.load).is_ok())
-        };
+        let accepts = accepts(records);
         let line = &self.line;
         let eligible = |address: &PublicAddress| {
-            world.is_none_or(|world| admits(address, world)) && !line.claims(records, address)
+            world.is_none_or(|world| accepts(address, world)) && !line.claims(records, address)
         };
         let picked = fleet.pick(Instant::now(), self.quota.take(from), eligible);
-        picked.ok_or_else(|| {
-            let servers = records.values();
-            refusal(
-                servers.map(|record| (record, effective_load(fleet, &record.address))),
-                world,
-            )
-        })
+        drop(accepts);
+        picked.ok_or_else(|| self.servers.refusal(world))
     }
 
     fn status_of(&self, record: &ServerRecord) -> ServerStatus {
@@ -194,11 +184,6 @@ fn ejected(failed: u32) -> Failure {
         Reason::StartsFail,
         format!("its last {failed} starts failed for a reason of its own; others are preferred for a while"),
     )
-}
-
-/// The load of a server with the clients that its last report does not show; `None` if it is down.
-pub(super) fn effective_load(fleet: &LoadBalancer<PublicAddress>, server: &PublicAddress) -> Option<Load> {
-    Load::try_from(fleet.effective_load(server)?).ok()
 }
 
 impl Actor for Registry {

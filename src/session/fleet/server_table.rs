@@ -8,12 +8,13 @@ use actix::prelude::*;
 use rustls::ClientConfig;
 
 use super::name_table::NameTable;
+use super::refusal::refusal;
 use super::server_monitor::{Ask, Parent, ServerMonitor, Stop};
 use super::server_record::ServerRecord;
 use super::slot_link::{LinkChange, LinkEvent};
 use crate::session::config::SessionConfig;
 use crate::session::placement::LoadBalancer;
-use crate::shared::domain::{PublicAddress, Wishes};
+use crate::shared::domain::{Failure, Load, ProjectUrl, PublicAddress, Wishes};
 use crate::shared::http::tls;
 use crate::shared::run::permanent::PanicCounter;
 
@@ -116,6 +117,13 @@ impl ServerTable {
         }
     }
 
+    /// Why no server takes a client for this world, if it names one.
+    pub fn refusal(&self, world: Option<&ProjectUrl>) -> Failure {
+        let load = |record: &ServerRecord| Load::try_from(self.fleet.effective_load(&record.address)?).ok();
+        let servers = self.records.values();
+        refusal(servers.map(|record| (record, load(record))), world)
+    }
+
     /// Tells a server who waits for its slots.
     pub fn ask(&self, server: &PublicAddress, wishes: Wishes) {
         if let Some(monitor) = self.monitors.get(server) {
@@ -131,6 +139,14 @@ impl ServerTable {
     /// What is known of all servers, in the order of the configuration.
     pub fn in_order(&self) -> impl Iterator<Item = &ServerRecord> {
         self.listed.iter().filter_map(|server| self.records.get(server))
+    }
+}
+
+/// Whether a server accepts a world, by its last report.
+pub fn accepts(records: &HashMap<PublicAddress, ServerRecord>) -> impl Fn(&PublicAddress, &ProjectUrl) -> bool {
+    |server, world| {
+        let answer = records.get(server).and_then(|record| record.state.last_answer());
+        answer.is_some_and(|answer| answer.report.check(world, answer.report.load).is_ok())
     }
 }
 
