@@ -72,7 +72,8 @@ pub async fn send() {
             };
             let is_for = |path: &str| begin[..length].starts_with(format!("GET {path} ").as_bytes());
             if is_for("/echo") || is_for("/flood") {
-                let (is_echo, socket) = (is_for("/echo"), socket.into_std().unwrap());
+                let is_echo = is_for("/echo");
+                let socket = socket.into_std().unwrap();
                 socket.set_nonblocking(false).unwrap();
                 std::thread::spawn(move || if is_echo { echo(socket) } else { flood(socket) });
                 return;
@@ -237,11 +238,13 @@ struct Beside {
 
 /// Measures one way. Each connection has a thread of its own, so that they don't wait for each other here.
 fn beside_fast_ones(url: &str, time: Duration) -> Beside {
-    let (received, is_over) = (Arc::new(AtomicU64::new(0)), Arc::new(AtomicBool::new(false)));
+    let received = Arc::new(AtomicU64::new(0));
+    let is_over = Arc::new(AtomicBool::new(false));
     let readers: Vec<_> = (0..FAST)
         .map(|_| {
             let (mut socket, _) = tungstenite::connect(format!("{url}flood")).unwrap();
-            let (received, is_over) = (Arc::clone(&received), Arc::clone(&is_over));
+            let received = Arc::clone(&received);
+            let is_over = Arc::clone(&is_over);
             std::thread::spawn(move || {
                 let MaybeTlsStream::Plain(tcp) = socket.get_mut() else {
                     unreachable!()
@@ -259,7 +262,8 @@ fn beside_fast_ones(url: &str, time: Duration) -> Beside {
     if let MaybeTlsStream::Plain(tcp) = socket.get_mut() {
         tcp.set_nodelay(true).unwrap();
     }
-    let (begin, before) = (Instant::now(), received.load(Ordering::Relaxed));
+    let begin = Instant::now();
+    let before = received.load(Ordering::Relaxed);
     let mut times = Vec::new();
     while begin.elapsed() < time {
         std::thread::sleep(PERIOD);
@@ -289,7 +293,8 @@ async fn one(urls: &[String], process: i32, time: Duration) -> Taken {
         .into_iter()
         .map(|one| one.unwrap().0)
         .collect();
-    let (before, begin) = (processor(process), now());
+    let before = processor(process);
+    let begin = now();
     let reading = sockets.into_iter().map(|mut socket| async move {
         let mut latencies = Vec::new();
         let reading = async {

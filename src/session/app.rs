@@ -60,7 +60,8 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     let socket = server::listen(address).map_err(|error| format!("can't listen on {address}: {error}"))?;
     let port = socket.local_addr()?.port();
     config.port = port;
-    let (http_url, websocket_url) = (config.http_url(), config.websocket_url());
+    let http_url = config.http_url();
+    let websocket_url = config.websocket_url();
     let server = Arc::new(assemble(config, connections, phase)?);
     let shared = web::Data::from(Arc::clone(&server));
     let app = move || App::new().app_data(shared.clone()).configure(configure);

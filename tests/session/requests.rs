@@ -140,7 +140,8 @@ async fn a_log_that_nobody_reads_stops_no_server() {
     let reader = tokio::net::unix::pipe::OpenOptions::new()
         .open_receiver(folder.path().join("pipe"))
         .unwrap();
-    let (mut log, mut buffer) = (String::new(), vec![0; 64 << 10]);
+    let mut log = String::new();
+    let mut buffer = vec![0; 64 << 10];
     until("the log tells that lines are missing", async || {
         http::get(&server.url("/health")).await;
         while let Ok(length) = reader.try_read(&mut buffer) {

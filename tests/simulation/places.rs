@@ -105,8 +105,10 @@ async fn the_waiting_line_is_served_in_order_and_forgets_who_leaves() {
 async fn one_address_leaves_places_and_a_part_of_the_line_to_others() {
     let builder = demo_server(4).set("waitingLine", 4);
     let server = builder.set("maxPlacesPerAddress", 3).start().await;
-    let (greedy, greedy_too) = ("2001:db8::1", "2001:db8::2");
-    let (other, third) = ("2001:db8:0:1::1", "203.0.113.11");
+    let greedy = "2001:db8::1";
+    let greedy_too = "2001:db8::2";
+    let other = "2001:db8:0:1::1";
+    let third = "203.0.113.11";
     let mut inside = Vec::new();
     for _ in 0..3 {
         let mut client = Client::start_from(&server, greedy, &arm()).await;
@@ -185,7 +187,8 @@ async fn a_port_that_somebody_else_has_is_not_lent() {
 #[actix_rt::test]
 async fn a_crowd_is_served_to_the_last_one_and_no_two_share_a_place() {
     let server = demo_server(3).start().await;
-    let (held, were_all_held) = (RefCell::new(BTreeSet::new()), Cell::new(false));
+    let held = RefCell::new(BTreeSet::new());
+    let were_all_held = Cell::new(false);
     let visits = (0..12).map(|_| async {
         let mut client = Client::start(&server, &arm()).await;
         let url = client.until("webots:").await;

@@ -714,7 +714,8 @@ async fn a_stranger_sees_no_port_and_steers_nobody() {
     let (_victim, path) = start(&server).await;
     let (_stranger, own) = start(&server).await;
     let mut victim = look_on(&server, &path).await.with_running_scene().await;
-    let (number, secret) = (&path["/stream/".len()..][..16], &own["/stream/".len() + 16..]);
+    let number = &path["/stream/".len()..][..16];
+    let secret = &own["/stream/".len() + 16..];
     for guess in [
         format!("/stream/{number}{secret}"),
         format!("{own}/../{number}{secret}"),

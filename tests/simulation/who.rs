@@ -43,7 +43,8 @@ async fn event(server: &Server) -> String {
 #[actix_rt::test]
 async fn a_name_is_for_administrators_alone_and_never_markup() {
     let server = with_users(2).start().await;
-    let (user, label) = ("<b>anna@lab</b>", "\"<script>alert(1)</script>\u{202e}\n=1+1,x;=2");
+    let user = "<b>anna@lab</b>";
+    let label = "\"<script>alert(1)</script>\u{202e}\n=1+1,x;=2";
     let mut client = start(&server, &[("x-forwarded-user", user)], Some(label)).await;
     client.until("webots:").await;
     let id = client.id().to_owned();

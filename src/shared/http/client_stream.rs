@@ -306,7 +306,8 @@ mod tests {
 
     /// Where the request at the start is complete, if it arrives in pieces of this size.
     fn found(text: &str, size: usize) -> Option<(Front, usize)> {
-        let (mut heads, mut bytes) = (HeadFinder::default(), BytesMut::new());
+        let mut heads = HeadFinder::default();
+        let mut bytes = BytesMut::new();
         let mut arrived = 0;
         text.as_bytes().chunks(size).find_map(|piece| {
             arrived += piece.len();

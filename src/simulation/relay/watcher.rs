@@ -25,8 +25,10 @@ pub(super) async fn relay(
     (mut watcher, sent): (TcpStream, Bytes),
     (mut webots, answered): (TcpStream, Bytes),
 ) -> io::Result<()> {
-    let (mut frames, mut to_webots) = (FrameReader::default(), Codec::new().client_mode());
-    let (mut from_watcher, mut from_webots) = (BytesMut::from(sent), BytesMut::from(answered));
+    let mut frames = FrameReader::default();
+    let mut to_webots = Codec::new().client_mode();
+    let mut from_watcher = BytesMut::from(sent);
+    let mut from_webots = BytesMut::from(answered);
     let mut requested = HashSet::new();
     loop {
         watcher.write_all(&from_webots.split()).await?;

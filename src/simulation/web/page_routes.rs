@@ -87,7 +87,8 @@ async fn usages(server: &AppState, snapshot: &Snapshot) -> Usages {
     if snapshot.simulations.is_empty() {
         return Usages::new();
     }
-    let (usage, simulations) = (server.usage.clone(), snapshot.simulations.iter());
+    let usage = server.usage.clone();
+    let simulations = snapshot.simulations.iter();
     let read = if let Some(containers) = &server.containers {
         // The process is `docker`, which waits for the containers.
         let roots: BTreeMap<u16, i32> = simulations.filter_map(|one| Some((one.port?, one.pid?))).collect();
