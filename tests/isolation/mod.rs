@@ -1,5 +1,6 @@
 //! What a world's program may do at each level of isolation.
 
+mod assets;
 mod deeds;
 mod display;
 mod level;

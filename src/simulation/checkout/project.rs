@@ -34,6 +34,11 @@ pub struct WorldFile {
 }
 
 impl Project {
+    /// The URL of its repository.
+    pub fn repository(&self) -> String {
+        self.url.repository()
+    }
+
     /// Identifies the project by its repository, its commit and its directory.
     pub fn identity(&self) -> String {
         format!(

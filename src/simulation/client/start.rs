@@ -128,6 +128,7 @@ impl Session {
             launcher: Arc::clone(&self.server.launcher),
             watcher: self.server.watcher.clone(),
             program,
+            assets: self.server.launcher.assets_of(&project.repository()),
             project,
             mode: self.mode,
             gpu,

@@ -133,6 +133,9 @@ pub struct SimulationConfig {
     /// Size limit of all cached repositories, in MiB. Default: 10240.
     #[serde(deserialize_with = "whole::<1, 100_000_000, _, _>")]
     pub cache_size: u64 = 10 * 1024,
+    /// Size limit of the assets that Webots has downloaded in sandboxes, in MiB; 0: none are kept. Default: 2048.
+    #[serde(deserialize_with = "whole::<0, 100_000_000, _, _>")]
+    pub assets_size: u64 = 2048,
     /// Size limit of a project, in MiB, for the fetch and for the checkout. Default: 1024.
     #[serde(deserialize_with = "whole::<1, 100_000_000, _, _>")]
     pub project_size: u64 = 1024,

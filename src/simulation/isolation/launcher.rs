@@ -6,10 +6,12 @@ use std::ffi::OsString;
 use std::io;
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use nix::sys::resource::{Resource, getrlimit};
 use which::which;
 
+use super::assets::{AssetCache, RepositoryAssets};
 use super::cgroup::{Cgroup, Cgroups};
 use super::display::Display;
 use super::network::OwnNetwork;
@@ -35,6 +37,8 @@ pub struct Launcher {
     pub shortcoming: Option<String>,
     /// Why sandboxes have no networks of their own, if the configuration leaves that to the machine.
     why_shared: Option<String>,
+    /// What Webots has downloaded, for the next simulations.
+    assets: Option<AssetCache>,
     cgroups: Option<Cgroups>,
     controllers: Vec<&'static str>,
     /// Its absolute path: a search after the fork would delay each start by a millisecond.
@@ -85,6 +89,7 @@ impl Launcher {
             why_shared: why_shared.filter(|_| sandbox.is_some()),
             sandbox,
             shortcoming,
+            assets: None,
             cgroups: None,
             controllers,
             prlimit,
@@ -119,6 +124,10 @@ impl Launcher {
             log::warn!("{line}");
         }
         launcher.cgroups = cgroups;
+        // With any commit, anybody can run a world in the name of a repository.
+        let keeps_assets = launcher.sandbox.is_some() && config.assets_size > 0 && !config.any_commit;
+        let cache = config.cache_dir.0.canonicalize().ok().filter(|_| keeps_assets);
+        launcher.assets = cache.map(|cache| AssetCache::new(&cache, config.assets_size, config.disk_reserve));
         Ok(launcher)
     }
 
@@ -209,6 +218,7 @@ impl Launcher {
         mut spec: SpawnSpec,
         port: u16,
         display: &Display,
+        assets: Option<&RepositoryAssets>,
     ) -> io::Result<(SpawnSpec, Option<Cgroup>)> {
         let cgroup = self.cgroups.as_ref().and_then(|cgroups| cgroups.make(&self.limits));
         let mut command = cgroup.as_ref().map(Cgroup::joining).unwrap_or_default();
@@ -222,7 +232,7 @@ impl Launcher {
             {
                 *file = real.into();
             }
-            command.extend(sandbox.command(&spec, port, display)?);
+            command.extend(sandbox.command(&spec, port, display, assets)?);
             environment.extend(sandbox.environment());
             spec.wrappers = 1 + usize::from(sandbox.network.is_some());
         }
@@ -238,6 +248,21 @@ impl Launcher {
             },
             cgroup,
         ))
+    }
+
+    /// The assets of the repository with this URL, if they are kept.
+    pub fn assets_of(&self, repository: &str) -> Option<Arc<RepositoryAssets>> {
+        let assets = self.assets.as_ref()?.of(repository);
+        assets
+            .inspect_err(|error| log::warn!("the assets of {repository} are downloaded again: {error}"))
+            .ok()
+    }
+
+    /// Keeps what Webots has downloaded in the simulation with this directory, which has ended. Blocks.
+    pub fn keep_assets(&self, assets: &RepositoryAssets, instance: &Path) {
+        if let Some(cache) = &self.assets {
+            cache.adopt(assets, &instance.join(Sandbox::HOME));
+        }
     }
 
     /// The variables of the server's own environment that a simulation gets.

@@ -1,5 +1,6 @@
 //! The launch of a simulation: its isolation level, environment and limits, and what ends with it.
 
+mod assets;
 mod cgroup;
 mod disk;
 mod display;
@@ -11,6 +12,7 @@ mod sandbox;
 mod system_calls;
 mod watcher;
 
+pub use assets::RepositoryAssets;
 pub use cgroup::Cgroup;
 pub use disk::DiskUse;
 pub use display::Display;

@@ -13,6 +13,7 @@ use std::time::Duration;
 
 use which::which;
 
+use super::assets::RepositoryAssets;
 use super::display::Display;
 use super::mount::{Mount, hidden};
 use super::network::OwnNetwork;
@@ -64,6 +65,9 @@ const NETWORK_REMEDY: &str = "ordinary users must be allowed to open /dev/net/tu
                               machine must have a default route, of the version of IP of bind";
 
 impl Sandbox {
+    /// The name of the home in the directory of an instance.
+    pub const HOME: &str = "home";
+
     /// Prepares sandboxes for a server with this configuration, and tries whether they work here. Blocks for ten seconds at
     /// most.
     ///
@@ -119,7 +123,13 @@ impl Sandbox {
     ///
     /// # Errors
     /// When a directory can't be created.
-    pub fn command(&self, spec: &SpawnSpec, port: u16, display: &Display) -> io::Result<Vec<OsString>> {
+    pub fn command(
+        &self,
+        spec: &SpawnSpec,
+        port: u16,
+        display: &Display,
+        assets: Option<&RepositoryAssets>,
+    ) -> io::Result<Vec<OsString>> {
         let instance = &spec.mark;
         let mut command = self
             .network
@@ -171,7 +181,11 @@ impl Sandbox {
         }
         // Of two mounts at the same path the last one counts.
         let mut mounts = BTreeMap::new();
-        for mount in self.own(spec, display)?.into_iter().chain(self.mounts.iter().cloned()) {
+        for mount in self
+            .own(spec, display, assets)?
+            .into_iter()
+            .chain(self.mounts.iter().cloned())
+        {
             mounts.insert((mount.at.components().count(), mount.at.clone()), mount);
         }
         // Empty directories are tmpfs, which takes memory: they are made read-only, as is the rest of `/dev`.
@@ -193,12 +207,14 @@ impl Sandbox {
     }
 
     /// The mounts that differ between simulations.
-    fn own(&self, spec: &SpawnSpec, display: &Display) -> io::Result<Vec<Mount>> {
+    fn own(&self, spec: &SpawnSpec, display: &Display, assets: Option<&RepositoryAssets>) -> io::Result<Vec<Mount>> {
         let inside = |name: &str| {
             let folder = spec.mark.join(name);
             std::fs::create_dir_all(&folder).map(|()| folder)
         };
-        let (home, run, tmp) = (inside("home")?, inside("run")?, inside("tmp")?);
+        let home = inside(Self::HOME)?;
+        let run = inside("run")?;
+        let tmp = inside("tmp")?;
         display.prepare(&tmp)?;
         let mut own: Vec<Mount> = temporary_folders().map(|at| Mount::writable(at, &tmp)).collect();
         own.push(Mount::writable(runtime_folder(), &run));
@@ -214,6 +230,10 @@ impl Sandbox {
             .chain(self.display_files(display));
         own.extend(files.filter_map(|file| file.canonicalize().ok()).map(Mount::read_only));
         own.extend(self.network.as_ref().and_then(|network| network.mounts(&spec.mark)));
+        if let Some(assets) = assets {
+            assets.offer(&home)?;
+            own.push(Mount::read_only(&assets.folder));
+        }
         own.retain(|mount| mount.at.exists() || mount.at == runtime_folder());
         Ok(own)
     }
@@ -273,7 +293,7 @@ impl Sandbox {
         };
         // A port that was free a moment ago.
         let port = TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?.local_addr()?.port();
-        let mut command = self.command(&spec, port, &Display::Outside(String::new()))?;
+        let mut command = self.command(&spec, port, &Display::Outside(String::new()), None)?;
         command.extend(["/bin/sh", "-c", "true"].map(Into::into));
         let mut complaint = String::new();
         let ran = Run::new(command, instance.path(), TRIAL).blocking(|line| complaint = line);

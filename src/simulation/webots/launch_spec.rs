@@ -13,7 +13,7 @@ use super::event::WebotsEvent;
 use crate::simulation::checkout::Project;
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::container::{ContainerRequest, ContainerService};
-use crate::simulation::isolation::{Cgroup, DiskUse, Display, Launcher, Watcher};
+use crate::simulation::isolation::{Cgroup, DiskUse, Display, Launcher, RepositoryAssets, Watcher};
 use crate::simulation::machine::sensors::Gpu;
 use crate::simulation::process::{SpawnSpec, until_answering};
 use crate::simulation::protocol::Mode;
@@ -36,6 +36,8 @@ pub struct LaunchSpec {
     pub program: PathBuf,
     /// The project that was checked out.
     pub project: Arc<Project>,
+    /// What Webots has downloaded for its repository before, if that is kept.
+    pub assets: Option<Arc<RepositoryAssets>>,
     /// How it is shown.
     pub mode: Mode,
     /// The GPU assigned to it, if any.
@@ -104,7 +106,18 @@ impl LaunchSpec {
             grace: self.config.timing.grace,
             ..SpawnSpec::new(command, instance)
         };
-        self.launcher.prepare(spec, self.slot.port, &display)
+        self.launcher
+            .prepare(spec, self.slot.port, &display, self.assets.as_deref())
+    }
+
+    /// Keeps what Webots has downloaded for the next simulations of its repository, on a thread of its own. Until then the
+    /// instance's directory stays.
+    pub fn keep_assets(&self) {
+        if let Some(assets) = self.assets.clone() {
+            let launcher = Arc::clone(&self.launcher);
+            let instance = Arc::clone(&self.project.instance);
+            actix_rt::task::spawn_blocking(move || launcher.keep_assets(&assets, instance.path()));
+        }
     }
 
     /// Waits until the simulation with this root process exceeds a limit, and returns the message for its client.

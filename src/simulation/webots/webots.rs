@@ -244,6 +244,9 @@ impl Webots {
         if kind == EndReason::NoWebots && self.group.is_some() {
             why += self.spec.launcher.remark();
         }
+        if self.listening {
+            self.spec.keep_assets();
+        }
         self.exit = Some(WebotsExit { clean, own, why });
         ctx.stop();
     }
