@@ -183,7 +183,7 @@ export class FleetReader {
   #reasons = new Reasons();
 
   /**
-   * Reads a text; `undefined` if it belongs to the next one.
+   * Reads a text; `undefined` if it belongs to the next one, or is of a later version.
    * @param {string} text
    * @returns {FleetMessage | undefined}
    */
@@ -199,8 +199,10 @@ export class FleetReader {
       return { is: 'announced', text: announcement };
     }
     const sentence = after(text, 'Error:');
-    return sentence === undefined
-      ? { is: 'chosen', server: text }
-      : { is: 'refused', failure: this.#reasons.failure(sentence) };
+    if (sentence !== undefined) {
+      return { is: 'refused', failure: this.#reasons.failure(sentence) };
+    }
+    const isAddress = text.startsWith('ws://') || text.startsWith('wss://');
+    return isAddress ? { is: 'chosen', server: text } : undefined;
   }
 }

@@ -117,6 +117,7 @@ test('the session server sends reports, announcements, addresses and refusals', 
     'ws://one:2000',
     `reason: ${JSON.stringify(DRAINING)}`,
     '0',
+    'of a later version: 1',
     'Error: no',
   ];
   assert.deepEqual(
@@ -128,6 +129,7 @@ test('the session server sends reports, announcements, addresses and refusals', 
       { is: 'chosen', server: 'ws://one:2000' },
       undefined,
       { is: 'available', now: false },
+      undefined,
       { is: 'refused', failure: { sentence: 'no', reason: DRAINING } },
     ],
   );
