@@ -155,7 +155,7 @@ async fn open_pages(time: Duration) {
             .replace("webots:", "")
             .replace("localhost", "127.0.0.1");
         let mut viewer = Client::connect(&format!("{simulator}/")).await;
-        viewer.send("x3d").await;
+        viewer.send("w3d").await;
         viewer.until("scene load completed").await;
         viewer.send("real-time:-1").await;
         actix_rt::spawn(async move { while let Heard::Text(_) = viewer.next().await {} });

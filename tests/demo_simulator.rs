@@ -1,15 +1,19 @@
-//! Black-box tests of the demo simulator, with viewers and signals. The rest is covered by other tests, which use it in
-//! place of Webots.
+//! Black-box tests of the demo simulator. They check what `docs/webots.md` says about it; the rest is covered by other
+//! tests, which use it in place of Webots.
 
 use std::fs::File;
 use std::net::Ipv4Addr;
+use std::os::unix::process::ExitStatusExt;
 use std::process::{Child, Command};
 use std::sync::atomic::{AtomicU8, Ordering};
+use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
 
-use crate::support::{Client, until};
+use crate::support::{Client, SOON, until};
 
 /// The simulator's port, below the ephemeral ports.
 const PORT: u16 = 21_234;
@@ -43,12 +47,22 @@ struct Simulator {
 impl Simulator {
     /// Starts a simulator, which is paused.
     fn start() -> Self {
+        Self::of(WORLD)
+    }
+
+    /// Starts a simulator whose first world has these options.
+    fn with(options: &str) -> Self {
+        Self::of(&WORLD.replacen('\n', &format!("\n#demo-simulator: {options}\n"), 1))
+    }
+
+    /// Starts a simulator of this world.
+    fn of(world: &str) -> Self {
         let address = own_address();
         let project = tempfile::tempdir().unwrap();
         let worlds = project.path().join("worlds");
         std::fs::create_dir(&worlds).unwrap();
-        for (name, robot) in [("a", "mover"), ("b", "other mover")] {
-            std::fs::write(worlds.join(name).with_extension("wbt"), WORLD).unwrap();
+        for (name, robot, world) in [("a", "mover", world), ("b", "other mover", WORLD)] {
+            std::fs::write(worlds.join(name).with_extension("wbt"), world).unwrap();
             std::fs::write(worlds.join(name).with_extension("x3d"), MODEL.replace("mover", robot)).unwrap();
             std::fs::write(worlds.join(name).with_extension("motion.json"), MOTION).unwrap();
         }
@@ -60,6 +74,7 @@ impl Simulator {
             "--stream",
             "--stdout",
             "--stderr",
+            "--heartbeat=50",
             &format!("--port={PORT}"),
         ]);
         command
@@ -77,17 +92,50 @@ impl Simulator {
         }
     }
 
+    fn output(&self) -> String {
+        std::fs::read_to_string(self.project.path().join("output")).unwrap()
+    }
+
+    /// Waits until it has printed this.
+    async fn prints(&self, words: &str) {
+        until(words, async || self.output().contains(words)).await;
+    }
+
+    /// Waits until the simulator listens.
+    async fn listens(&self) {
+        self.prints(&format!("server listening on port {PORT}.")).await;
+    }
+
     /// Connects once the simulator listens.
     async fn connect(&self) -> Client {
-        let (output, words) = (
-            self.project.path().join("output"),
-            format!("server listening on port {PORT}."),
-        );
-        until(&words, async || {
-            std::fs::read_to_string(&output).unwrap().contains(&words)
-        })
-        .await;
+        self.listens().await;
         Client::connect(&format!("ws://{}:{PORT}/", self.address)).await
+    }
+
+    /// Sends these bytes and returns the answer, up to the end of the connection.
+    async fn answer(&self, request: &str) -> String {
+        let mut stream = TcpStream::connect((self.address, PORT)).await.unwrap();
+        stream.write_all(request.as_bytes()).await.unwrap();
+        let mut answer = String::new();
+        let read = stream.read_to_string(&mut answer);
+        actix_rt::time::timeout(SOON, read).await.unwrap().unwrap();
+        answer
+    }
+
+    /// The answer to a controller for a robot that is not there.
+    async fn answer_to_controller(&self) -> String {
+        self.answer("CTR\nRobot-Name: %2F\n\n").await
+    }
+
+    /// The answer to a request for a file.
+    async fn file(&self, path: &str) -> String {
+        self.answer(&format!("GET {path} HTTP/1.1\r\nHost: here:1\r\n\r\n"))
+            .await
+    }
+
+    async fn crashes(&mut self) {
+        until("it has ended", async || self.child.try_wait().unwrap().is_some()).await;
+        assert_eq!(self.child.wait().unwrap().signal(), Some(Signal::SIGSEGV as i32));
     }
 
     /// A broadcast viewer that has received the scene.
@@ -123,7 +171,7 @@ fn own_address() -> Ipv4Addr {
 #[actix_rt::test]
 async fn a_viewer_hears_the_whole_scene_first() {
     let simulator = Simulator::start();
-    for first in ["x3d", "w3d", "x3d;broadcast", "w3d;broadcast"] {
+    for first in ["w3d", "w3d;broadcast"] {
         let mut viewer = simulator.connect().await;
         viewer.send(first).await;
         viewer.until("pause: 0").await;
@@ -218,8 +266,189 @@ async fn a_signal_ends_it_with_0_after_the_closing_handshake() {
         let mut viewer = simulator.spectator().await;
         let _silent = simulator.spectator().await;
         kill(Pid::from_raw(simulator.child.id().cast_signed()), signal).unwrap();
-        // On any other code Webots' page shows a dialog.
-        assert_eq!(viewer.closed().await, Some(1000));
+        assert_eq!(viewer.closed().await, Some(1001));
         simulator.ends_with(0).await;
     }
+}
+
+#[actix_rt::test]
+async fn a_client_of_a_world_that_is_not_there_yet_crashes_it() {
+    let mut simulator = Simulator::with("download=60");
+    let mut silent = simulator.connect().await;
+    silent.until("loading:Downloading assets:").await;
+    assert_eq!(simulator.answer_to_controller().await, "PROCESSING");
+    simulator.prints("\n.\n").await;
+    let mut viewer = simulator.connect().await;
+    viewer.send("w3d;broadcast").await;
+    simulator.crashes().await;
+    // Until R2023a, a controller did too.
+    let mut simulator = Simulator::of("#VRML_SIM R2023a utf8\n#demo-simulator: download=60\n");
+    simulator.listens().await;
+    let mut controller = TcpStream::connect((simulator.address, PORT)).await.unwrap();
+    controller.write_all(b"CTR\nRobot-Name: %2F\n\n").await.unwrap();
+    simulator.crashes().await;
+}
+
+#[actix_rt::test]
+async fn while_a_world_is_read_nothing_is_answered() {
+    let simulator = Simulator::with("download=0.3 load=2");
+    let mut silent = simulator.connect().await;
+    silent.until("loading:Reading world file :0").await;
+    // Soon the kernel accepts the connections, and nothing answers.
+    let mut beats = 0;
+    until("it is blocked", async || {
+        beats = simulator.output().matches("\n.").count();
+        let answer = simulator.file("/worlds/a.png");
+        actix_rt::time::timeout(Duration::from_millis(400), answer)
+            .await
+            .is_err()
+    })
+    .await;
+    assert!(simulator.output().matches("\n.").count() <= beats + 1);
+    // What was sent meanwhile is answered later.
+    let mut early = simulator.connect().await;
+    early.send("w3d").await;
+    early.until("scene load completed").await;
+    // Without a request, every client gets the new scene too.
+    silent.until("world:worlds/a.wbt:").await;
+    silent.until("scene load completed").await;
+    assert_eq!(simulator.answer_to_controller().await, "FAILED");
+    let beats = simulator.output().matches("\n.").count();
+    until("the heart beats", async || {
+        simulator.output().matches("\n.").count() > beats
+    })
+    .await;
+    // A reload takes the same time.
+    early.send("reload").await;
+    early.until("delete world").await;
+    silent.until("loading:Reading world file :0").await;
+    let begin = Instant::now();
+    early.until("scene load completed").await;
+    assert!(begin.elapsed() > Duration::from_secs(1));
+}
+
+#[actix_rt::test]
+async fn a_busy_simulation_answers_nobody() {
+    let simulator = Simulator::with("busy=1.5@0.3");
+    simulator.listens().await;
+    let mut longest = Duration::ZERO;
+    until("it was busy", async || {
+        let begin = Instant::now();
+        assert_eq!(simulator.answer_to_controller().await, "FAILED");
+        longest = longest.max(begin.elapsed());
+        longest > Duration::from_secs(1)
+    })
+    .await;
+}
+
+#[actix_rt::test]
+async fn a_release_knows_one_kind_of_scene_and_calls_the_other_unsupported() {
+    for (release, known, other) in [
+        ("R2025a", "w3d", "x3d"),
+        ("R2023b", "x3d", "w3d"),
+        ("R2022b", "x3d", "w3d"),
+    ] {
+        let simulator = Simulator::of(&WORLD.replace("R2025a", release));
+        let mut viewer = simulator.connect().await;
+        viewer.send(other).await;
+        viewer.send("nonsense").await;
+        // Errors wait for the first request of a scene, and then come in one message.
+        viewer.send(&format!("{known};broadcast")).await;
+        let texts = viewer.until("stderr:").await;
+        let error = |text: &str| format!("stderr:ERROR: Streaming server: Unsupported message: {text}.");
+        assert_eq!(texts, [error(other), error("nonsense")].join("\n"));
+        assert!(viewer.heard[0].starts_with("world:"), "{:?}", viewer.heard);
+        viewer.send("pictures").await;
+        assert_eq!(viewer.until("").await, error("pictures"));
+        simulator
+            .prints("ERROR: Streaming server: Unsupported message: pictures.")
+            .await;
+    }
+}
+
+#[actix_rt::test]
+async fn updates_go_to_every_websocket() {
+    let simulator = Simulator::start();
+    let mut silent = simulator.connect().await;
+    let mut player = simulator.spectator().await;
+    player.send("real-time:-1").await;
+    assert!(silent.until("").await.starts_with("application/json:{\"time\":"));
+}
+
+#[actix_rt::test]
+async fn it_pauses_by_a_timeout_only_with_clients_and_a_broadcast_clears_the_timeout() {
+    let simulator = Simulator::start();
+    let mut player = simulator.spectator().await;
+    player.send("real-time:300").await;
+    let mut watcher = simulator.spectator().await;
+    while player.time().await < 600.0 {}
+    watcher.send("timeout:100").await;
+    player.until("pause: ").await;
+    // Nobody is there when the time is over.
+    player.send("real-time:200").await;
+    player.until("real-time").await;
+    let pauses = simulator.output().matches("\npause").count();
+    player.leave().await;
+    watcher.leave().await;
+    actix_rt::time::sleep(Duration::from_millis(400)).await;
+    assert_eq!(
+        simulator.output().matches("\npause").count(),
+        pauses,
+        "{}",
+        simulator.output()
+    );
+    let mut back = simulator.connect().await;
+    back.until("pause: ").await;
+}
+
+#[actix_rt::test]
+async fn files_are_served_as_by_webots() {
+    let simulator = Simulator::start();
+    simulator.listens().await;
+    let project = simulator.project.path();
+    std::fs::write(project.join("worlds/a page.html"), "see webots://file").unwrap();
+    let outside = tempfile::Builder::new().suffix(".png").tempfile().unwrap();
+    std::fs::write(outside.path(), "secret").unwrap();
+    let found = simulator.file("/worlds/a%20page.html?name=x").await;
+    let (head, body) = found.split_once("\r\n\r\n").unwrap();
+    assert_eq!(body, "see http://here:1/file");
+    for line in [
+        "HTTP/1.1 200 OK",
+        "Access-Control-Allow-Origin: *",
+        "Cache-Control: public, max-age=3600",
+        "Content-Type: text/html",
+        "Content-Length: 22",
+    ] {
+        assert!(head.lines().any(|one| one == line), "{line}: {head}");
+    }
+    let etag = head.lines().find_map(|line| line.strip_prefix("etag: ")).unwrap();
+    let again = format!("GET /worlds/a%20page.html HTTP/1.1\r\nHost: here:1\r\nIf-None-Match: {etag}\r\n\r\n");
+    assert!(simulator.answer(&again).await.starts_with("HTTP/1.1 304 "));
+    // The path may leave the project, as it is or encoded.
+    for up in ["../", "%2e%2e/", "..%2F"] {
+        let path = format!("/{}{}", up.repeat(20), &outside.path().to_str().unwrap()[1..]);
+        assert!(simulator.file(&path).await.ends_with("\r\n\r\nsecret"), "{path}");
+    }
+    assert!(simulator.file("/worlds/none.png").await.starts_with("HTTP/1.1 404 "));
+    assert!(!simulator.output().contains("WARNING"), "{}", simulator.output());
+    for (path, warning) in [
+        ("/robots.txt", "WARNING: Unsupported file type '/robots.txt'."),
+        ("/worlds/a.wbt", "WARNING: Unsupported file type '/worlds/a.wbt'."),
+        (
+            "/none.html",
+            "WARNING: Cannot read 'none.html', sending \"404 Not Found\".",
+        ),
+    ] {
+        assert!(simulator.file(path).await.starts_with("HTTP/1.1 404 "), "{path}");
+        simulator.prints(warning).await;
+    }
+    // There is no HEAD, and no second request on a connection.
+    assert!(
+        simulator
+            .answer("HEAD /none.html HTTP/1.1\r\nHost: a\r\n\r\n")
+            .await
+            .starts_with("HTTP/1.1 400 ")
+    );
+    let two = "GET /worlds/none.png HTTP/1.1\r\nHost: a\r\n\r\n".repeat(2);
+    assert_eq!(simulator.answer(&two).await.matches("HTTP/1.1").count(), 1);
 }

@@ -31,7 +31,7 @@ class WebotsView extends HTMLElement {
   // As the real one does it: texts over the stream, files from where the stream is.
   stream(server, broadcast) {
     const socket = new WebSocket(server);
-    socket.onopen = () => socket.send(broadcast ? 'x3d;broadcast' : 'x3d');
+    socket.onopen = () => socket.send(broadcast ? 'w3d;broadcast' : 'w3d');
     socket.onmessage = async ({ data }) => {
       if (data === 'scene load completed') {
         const file = await fetch(`${server.replace('ws', 'http')}worlds/textures/wood.png`);

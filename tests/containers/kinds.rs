@@ -142,7 +142,7 @@ async fn a_participant_connects_and_runs_edited_code_after_a_reset() {
         "echo 'print(2)' >/home/project/webots-project/participant.py",
     ]);
     let mut viewer = Client::connect(&format!("ws://127.0.0.1:{port}/")).await;
-    viewer.send("x3d").await;
+    viewer.send("w3d").await;
     viewer.until("model:").await;
     viewer.send("reset").await;
     until("it is connected again", async || connected().len() == 2).await;

@@ -85,7 +85,7 @@ async fn who_comes_back_finds_its_container_as_it_runs() {
     let mut client = Client::resuming(&server, &token).await;
     client.token().await;
     let mut viewer = Client::connect(&stream).await;
-    viewer.send("x3d;broadcast").await;
+    viewer.send("w3d;broadcast").await;
     viewer.until("real-time").await;
     let back = viewer.time().await;
     assert!(back > left, "it began anew: {left} {back}");

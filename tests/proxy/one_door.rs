@@ -35,7 +35,7 @@ async fn who_is_lost_comes_back_through_the_door() {
         let mut back = browser.open(&client).await.resume(token).await;
         assert_eq!(back.until("webots:").await, format!("webots:{stream}"));
         let mut viewer = browser.open(&format!("{stream}/")).await;
-        viewer.send("x3d;broadcast").await;
+        viewer.send("w3d;broadcast").await;
         viewer.until("scene load completed").await;
         // It counts once, at its own server and at the session server.
         until("both servers say so", async || {

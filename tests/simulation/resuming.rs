@@ -57,7 +57,7 @@ async fn who_comes_back_finds_the_simulation_as_it_runs_at_each_level() {
         assert!((7000..=7200).contains(&rest) && heard.len() == 6, "{heard:?}");
         assert_ne!(first, second);
         let mut viewer = Client::connect(&stream).await;
-        viewer.send("x3d;broadcast").await;
+        viewer.send("w3d;broadcast").await;
         let back = viewer.time().await;
         assert!(back >= left, "it began anew: {left} {back}");
         viewer.until("real-time").await;

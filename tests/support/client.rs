@@ -132,7 +132,7 @@ impl Client {
 
     /// A viewer that has received the scene.
     pub async fn with_scene(mut self) -> Self {
-        self.send("x3d").await;
+        self.send("w3d").await;
         self.until("scene load completed").await;
         self
     }

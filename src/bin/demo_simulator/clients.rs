@@ -12,26 +12,27 @@ use crate::client::{ClientHandle, ClientId};
 #[derive(Default)]
 pub(crate) struct Clients {
     connected: BTreeMap<ClientId, Connected>,
+    /// Texts of the console, each on a line, until the first client has requested a scene.
+    console: Vec<String>,
+    /// Whether a client has requested a scene.
+    has_viewer: bool,
     /// Dropped when the last client has disconnected.
     closing: Option<oneshot::Sender<()>>,
 }
 
 struct Connected {
     handle: ClientHandle,
-    /// Whether it has requested the scene.
-    watching: bool,
     /// Whether it read too slowly for the last update.
     missed_update: bool,
 }
 
 impl Clients {
-    /// Adds a client, which gets no broadcasts yet.
+    /// Adds a client.
     pub(crate) fn add(&mut self, id: ClientId, handle: ClientHandle) {
         self.connected.insert(
             id,
             Connected {
                 handle,
-                watching: false,
                 missed_update: false,
             },
         );
@@ -43,10 +44,28 @@ impl Clients {
         self.closing.take_if(|_| self.connected.is_empty());
     }
 
-    /// Adds this client to the recipients of broadcasts.
-    pub(crate) fn watch(&mut self, id: ClientId) {
-        if let Some(client) = self.connected.get_mut(&id) {
-            client.watching = true;
+    /// Whether no client is connected.
+    pub(crate) fn is_empty(&self) -> bool {
+        self.connected.is_empty()
+    }
+
+    /// Sends the texts of the console that wait, and later ones at once: a client has requested a scene.
+    pub(crate) fn start_console(&mut self) {
+        self.has_viewer = true;
+        self.send_console();
+    }
+
+    /// Sends a text of the console to all clients, once one of them has requested a scene.
+    pub(crate) fn log(&mut self, text: String) {
+        self.console.push(text);
+        self.send_console();
+    }
+
+    /// All texts go in one message, which waits for a client.
+    fn send_console(&mut self) {
+        if self.has_viewer && !self.console.is_empty() && !self.connected.is_empty() {
+            let texts = mem::take(&mut self.console);
+            self.broadcast(texts.join("\n"));
         }
     }
 
@@ -56,15 +75,15 @@ impl Clients {
         self.send_where(&text, |client, _| client == id);
     }
 
-    /// Sends a text to all clients that watch.
+    /// Sends a text to all clients, those too that have requested nothing.
     pub(crate) fn broadcast(&mut self, text: impl Into<ByteString>) {
-        self.send_where(&text.into(), |_, client| client.watching);
+        self.send_where(&text.into(), |_, _| true);
     }
 
-    /// Sends an update to all clients that watch and read fast enough.
+    /// Sends an update to all clients that read fast enough.
     pub(crate) fn broadcast_update(&mut self, text: impl Into<ByteString>) {
         let text = text.into();
-        for client in self.connected.values_mut().filter(|client| client.watching) {
+        for client in self.connected.values_mut() {
             client.missed_update = !client.handle.send_update(text.clone());
         }
     }

@@ -102,8 +102,8 @@ impl Clock {
         self.now += self.step;
     }
 
-    /// Makes the steps for `elapsed` wall time.
-    pub(crate) fn advance(&mut self, elapsed: Duration) -> Progress {
+    /// Makes the steps for `elapsed` wall time. Pauses after the timeout only if `has_clients`.
+    pub(crate) fn advance(&mut self, elapsed: Duration, has_clients: bool) -> Progress {
         let speed = match self.mode {
             Mode::Pause => return Progress::None,
             Mode::RealTime => 1.0,
@@ -117,7 +117,7 @@ impl Clock {
         }
         self.remainder -= steps * self.step;
         let steps_left = ((self.pause_at - self.now) / self.step).ceil().max(1.0);
-        if steps < steps_left {
+        if steps < steps_left || !has_clients {
             self.now += steps * self.step;
             return Progress::Advanced;
         }
@@ -136,11 +136,11 @@ mod tests {
     #[test]
     fn real_time_makes_whole_steps_and_keeps_the_rest() {
         let mut clock = Clock::new(Mode::RealTime, 32.0);
-        assert_eq!(clock.advance(Duration::from_millis(10)), Progress::None);
-        assert_eq!(clock.advance(Duration::from_millis(10)), Progress::Advanced);
+        assert_eq!(clock.advance(Duration::from_millis(10), true), Progress::None);
+        assert_eq!(clock.advance(Duration::from_millis(10), true), Progress::Advanced);
         assert_eq!(clock.now(), 32.0);
         for _ in 0..98 {
-            clock.advance(Duration::from_millis(10));
+            clock.advance(Duration::from_millis(10), true);
         }
         assert_eq!(clock.now(), 992.0, "1000 ms of wall time");
     }
@@ -148,7 +148,7 @@ mod tests {
     #[test]
     fn fast_is_faster_by_a_fixed_factor() {
         let mut clock = Clock::new(Mode::Fast, 10.0);
-        clock.advance(Duration::from_millis(100));
+        clock.advance(Duration::from_millis(100), true);
         assert_eq!(clock.now(), 1600.0);
     }
 
@@ -158,14 +158,14 @@ mod tests {
             let mut clock = Clock::new(Mode::Fast, 32.0);
             clock.set_timeout(timeout);
             assert_eq!(
-                clock.advance(Duration::from_millis(100)),
+                clock.advance(Duration::from_millis(100), true),
                 Progress::TimedOut,
                 "{timeout}"
             );
             assert_eq!((clock.now(), clock.mode()), (expected, Mode::Pause), "{timeout}");
             clock.set_mode(Mode::Fast);
             assert_eq!(
-                clock.advance(Duration::from_millis(100)),
+                clock.advance(Duration::from_millis(100), true),
                 Progress::Advanced,
                 "it pauses only once"
             );
@@ -173,9 +173,18 @@ mod tests {
     }
 
     #[test]
+    fn without_clients_it_pauses_once_one_is_there() {
+        let mut clock = Clock::new(Mode::RealTime, 10.0);
+        clock.set_timeout(20.0);
+        assert_eq!(clock.advance(Duration::from_millis(100), false), Progress::Advanced);
+        assert_eq!(clock.now(), 100.0);
+        assert_eq!(clock.advance(Duration::from_millis(10), true), Progress::TimedOut);
+    }
+
+    #[test]
     fn a_process_that_was_stopped_for_long_does_not_catch_up() {
         let mut clock = Clock::new(Mode::RealTime, 10.0);
-        clock.advance(Duration::from_hours(1));
+        clock.advance(Duration::from_hours(1), true);
         assert_eq!(clock.now(), 1000.0);
     }
 }

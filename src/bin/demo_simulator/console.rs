@@ -20,17 +20,10 @@ impl Console {
         }
     }
 
-    /// Prints a warning, with `--stderr`.
-    pub(crate) fn warning(self, text: impl Display) {
+    /// Prints a line, which begins with `WARNING: ` or `ERROR: `, with `--stderr`.
+    pub(crate) fn trouble(self, line: &str) {
         if self.stderr {
-            print(io::stderr(), &format!("WARNING: {text}"));
-        }
-    }
-
-    /// Prints an error, with `--stderr`.
-    pub(crate) fn error(self, text: impl Display) {
-        if self.stderr {
-            print(io::stderr(), &format!("ERROR: {text}"));
+            print(io::stderr(), line);
         }
     }
 }

@@ -1,82 +1,68 @@
-//! The simulator's port: WebSockets at `/`, and files of the world's project at any other path.
+//! The simulator's port. The first bytes of a connection decide, as in Webots: `GET /` opens a WebSocket, `GET` with
+//! another path is for a file, and `CTR` comes from a controller.
 
-use std::path::{Component, Path, PathBuf};
+use std::path::Path;
+use std::rc::Rc;
 
-use actix::Recipient;
-use actix_files::NamedFile;
-use actix_web::http::header;
-use actix_web::{Error, HttpRequest, HttpResponse, web};
-use actix_web_actors::ws;
-use percent_encoding::percent_decode_str;
+use actix::Addr;
+use tokio::io::AsyncWriteExt as _;
+use tokio::net::{TcpListener, TcpStream};
+use tokio_tungstenite::accept_async_with_config;
+use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 
-use crate::client::{Client, Event};
+use crate::client;
+use crate::files;
+use crate::simulation::{ConnectController, Simulation, Warn};
 
-/// The extensions of the files that are served: what a client needs to draw a scene.
-const EXTENSIONS: [&str; 11] = [
-    "png", "jpg", "jpeg", "ico", "html", "css", "js", "dae", "obj", "mtl", "stl",
-];
-const NOT_FOUND: &str = include_str!("../../../templates/demo/not_found.html");
+/// Longest head of a request, in bytes.
+const MAX_HEAD: usize = 8 * 1024;
+/// Size of the read buffer of a WebSocket, in bytes: clients send short texts.
+const READ_BUFFER: usize = 4 * 1024;
+const BAD_REQUEST: &[u8] = b"HTTP/1.1 400 Bad Request\r\nContent-Length: 0\r\n\r\n";
 
-/// The directory whose files are served, without symlinks.
-#[derive(Clone, Debug)]
-pub(crate) struct ProjectFolder(PathBuf);
-
-impl ProjectFolder {
-    /// Serves files of `folder`; none if there is no such directory.
-    pub(crate) fn new(folder: &Path) -> Self {
-        Self(folder.canonicalize().unwrap_or_else(|_| PathBuf::from("/dev/null")))
+/// Accepts connections, for ever. All are served on this thread, which is also that of the simulation: while it is
+/// busy, connections are accepted by the kernel only.
+pub(crate) async fn serve(listener: TcpListener, simulation: Addr<Simulation>, project: Rc<Path>) {
+    loop {
+        // An error is about the connection, or there are too many: later ones may be accepted.
+        let Ok((stream, _)) = listener.accept().await else {
+            tokio::task::yield_now().await;
+            continue;
+        };
+        let (simulation, project) = (simulation.clone(), Rc::clone(&project));
+        actix_web::rt::spawn(async move {
+            // The peer is gone.
+            connect(stream, simulation, &project).await.ok();
+        });
     }
+}
 
-    /// Returns the file at a request's path, if there is one and it may be served. Blocks.
-    fn file(&self, path: &str) -> Option<PathBuf> {
-        let path = percent_decode_str(path.trim_start_matches('/')).decode_utf8().ok()?;
-        let path = Path::new(path.as_ref());
-        if !path.components().all(|part| matches!(part, Component::Normal(_))) {
-            return None;
+async fn connect(mut stream: TcpStream, simulation: Addr<Simulation>, project: &Path) -> std::io::Result<()> {
+    stream.set_nodelay(true)?;
+    let mut head = vec![0; MAX_HEAD];
+    let length = stream.peek(&mut head).await?;
+    let head = String::from_utf8_lossy(head.get(..length).unwrap_or_default()).into_owned();
+    let answer = match head.split_ascii_whitespace().collect::<Vec<_>>().as_slice() {
+        ["GET", "/", ..] if head.to_ascii_lowercase().contains("upgrade: websocket") => {
+            let config = WebSocketConfig::default().read_buffer_size(READ_BUFFER);
+            if let Ok(socket) = accept_async_with_config(stream, Some(config)).await {
+                client::serve(socket, simulation.recipient()).await;
+            }
+            return Ok(());
         }
-        // symlinks must not resolve to a path outside the directory
-        let file = self.0.join(path).canonicalize().ok()?;
-        let extension = file.extension()?.to_str()?.to_ascii_lowercase();
-        let is_allowed = EXTENSIONS.contains(&extension.as_str());
-        (is_allowed && file.starts_with(&self.0) && file.is_file()).then_some(file)
-    }
-}
-
-/// Adds the routes to an application.
-pub(crate) fn configure(app: &mut web::ServiceConfig) {
-    app.route("/", web::get().to(open_websocket))
-        .default_service(web::get().to(send_file));
-}
-
-async fn open_websocket(
-    request: HttpRequest,
-    body: web::Payload,
-    simulation: web::Data<Recipient<Event>>,
-) -> Result<HttpResponse, Error> {
-    ws::start(Client::new(simulation.get_ref().clone()), &request, body)
-}
-
-async fn send_file(request: HttpRequest, project: web::Data<ProjectFolder>) -> HttpResponse {
-    let path = request.path().to_owned();
-    let found = web::block(move || project.file(&path).and_then(|path| NamedFile::open(path).ok())).await;
-    let Ok(Some(file)) = found else {
-        return HttpResponse::NotFound()
-            .insert_header((header::ACCESS_CONTROL_ALLOW_ORIGIN, "*"))
-            .content_type("text/html; charset=utf-8")
-            .body(NOT_FOUND);
+        ["GET", path, ..] if *path != "/" => {
+            let answer = files::answer(project, &head);
+            if let Some(warning) = answer.warning {
+                simulation.do_send(Warn(warning));
+            }
+            answer.bytes
+        }
+        ["CTR", ..] => simulation.send(ConnectController).await.unwrap_or_default().into(),
+        _ => BAD_REQUEST.into(),
     };
-    let mut response = file
-        .use_last_modified(false)
-        .disable_content_disposition()
-        .into_response(&request);
-    let headers = response.headers_mut();
-    headers.insert(
-        header::ACCESS_CONTROL_ALLOW_ORIGIN,
-        header::HeaderValue::from_static("*"),
-    );
-    headers.insert(
-        header::CACHE_CONTROL,
-        header::HeaderValue::from_static("public, max-age=3600"),
-    );
-    response
+    // The socket must not have unread data when it is closed: the peer would lose the answer.
+    let mut read = vec![0; length];
+    tokio::io::AsyncReadExt::read_exact(&mut stream, &mut read).await?;
+    stream.write_all(&answer).await?;
+    stream.shutdown().await
 }

@@ -2,20 +2,23 @@
 //! a fleet can be tried, tested and measured on a machine without Webots. The servers contain no code for it; a
 //! configuration names it as the Webots to start.
 //!
-//! It does not read world files beyond their first line: the scene and the motion come from two files beside the world
+//! It does not read world files beyond their first lines: the scene and the motion come from two files beside the world
 //! (`scene`), or from a small built-in scene. It simulates no physics, runs no controllers and renders no pictures.
+//! `docs/webots.md` compares it with Webots.
 //!
-//! `main` reads the command line, opens the port, and only then loads the world, as Webots does: a client
-//! that connects early receives the progress of the loading. Two actors do the rest: one `simulation`, and a
-//! `client` for each WebSocket, on the HTTP server's one worker thread.
+//! `main` reads the command line, opens the port, and only then loads the world, as Webots does. One thread does
+//! everything, as the event loop of Webots: an actor, the `simulation`, and a task for each connection (`http`), which
+//! of a WebSocket is a `client`. While that thread is blocked, nothing is answered.
 
 mod args;
 mod client;
 mod clients;
 mod clock;
 mod console;
+mod files;
 mod http;
 mod motion;
+mod phases;
 mod port;
 mod protocol;
 mod run;
@@ -39,7 +42,7 @@ fn main() {
             console::status(&system_info());
             0
         }
-        Ok(args) => run::run(args),
+        Ok(args) => run::run(&args),
         Err(error) if !error.use_stderr() => {
             console::explain(&error.to_string()); // the help; Webots too prints it on the standard error
             0

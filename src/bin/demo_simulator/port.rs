@@ -21,8 +21,8 @@ pub(crate) fn listen(first: u16, console: Console) -> Result<TcpListener, Box<dy
         match TcpListener::bind(SocketAddr::new(address, port)) {
             Ok(listener) => {
                 if port != first {
-                    console.warning(format_args!(
-                        "Could not listen to port {first}. Using port {port} instead."
+                    console.trouble(&format!(
+                        "WARNING: Could not listen to port {first}. Using port {port} instead."
                     ));
                 }
                 console.info(format_args!("Streaming server listening on port {port}."));

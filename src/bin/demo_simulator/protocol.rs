@@ -2,8 +2,7 @@
 //!
 //! | client sends | meaning |
 //! |---|---|
-//! | `x3d`, `w3d`, both also with `;broadcast` | send the scene and then updates; without `;broadcast` the simulation pauses at its next step unless the client runs it |
-//! | `mjpeg: WxH` | send pictures (an error: nothing is rendered here) |
+//! | `w3d` since R2025a, `x3d` before, both also with `;broadcast` | send the scene; without `;broadcast` the simulation pauses at its next step unless the client runs it |
 //! | `pause`, `step`, `reset`, `reload` (`revert`), `load:WORLD` | the command of that name |
 //! | `real-time:MS`, `fast:MS` | run, and pause by itself after this much simulation time; never if negative |
 //! | `timeout:MS` | change only that time |
@@ -17,7 +16,6 @@ use crate::world::WorldNames;
 #[derive(Debug, PartialEq)]
 pub(crate) enum Command {
     Watch { broadcast: bool },
-    WatchPictures,
     Pause,
     RealTime(f64),
     Fast(f64),
@@ -30,14 +28,14 @@ pub(crate) enum Command {
 }
 
 impl Command {
-    /// Parses a client's text; `None` if it is not a request.
-    pub(crate) fn parse(text: &str) -> Option<Self> {
+    /// Parses a client's text; `None` if it is not a request. `scene_request` is the one for the scene.
+    pub(crate) fn parse(text: &str, scene_request: &str) -> Option<Self> {
         let command = match text {
             "pause" => Self::Pause,
             "step" => Self::Step,
             "reset" => Self::Reset,
             "reload" | "revert" => Self::Reload,
-            _ if text.starts_with("x3d") || text.starts_with("w3d") => Self::Watch {
+            _ if text.starts_with(scene_request) => Self::Watch {
                 broadcast: text.ends_with(";broadcast"),
             },
             _ => match text.split_once(':')? {
@@ -46,7 +44,6 @@ impl Command {
                 ("timeout", timeout) => Self::Timeout(parse_timeout(timeout)?),
                 ("load", world) => Self::Load(world.trim().to_owned()),
                 ("robot", _) => Self::Robot,
-                ("mjpeg", _) => Self::WatchPictures,
                 _ => return None,
             },
         };
@@ -71,7 +68,13 @@ pub(crate) const FAST: &str = "fast";
 pub(crate) const RESET_FINISHED: &str = "reset finished";
 /// The last part of a scene.
 pub(crate) const SCENE_COMPLETED: &str = "scene load completed";
-/// The first status of a world that is being loaded; with the trailing space, as in Webots.
+/// Answers a controller, before it is closed, while there is no world.
+pub(crate) const PROCESSING: &str = "PROCESSING";
+/// Answers a controller whose robot is not there.
+pub(crate) const FAILED: &str = "FAILED";
+/// The status of a world whose assets are downloaded.
+pub(crate) const DOWNLOADING: &str = "Downloading assets";
+/// The first status of a world that is being read; with the trailing space, as in Webots.
 pub(crate) const READING: &str = "Reading world file ";
 /// Announces that another world will be loaded.
 pub(crate) const DELETE_WORLD: &str = "delete world";
@@ -79,6 +82,11 @@ pub(crate) const DELETE_WORLD: &str = "delete world";
 /// The state of a paused simulation, at `time` milliseconds.
 pub(crate) fn paused(time: f64) -> String {
     format!("pause: {time}")
+}
+
+/// A warning or an error of the console.
+pub(crate) fn stderr(line: &str) -> String {
+    format!("stderr:{line}")
 }
 
 /// The progress of loading a world.

@@ -1,54 +1,36 @@
 //! A run of the simulator, from the open port to the exit code.
 
 use std::error::Error;
-use std::net::TcpListener;
-use std::sync::mpsc;
+use std::rc::Rc;
 use std::time::Duration;
-use std::{future, io, thread};
 
-use actix::{Actor as _, Recipient, System};
-use actix_web::dev::Server;
-use actix_web::{App, HttpServer, rt, web};
+use actix::{Actor as _, System};
+use actix_web::rt;
 use futures_util::future::select_all;
+use tokio::net::TcpListener;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::oneshot;
-use tokio::time;
+use tokio::time::{self, MissedTickBehavior};
 
 use crate::args::Args;
-use crate::client::Event;
 use crate::console::{self, Console};
-use crate::http::{self, ProjectFolder};
+use crate::http;
 use crate::port;
 use crate::simulation::{CloseClients, Simulation};
 use crate::world::WorldFile;
 
-/// Limit of connections; more wait.
-const MAX_CONNECTIONS: usize = 256;
 /// Timeout of the closing handshake with clients.
 const CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Runs a simulation until a signal ends it, and returns the exit code.
-///
-/// The process must then exit without waiting for any thread: one may still be reading the world. No thread with actors
-/// ends before that, because actix's thread-local values panic if they are dropped on two threads at once.
-pub(crate) fn run(args: Args) -> i32 {
-    let (sender, code) = mpsc::channel();
-    let thread = thread::Builder::new().spawn(move || {
-        System::new().block_on(async {
-            let code = simulate(&args).await.map_or_else(fail, |()| 0);
-            sender.send(code).ok();
-            future::pending::<()>().await;
-        });
-    });
-    if let Err(error) = thread {
-        return fail(format!("no thread can be started: {error}").into());
+pub(crate) fn run(args: &Args) -> i32 {
+    match System::new().block_on(simulate(args)) {
+        Ok(()) => 0,
+        Err(error) => {
+            console::fatal(error);
+            1
+        }
     }
-    code.recv().unwrap_or(1)
-}
-
-fn fail(error: Box<dyn Error>) -> i32 {
-    console::fatal(error);
-    1
 }
 
 async fn simulate(args: &Args) -> Result<(), Box<dyn Error>> {
@@ -64,18 +46,23 @@ async fn simulate(args: &Args) -> Result<(), Box<dyn Error>> {
     ];
     let signals = kinds.into_iter().map(signal).collect::<Result<_, _>>()?;
     let listener = port::listen(args.port, console)?;
+    listener.set_nonblocking(true)?;
     if args.stream.is_some() && !args.batch {
-        console.warning("Streaming should be used with --batch.");
+        console.trouble("WARNING: Streaming should be used with --batch.");
     }
     if let Some(period) = args.heartbeat {
         rt::spawn(beat(Duration::from_millis(period)));
     }
 
     let file = WorldFile::new(args.world.as_deref().unwrap_or("".as_ref()));
-    let project = ProjectFolder::new(file.project());
+    let project = Rc::from(file.project());
     let (report_failure, failure) = oneshot::channel();
     let simulation = Simulation::new(file, args.mode, args.stream.is_some(), console, report_failure).start();
-    rt::spawn(serve(listener, simulation.clone().recipient(), project)?);
+    rt::spawn(http::serve(
+        TcpListener::from_std(listener)?,
+        simulation.clone(),
+        project,
+    ));
 
     tokio::select! {
         () = first_of(signals) => drop(time::timeout(CLOSE_TIMEOUT, simulation.send(CloseClients)).await),
@@ -89,30 +76,13 @@ async fn first_of(mut signals: Vec<Signal>) {
     select_all(signals.iter_mut().map(|signal| Box::pin(signal.recv()))).await;
 }
 
-/// The first heartbeat comes one period after the start, as with Webots.
+/// The first heartbeat comes one period after the start, as with Webots. Those that a busy thread misses are left out.
 async fn beat(period: Duration) {
     let mut beats = time::interval(period);
+    beats.set_missed_tick_behavior(MissedTickBehavior::Delay);
     beats.tick().await;
     loop {
         beats.tick().await;
         console::status(".");
     }
-}
-
-fn serve(listener: TcpListener, simulation: Recipient<Event>, project: ProjectFolder) -> io::Result<Server> {
-    let simulation = web::Data::new(simulation);
-    let project = web::Data::new(project);
-    let server = HttpServer::new(move || {
-        App::new()
-            .app_data(simulation.clone())
-            .app_data(project.clone())
-            .configure(http::configure)
-    });
-    Ok(server
-        .workers(1)
-        .worker_max_blocking_threads(2)
-        .max_connections(MAX_CONNECTIONS)
-        .disable_signals()
-        .listen(listener)?
-        .run())
 }

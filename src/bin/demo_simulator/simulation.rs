@@ -2,38 +2,55 @@
 //! by `run`, lives as long as the program. Receives events from the clients and answers through their handles; notifies
 //! `run` if the first world cannot be read.
 
+use std::thread;
 use std::time::{Duration, Instant};
 
 use actix::{
-    Actor, ActorFutureExt as _, AsyncContext as _, Context, Handler, Message, ResponseFuture, SpawnHandle,
-    WrapFuture as _,
+    Actor, ActorFutureExt as _, AsyncContext as _, Context, Handler, Message, MessageResult, ResponseFuture,
+    SpawnHandle, WrapFuture as _,
 };
+use nix::sys::signal::{Signal, raise};
 use tokio::sync::oneshot;
-use tokio::task::spawn_blocking;
 
 use crate::client::{ClientId, Event};
 use crate::clients::Clients;
 use crate::clock::{Clock, Mode, Progress};
 use crate::console::{self, Console};
+use crate::phases::Phases;
 use crate::protocol::{self, Command};
 use crate::scene::Scene;
-use crate::world::{WorldError, WorldFile, WorldNames};
+use crate::world::{Release, WorldError, WorldFile, WorldNames};
+
+/// Messages about the progress of a download.
+const STEPS: u8 = 10;
+/// Time that the clients' tasks have to send the progress before the thread is blocked.
+const FLUSH: Duration = Duration::from_millis(10);
 
 /// Closes the WebSockets of all clients. Answered when all are closed.
 #[derive(Message)]
 #[rtype(result = "()")]
 pub(crate) struct CloseClients;
 
+/// A controller requests a connection to a robot; none is there. Answered with the text for it.
+#[derive(Message)]
+#[rtype(result = "&'static str")]
+pub(crate) struct ConnectController;
+
+/// Prints a warning, and sends it to the clients.
+#[derive(Message)]
+#[rtype(result = "()")]
+pub(crate) struct Warn(pub(crate) String);
+
 /// The simulation.
 pub(crate) struct Simulation {
     file: WorldFile,
     names: WorldNames,
-    /// `None` while it is being loaded.
+    /// That of the world which was last opened.
+    release: Release,
+    /// `None` while the world's assets are downloaded. While it is read, nothing runs.
     scene: Option<Scene>,
     clock: Clock,
     clients: Clients,
-    /// Clients that requested the scene while it was being loaded.
-    waiting: Vec<ClientId>,
     console: Console,
     /// Whether clients are served at all.
     stream: bool,
@@ -56,10 +73,10 @@ impl Simulation {
         Self {
             file,
             names: WorldNames::default(),
+            release: Release::default(),
             clock: Clock::new(mode, Scene::empty().step()),
             scene: None,
             clients: Clients::default(),
-            waiting: Vec::new(),
             console,
             stream,
             ticker: None,
@@ -73,7 +90,7 @@ impl Actor for Simulation {
     type Context = Context<Self>;
 
     fn started(&mut self, ctx: &mut Self::Context) {
-        self.load(ctx);
+        self.open(ctx);
     }
 }
 
@@ -86,14 +103,33 @@ impl Handler<Event> for Simulation {
             Event::Disconnected(id) => self.clients.remove(id),
             // like Webots without `--stream`: the client gets no answer
             Event::Received(..) if !self.stream => (),
-            Event::Received(id, text, _permit) => match Command::parse(&text) {
+            Event::Received(id, text) => match Command::parse(&text, self.release.scene_request()) {
                 Some(command) => self.obey(command, id, ctx),
-                None => self.error(&format!(
-                    "Unsupported message: {:?}.",
-                    text.chars().take(100).collect::<String>()
-                )),
+                None => self.error(&format!("Streaming server: Unsupported message: {text}.")),
             },
         }
+    }
+}
+
+impl Handler<ConnectController> for Simulation {
+    type Result = MessageResult<ConnectController>;
+
+    fn handle(&mut self, _: ConnectController, _: &mut Self::Context) -> Self::Result {
+        if self.scene.is_some() {
+            return MessageResult(protocol::FAILED);
+        }
+        if !self.release.answers_controllers_at_once() {
+            crash();
+        }
+        MessageResult(protocol::PROCESSING)
+    }
+}
+
+impl Handler<Warn> for Simulation {
+    type Result = ();
+
+    fn handle(&mut self, Warn(text): Warn, _: &mut Self::Context) {
+        self.trouble(&format!("WARNING: {text}"));
     }
 }
 
@@ -111,10 +147,10 @@ impl Simulation {
     fn obey(&mut self, command: Command, id: ClientId, ctx: &mut Context<Self>) {
         match command {
             Command::Watch { broadcast } => {
+                // for all clients, as in Webots
                 self.clock.set_timeout(if broadcast { f64::INFINITY } else { 0.0 });
                 self.watch(id);
             }
-            Command::WatchPictures => self.error("this simulator renders no pictures."),
             Command::Pause => self.pause(id, ctx),
             Command::RealTime(timeout) => self.run(Mode::RealTime, timeout, id, ctx),
             Command::Fast(timeout) => self.run(Mode::Fast, timeout, id, ctx),
@@ -128,7 +164,7 @@ impl Simulation {
             Command::Reload => self.change_world(self.file.clone(), ctx),
             Command::Load(name) => match self.file.sibling(&name) {
                 Some(file) => self.change_world(file, ctx),
-                None => self.error(&format!("there is no world {name:?}.")),
+                None => self.error(&format!("Streaming server: world {name} doesn't exist.")),
             },
             Command::Timeout(timeout) => self.clock.set_timeout(timeout),
             Command::Robot => (), // there are no controllers
@@ -136,16 +172,15 @@ impl Simulation {
     }
 
     fn watch(&mut self, id: ClientId) {
-        self.clients.watch(id);
-        if self.scene.is_some() {
-            for text in self.scene_texts() {
-                self.clients.send(id, text);
-            }
-            self.clients.send(id, self.state());
-        } else {
-            self.waiting.push(id);
-            self.clients.send(id, protocol::loading(protocol::READING, 0));
+        let Some(texts) = self.scene_texts() else {
+            // Webots dereferences the world that is not there
+            crash();
+        };
+        for text in texts {
+            self.clients.send(id, text);
         }
+        self.clients.send(id, self.state());
+        self.clients.start_console();
     }
 
     fn pause(&mut self, id: ClientId, ctx: &mut Context<Self>) {
@@ -171,8 +206,14 @@ impl Simulation {
         }
     }
 
-    fn error(&self, text: &str) {
-        self.console.error(format_args!("Streaming server: {text}"));
+    fn error(&mut self, text: &str) {
+        self.trouble(&format!("ERROR: {text}"));
+    }
+
+    /// Prints a warning or an error, and sends it to the clients.
+    fn trouble(&mut self, line: &str) {
+        self.console.trouble(line);
+        self.clients.log(protocol::stderr(line));
     }
 
     /// The clock's state, as it is sent to clients.
@@ -184,14 +225,14 @@ impl Simulation {
         }
     }
 
-    fn scene_texts(&self) -> Vec<String> {
-        let Some(scene) = &self.scene else { return Vec::new() };
-        vec![
+    fn scene_texts(&self) -> Option<Vec<String>> {
+        let scene = self.scene.as_ref()?;
+        Some(vec![
             protocol::world(&self.names),
             protocol::model(&scene.model),
             protocol::update(&scene.update(self.clock.now())),
             protocol::SCENE_COMPLETED.to_owned(),
-        ]
+        ])
     }
 }
 
@@ -204,48 +245,79 @@ impl Simulation {
         }
         self.file = file;
         self.clients.broadcast(protocol::DELETE_WORLD);
-        self.clients.broadcast(protocol::loading(protocol::READING, 0));
-        self.load(ctx);
-    }
-
-    fn load(&mut self, ctx: &mut Context<Self>) {
         self.stop_ticker(ctx);
-        let file = self.file.clone();
-        let loading = spawn_blocking(move || (file.names(), file.load())).into_actor(self);
-        ctx.spawn(loading.map(|outcome, simulation, ctx| match outcome {
-            Ok((names, scene)) => simulation.loaded(names, scene, ctx),
-            Err(error) => simulation.console.error(error),
-        }));
+        self.open(ctx);
     }
 
-    /// Sends the scene to all clients that watch: from time 0, in the same mode.
-    fn loaded(&mut self, names: WorldNames, scene: Result<Scene, WorldError>, ctx: &mut Context<Self>) {
-        let scene = match (scene, self.failure.take()) {
-            (Ok(scene), _) => scene,
+    /// Opens the world: downloads its assets, then reads it.
+    fn open(&mut self, ctx: &mut Context<Self>) {
+        let phases = match (self.file.header(), self.failure.take()) {
+            (Ok(header), _) => {
+                self.release = header.release;
+                header.phases
+            }
             (Err(error @ WorldError::Unreadable { .. }), Some(failure)) => {
                 drop(failure.send(error));
                 return;
             }
             // like Webots: the empty world replaces it
             (Err(error), _) => {
-                self.console
-                    .error(format_args!("'{}': {error}", self.file.path().display()));
-                Scene::empty()
+                self.error(&format!("'{}': {error}", self.file.path().display()));
+                return self.loaded(Scene::empty(), Phases::default(), ctx);
             }
         };
+        if phases.download.is_zero() {
+            return self.read(phases, ctx);
+        }
+        for step in 0..STEPS {
+            let progress = protocol::loading(protocol::DOWNLOADING, 100 / STEPS * step);
+            let time = phases.download * u32::from(step) / u32::from(STEPS);
+            ctx.run_later(time, move |simulation, _| simulation.clients.broadcast(progress));
+        }
+        ctx.run_later(phases.download, move |simulation, ctx| simulation.read(phases, ctx));
+    }
+
+    /// Reads the world, which blocks the thread.
+    fn read(&mut self, phases: Phases, ctx: &mut Context<Self>) {
+        self.clients.broadcast(protocol::loading(protocol::READING, 0));
+        if phases.load.is_zero() {
+            return self.finish_loading(phases, ctx);
+        }
+        // Webots sends the progress before it blocks. This actor handles no message meanwhile.
+        let blocked = async move {
+            tokio::time::sleep(FLUSH).await;
+            thread::sleep(phases.load);
+        };
+        ctx.wait(
+            blocked
+                .into_actor(self)
+                .map(move |(), simulation, ctx| simulation.finish_loading(phases, ctx)),
+        );
+    }
+
+    fn finish_loading(&mut self, phases: Phases, ctx: &mut Context<Self>) {
+        let scene = self.file.load().unwrap_or_else(|error| {
+            self.error(&format!("'{}': {error}", self.file.path().display()));
+            Scene::empty()
+        });
+        self.loaded(scene, phases, ctx);
+    }
+
+    /// Sends the scene to all clients: from time 0, in the same mode.
+    fn loaded(&mut self, scene: Scene, phases: Phases, ctx: &mut Context<Self>) {
         self.clock.restart(scene.step());
-        self.names = names;
+        self.names = self.file.names();
         self.scene = Some(scene);
         for status in ["Parsing world", "Finalizing nodes"] {
             self.clients.broadcast(protocol::loading(status, 100));
         }
-        for text in self.scene_texts() {
+        for text in self.scene_texts().unwrap_or_default() {
             self.clients.broadcast(text);
         }
-        for id in std::mem::take(&mut self.waiting) {
-            self.clients.send(id, self.state());
-        }
         self.set_mode(self.clock.mode(), ctx);
+        if let Some(busy) = phases.busy {
+            ctx.run_later(busy.after, move |_, _| thread::sleep(busy.length));
+        }
     }
 }
 
@@ -276,7 +348,7 @@ impl Simulation {
 
     fn tick(&mut self, ctx: &mut Context<Self>) {
         let now = Instant::now();
-        let progress = self.clock.advance(now - self.last_tick);
+        let progress = self.clock.advance(now - self.last_tick, !self.clients.is_empty());
         self.last_tick = now;
         if progress == Progress::None {
             return;
@@ -294,5 +366,13 @@ impl Simulation {
             self.clients
                 .broadcast_update(protocol::update(&scene.update(self.clock.now())));
         }
+    }
+}
+
+/// Ends the program as an access to memory that is not there would. The first signal only resets the handler that Rust
+/// installs for it.
+fn crash() -> ! {
+    loop {
+        raise(Signal::SIGSEGV).ok();
     }
 }

@@ -1,14 +1,15 @@
 //! World files: their paths in their project, and their validity.
 
 use std::fs::{self, File};
-use std::io::{self, BufRead as _, BufReader, Read as _};
+use std::io::{self, Read as _};
 use std::path::{Path, PathBuf};
 
 use thiserror::Error;
 
+use crate::phases::Phases;
 use crate::scene::{Scene, SceneError};
 
-/// Longest first line, in bytes.
+/// Length of the part of a world that is read, in bytes: its first line and the comments after it.
 const MAX_HEADER: u64 = 1024;
 
 /// The worlds of a project, as paths in it.
@@ -27,8 +28,46 @@ pub(crate) enum WorldError {
     Unreadable { path: PathBuf, source: io::Error },
     #[error("the first line must be '#VRML_SIM R2025a utf8' or that of an older release")]
     Header,
+    #[error("the demo simulator has no option '{0}'")]
+    Phases(String),
     #[error(transparent)]
     Scene(#[from] SceneError),
+}
+
+/// What the beginning of a world says.
+#[derive(Clone, Debug)]
+pub(crate) struct Header {
+    /// The release of Webots that the world was made for, which this program then is.
+    pub(crate) release: Release,
+    /// What makes it slow.
+    pub(crate) phases: Phases,
+}
+
+/// A release of Webots, such as `R2025a`.
+#[derive(Clone, Debug)]
+pub(crate) struct Release(String);
+
+impl Release {
+    /// The message with which a client requests the scene: releases know only one of two.
+    pub(crate) fn scene_request(&self) -> &'static str {
+        if self.is_since("R2025a") { "w3d" } else { "x3d" }
+    }
+
+    /// Whether controllers are answered before there is a world.
+    pub(crate) fn answers_controllers_at_once(&self) -> bool {
+        self.is_since("R2023b")
+    }
+
+    fn is_since(&self, release: &str) -> bool {
+        self.0.starts_with('R') && *self.0 >= *release
+    }
+}
+
+impl Default for Release {
+    /// That of the program itself.
+    fn default() -> Self {
+        Self("R2025a".to_owned())
+    }
 }
 
 /// The paths of a world and its project.
@@ -88,15 +127,19 @@ impl WorldFile {
         }
     }
 
-    /// Checks the world's first line and loads its scene. Blocks.
-    pub(crate) fn load(&self) -> Result<Scene, WorldError> {
-        let header = self.read_header().map_err(|source| WorldError::Unreadable {
+    /// Reads the world's first line and its options. Blocks.
+    pub(crate) fn header(&self) -> Result<Header, WorldError> {
+        let text = self.beginning().map_err(|source| WorldError::Unreadable {
             path: self.path.clone(),
             source,
         })?;
-        if !is_header(&header) {
-            return Err(WorldError::Header);
-        }
+        let release = release(text.lines().next().unwrap_or_default()).ok_or(WorldError::Header)?;
+        let phases = Phases::parse(&text).map_err(WorldError::Phases)?;
+        Ok(Header { release, phases })
+    }
+
+    /// Loads the world's scene. Blocks.
+    pub(crate) fn load(&self) -> Result<Scene, WorldError> {
         Ok(Scene::load(&self.path)?)
     }
 
@@ -104,13 +147,13 @@ impl WorldFile {
         path.strip_prefix(&self.project).unwrap_or(path).display().to_string()
     }
 
-    fn read_header(&self) -> io::Result<String> {
+    fn beginning(&self) -> io::Result<String> {
         if !is_world(&self.path) {
             return Err(io::Error::other("not a .wbt file"));
         }
-        let mut line = Vec::new();
-        BufReader::new(File::open(&self.path)?.take(MAX_HEADER)).read_until(b'\n', &mut line)?;
-        Ok(String::from_utf8_lossy(&line).into_owned())
+        let mut text = Vec::new();
+        File::open(&self.path)?.take(MAX_HEADER).read_to_end(&mut text)?;
+        Ok(String::from_utf8_lossy(&text).into_owned())
     }
 }
 
@@ -119,8 +162,13 @@ fn is_world(path: &Path) -> bool {
         .is_some_and(|extension| extension.eq_ignore_ascii_case("wbt"))
 }
 
-fn is_header(line: &str) -> bool {
-    let mut words = line.trim_start_matches('\u{feff}').split_whitespace();
-    let is_release = |word: &str| word.starts_with(['R', 'V']) && word.len() > 1;
-    words.next() == Some("#VRML_SIM") && words.next().is_some_and(is_release) && words.next() == Some("utf8")
+/// The release in the first line of a world; `None` if that is not one.
+fn release(line: &str) -> Option<Release> {
+    let line = line.trim_start_matches('\u{feff}');
+    match line.split_whitespace().collect::<Vec<_>>().as_slice() {
+        ["#VRML_SIM", release, "utf8", ..] if release.starts_with(['R', 'V']) && release.len() > 1 => {
+            Some(Release((*release).to_owned()))
+        }
+        _ => None,
+    }
 }
