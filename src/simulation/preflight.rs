@@ -43,6 +43,7 @@ fn isolation(config: &SimulationConfig, launcher: &Launcher) -> Vec<(&'static st
         .network_in_words()
         .filter(|_| launcher.level == IsolationSetting::Sandbox);
     findings.extend(words.map(|words| ("network", Ok(words))));
+    findings.extend(launcher.exposed_files(config).map(|words| ("streams", Err(words))));
     let is_shared = launcher.network() == Some(SandboxNetwork::Shared);
     if is_shared && !config.ports_are_public() {
         findings.push(("streams", streams(config)));

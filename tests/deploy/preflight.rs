@@ -76,9 +76,10 @@ fn what_is_missing_or_does_not_fit_is_warned_about() {
             pose,
         ),
         (
-            json!({"isolation": "none", "allowedRepositories": []}),
-            "isolation: none\nallowedRepositories is not set: no world will run here",
-            "streams: ",
+            json!({"isolation": "none", "allowedRepositories": [], "maxConnections": 20}),
+            "isolation: none\nwarning: streams: any file that this user may read, such as this server's configuration, can \
+             be read by anybody who reaches ports 2001 to 2020\nallowedRepositories is not set: no world will run here",
+            "relayed",
         ),
         (
             json!({"docker": true, "allowedRepositories": []}),
@@ -90,8 +91,8 @@ fn what_is_missing_or_does_not_fit_is_warned_about() {
             "allowedRepositories is not set: no world will run here",
             "any repository",
         ),
-        (users("127.0.0.1"), pose, "streams: "),
-        (users("::1"), pose, "streams: "),
+        (users("127.0.0.1"), pose, "streams: relayed"),
+        (users("::1"), pose, "streams: relayed"),
         (users("192.0.2.1"), "isolation: none", pose),
     ] {
         let (_, told) = check(&keys, |command| {

@@ -90,7 +90,7 @@ async fn an_editor_is_at_the_port_of_its_webots_and_500_more(fleet: &Fleet) {
 }
 
 /// The path requested, and the path that arrives through Apache and through nginx; `None` if they refuse it.
-const PATHS: [(&str, Option<&str>, Option<&str>); 11] = [
+const PATHS: [(&str, Option<&str>, Option<&str>); 16] = [
     (
         "/textures/my%20file.png",
         Some("/textures/my%20file.png"),
@@ -106,8 +106,14 @@ const PATHS: [(&str, Option<&str>, Option<&str>); 11] = [
     ("/a%3Fb.png", None, Some("/a%3Fb.png")),
     // An encoded slash is decoded or refused.
     ("/a%2Fb.png", None, Some("/a/b.png")),
-    ("/a/%2e%2e/b.png", Some("/b.png"), Some("/b.png")),
+    // Webots joins any path to the project's folder.
+    ("/a/../b.png", None, None),
+    ("/a/%2e%2e/b.png", None, None),
     ("/%2e%2e/b.png", None, None),
+    ("/a/.%2E/b.png", None, None),
+    ("/%252e%252e/b.png", None, None),
+    ("/a/.%25252E/b.png", None, None),
+    ("/a.b.png?x=..", Some("/a.b.png?x=.."), Some("/a.b.png?x=..")),
     ("/a/..%2F..%2Fb.png", None, None),
     // Encoded line ends stay part of the name.
     (

@@ -18,9 +18,9 @@ pub struct Timing {
     /// Timeout of pulling and building an image. Default: 900.
     #[serde(with = "seconds")]
     pub build: Duration = Duration::from_mins(15),
-    /// Timeout of Webots' start, until it listens on its port. Default: 120.
+    /// Timeout of Webots' start, until its world is ready: it downloads the world's assets and reads it. Default: 600.
     #[serde(with = "seconds")]
-    pub launch: Duration = Duration::from_mins(2),
+    pub launch: Duration = Duration::from_mins(10),
     /// Interval between two heartbeats of Webots. Default: 5.
     #[serde(with = "seconds")]
     pub heartbeat: Duration = Duration::from_secs(5),

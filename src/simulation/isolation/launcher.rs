@@ -120,7 +120,11 @@ impl Launcher {
             };
             log::log!(level, "network of simulations: {network}");
         }
-        for line in launcher.unenforced_limits() {
+        for line in launcher
+            .unenforced_limits()
+            .into_iter()
+            .chain(launcher.exposed_files(config))
+        {
             log::warn!("{line}");
         }
         launcher.cgroups = cgroups;
@@ -129,6 +133,19 @@ impl Launcher {
         let cache = config.cache_dir.0.canonicalize().ok().filter(|_| keeps_assets);
         launcher.assets = cache.map(|cache| AssetCache::new(&cache, config.assets_size, config.disk_reserve));
         Ok(launcher)
+    }
+
+    /// Why visitors may read files of the server's user, if they may: Webots serves any file that it can read to whoever
+    /// reaches its port.
+    pub fn exposed_files(&self, config: &SimulationConfig) -> Option<String> {
+        let (first, last) = config.streaming_ports().into_inner();
+        (config.ports_are_public() && self.level == IsolationSetting::None).then(|| {
+            format!(
+                "any file that this user may read, such as this server's configuration, can be read by anybody who \
+                 reaches ports {first} to {last}, because Webots serves it there (streaming: \"direct\", isolation: \
+                 none); set streaming to \"relay\", or isolation to \"sandbox\""
+            )
+        })
     }
 
     /// The limits that this machine can't enforce, one line each.
