@@ -18,7 +18,12 @@ def copy(source, target):
 
 
 def serve(near):
-    if near.recv(1, socket.MSG_PEEK):  # else the server has looked whether anything listens
+    begin = near.recv(3, socket.MSG_PEEK)
+    if begin == b"CTR":  # the server asks whether the world is ready
+        near.recv(4096)
+        near.sendall(b"FAILED")
+        near.close()
+    elif begin:  # else the server has looked whether anything listens
         far = socket.create_connection(("127.0.0.1", other))
         threading.Thread(target=copy, args=(near, far), daemon=True).start()
         copy(far, near)

@@ -114,10 +114,8 @@ impl Session {
         );
         let version = project.world.version.clone();
         slot.lease.update(|one| one.version = Some(version));
-        if self.mode != Mode::Mjpeg {
-            let release = Release::of_simulation(&program, &project.world.version);
-            self.kind = Some(SceneKind::of(release));
-        }
+        let release = Release::of_simulation(&program, &project.world.version);
+        self.kind = (self.mode != Mode::Mjpeg).then(|| SceneKind::of(release));
         self.text(protocol::loading("webots is starting"));
         let gpu = self.take_gpu(&slot.lease);
         let project = Arc::new(project);
@@ -130,6 +128,7 @@ impl Session {
             program,
             assets: self.server.launcher.assets_of(&project.repository()),
             project,
+            release,
             mode: self.mode,
             gpu,
             slot,

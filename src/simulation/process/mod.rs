@@ -1,6 +1,5 @@
 //! The processes and directories of simulations: how they are started, measured and removed.
 
-mod answer;
 pub mod disk_usage;
 pub mod guardian;
 mod instance_dir;
@@ -9,7 +8,6 @@ mod process_group;
 pub mod process_tree;
 mod runner;
 
-pub use answer::until_answering;
 pub use disk_usage::DiskRoom;
 pub use guardian::Guardian;
 pub use instance_dir::{InstanceDir, RunDir, remove_tree};

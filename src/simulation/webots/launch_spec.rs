@@ -10,12 +10,14 @@ use std::time::Duration;
 use actix::prelude::*;
 
 use super::event::WebotsEvent;
+use super::release::Release;
+use super::startup::{StartupEvent, follow_startup};
 use crate::simulation::checkout::Project;
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::container::{ContainerRequest, ContainerService};
 use crate::simulation::isolation::{Cgroup, DiskUse, Display, Launcher, RepositoryAssets, Watcher};
 use crate::simulation::machine::sensors::Gpu;
-use crate::simulation::process::{SpawnSpec, until_answering};
+use crate::simulation::process::SpawnSpec;
 use crate::simulation::protocol::Mode;
 use crate::simulation::slots::Slot;
 
@@ -38,6 +40,8 @@ pub struct LaunchSpec {
     pub project: Arc<Project>,
     /// What Webots has downloaded for its repository before, if that is kept.
     pub assets: Option<Arc<RepositoryAssets>>,
+    /// The release of Webots that runs, if it is known.
+    pub release: Option<Release>,
     /// How it is shown.
     pub mode: Mode,
     /// The GPU assigned to it, if any.
@@ -143,9 +147,14 @@ impl LaunchSpec {
         connected.map_or_else(|error| error.kind() == ErrorKind::TimedOut, |_| true)
     }
 
-    /// Waits until it is ready at its port.
-    pub fn until_ready(&self) -> impl Future<Output = ()> + use<> {
+    /// Whether its first heartbeat shows that it is ready, because its release does not answer before that.
+    pub fn is_ready_by_heartbeat(&self) -> bool {
+        !Release::answers_during_start(self.release)
+    }
+
+    /// Follows its start at its port, until it is ready.
+    pub fn follow_startup(&self, events: Recipient<StartupEvent>) -> impl Future<Output = ()> + use<> {
         let is_forwarded = self.containers.is_some() || self.launcher.reached().is_some();
-        until_answering(self.address(), is_forwarded)
+        follow_startup(self.address(), is_forwarded, events)
     }
 }

@@ -6,6 +6,7 @@ mod launch_spec;
 mod launched;
 mod output;
 mod release;
+mod startup;
 mod webots;
 
 pub use event::{WebotsEvent, WebotsExit};

@@ -11,6 +11,11 @@ pub struct Release {
     letter: char,
 }
 
+/// The first release that answers controllers before its world is ready.
+const FIRST_ANSWERING: Release = Release {
+    year: 2023,
+    letter: 'b',
+};
 /// The first release whose 3D stream is `w3d`.
 const FIRST_W3D: Release = Release {
     year: 2025,
@@ -40,6 +45,11 @@ impl Release {
             Self::parse(&version)
         };
         installed().or_else(|| Self::parse(version_of_world))
+    }
+
+    /// Whether this release answers controllers before its world is ready. Older ones crash.
+    pub fn answers_during_start(release: Option<Self>) -> bool {
+        release >= Some(FIRST_ANSWERING)
     }
 }
 

@@ -1,6 +1,6 @@
 //! Actor: one running Webots. Owns its process group, its instance directory and its slot; ends with all three.
 //!
-//! Created by a session once its project is checked out. Starts Webots, waits until it listens, monitors its heartbeat
+//! Created by a session once its project is checked out. Starts Webots, waits until its world is ready, monitors its heartbeat
 //! and the time limit, sends [`WebotsEvent`]s, and ends when Webots' whole process tree has ended. Never restarted.
 
 use std::sync::Arc;
@@ -14,6 +14,7 @@ use super::event::{WebotsEvent, WebotsExit};
 use super::launch_spec::LaunchSpec;
 use super::launched::{self, End};
 use super::output::{OutputEvent, Tail};
+use super::startup::StartupEvent;
 use crate::simulation::container::{SimulationContainers, StartError};
 use crate::simulation::ends::{EndReason, Taken};
 use crate::simulation::process::ProcessGroup;
@@ -32,9 +33,10 @@ pub struct Webots {
     group: Option<ProcessGroup>,
     /// Restarts the controller of a competition's participant.
     restart: Option<Arc<Notify>>,
-    /// The wait until it listens.
-    awaiting: Option<SpawnHandle>,
+    /// Follows its start.
+    startup: Option<SpawnHandle>,
     tail: Tail,
+    /// Whether its world is ready.
     pub(super) listening: bool,
     /// Whether the simulation is not paused.
     pub(super) runs: bool,
@@ -59,7 +61,7 @@ impl Webots {
             preparing: None,
             group: None,
             restart: None,
-            awaiting: None,
+            startup: None,
             tail: Tail::default(),
             listening: false,
             runs: false,
@@ -113,7 +115,7 @@ impl Webots {
         }
         self.send(WebotsEvent::Started);
         // In containers, the wait begins when the container reports that it runs.
-        self.spec.containers.is_none().then(|| self.await_port(ctx));
+        self.spec.containers.is_none().then(|| self.follow_startup(ctx));
         ctx.run_interval(self.spec.config.timing.heartbeat, Self::check_heartbeat);
         let limit = self.spec.config.timing.launch;
         ctx.run_later(limit, move |this, _| {
@@ -151,11 +153,11 @@ impl Webots {
         Ok(())
     }
 
-    /// Waits until it listens, unless the wait has begun.
-    fn await_port(&mut self, ctx: &mut Context<Self>) {
-        if self.awaiting.is_none() {
-            let ready = self.spec.until_ready().into_actor(self);
-            self.awaiting = Some(ctx.spawn(ready.map(|(), this, ctx| this.ready(ctx))));
+    /// Follows its start, unless that has begun or its heartbeat shows when it is ready.
+    fn follow_startup(&mut self, ctx: &mut Context<Self>) {
+        if self.startup.is_none() && !self.spec.is_ready_by_heartbeat() {
+            let startup = self.spec.follow_startup(ctx.address().recipient());
+            self.startup = Some(ctx.spawn(startup.into_actor(self)));
         }
     }
 
@@ -181,7 +183,7 @@ impl Webots {
     }
 
     fn check_heartbeat(&mut self, _: &mut Context<Self>) {
-        // Until it listens, the timeout of its launch applies.
+        // Until its world is ready, the timeout of its launch applies: it sends no heartbeat while it reads the world.
         if !self.listening {
             return;
         }
@@ -293,9 +295,9 @@ impl Handler<OutputEvent> for Webots {
         self.hanging = false;
         match event {
             OutputEvent::Heartbeat if self.listening => self.send(WebotsEvent::Heartbeat),
-            OutputEvent::Heartbeat if self.spec.containers.is_some() => self.ready(ctx),
+            OutputEvent::Heartbeat if self.spec.is_ready_by_heartbeat() => self.ready(ctx),
             OutputEvent::Heartbeat => {}
-            OutputEvent::ContainerRuns => self.await_port(ctx),
+            OutputEvent::ContainerRuns => self.follow_startup(ctx),
             OutputEvent::Reset => {
                 self.restart.iter().for_each(|controller| controller.notify_one());
                 self.used(ctx);
@@ -305,6 +307,18 @@ impl Handler<OutputEvent> for Webots {
                 self.show_pace();
                 self.used(ctx);
             }
+        }
+    }
+}
+
+impl Handler<StartupEvent> for Webots {
+    type Result = ();
+
+    fn handle(&mut self, event: StartupEvent, ctx: &mut Self::Context) {
+        match event {
+            StartupEvent::Listening => {}
+            StartupEvent::Loading(progress) => self.send(WebotsEvent::Progress(progress)),
+            StartupEvent::Ready => self.ready(ctx),
         }
     }
 }

@@ -1,0 +1,257 @@
+//! The start of a Webots, as its port shows it.
+//!
+//! Webots listens before there is a world. First it downloads the world's assets: it answers, but a viewer that requests
+//! the scene crashes it. Then it reads the world: the kernel accepts connections, and nothing answers. To the handshake
+//! of a controller it answers `PROCESSING` until the world is ready, and writes nothing to its console. Releases before
+//! R2023b don't: a controller crashes them too, and the first heartbeat is the best sign that they are ready.
+//!
+//! Docker's proxy and pasta accept connections from the start, even if nothing inside listens: behind them, only an
+//! answer shows that Webots listens.
+
+use std::cell::Cell;
+use std::convert::Infallible;
+use std::io;
+use std::net::SocketAddr;
+use std::time::{Duration, Instant};
+
+use actix::prelude::*;
+use futures_util::StreamExt;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
+use tokio::sync::Notify;
+use tokio_tungstenite::connect_async;
+use tokio_tungstenite::tungstenite::Message as Frame;
+
+/// An event of the start of a Webots.
+#[derive(Message, Debug, Clone, PartialEq, Eq)]
+#[rtype(result = "()")]
+pub enum StartupEvent {
+    /// It listens.
+    Listening,
+    /// The progress of its download or load, as text.
+    Loading(String),
+    /// The world is ready: viewers may connect.
+    Ready,
+}
+
+/// The handshake of a controller for a robot that no world has. Its answer is `PROCESSING`, or another text once there
+/// is a world.
+const REQUEST: &[u8] = b"CTR\nRobot-Name: %2F\n\n";
+/// The beginning of `PROCESSING`. No other answer is shorter.
+const PROCESSING: [u8; 6] = *b"PROCES";
+/// Bounds of the pause between two requests.
+const PAUSE: (Duration, Duration) = (Duration::from_millis(5), Duration::from_millis(500));
+/// The pause is 1/`PART` of the time since the start, so that many starts on a busy machine don't poll all the time.
+const PART: u32 = 20;
+/// Bounds of the timeout of a request behind a proxy, until one was answered. It is the time since the start: the proxy
+/// may accept the first request before anything inside listens, and Webots answers none while it reads a world.
+const TIMEOUT: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(10));
+
+/// Follows the start of the Webots at this address, and sends its events. The last one is [`StartupEvent::Ready`].
+///
+/// A container must run already: a request before it has its address delays all others by a second, until the kernel
+/// resolves the address again.
+pub async fn follow_startup(address: SocketAddr, is_forwarded: bool, events: Recipient<StartupEvent>) {
+    let startup = Startup {
+        address,
+        is_forwarded,
+        events,
+        begin: Instant::now(),
+        listens: Cell::new(false),
+        processing: Notify::new(),
+        loaded: Notify::new(),
+    };
+    tokio::select! {
+        () = startup.until_ready() => startup.events.do_send(StartupEvent::Ready),
+        never = startup.forward_progress() => match never {},
+    }
+}
+
+struct Startup {
+    address: SocketAddr,
+    is_forwarded: bool,
+    events: Recipient<StartupEvent>,
+    begin: Instant,
+    /// Whether Webots is known to listen.
+    listens: Cell<bool>,
+    /// Webots answers, but there is no world.
+    processing: Notify,
+    /// Webots has sent a world.
+    loaded: Notify,
+}
+
+/// An answer to a request.
+#[derive(PartialEq)]
+enum Answer {
+    Processing,
+    Ready,
+}
+
+impl Startup {
+    /// Sends requests until the world is ready.
+    async fn until_ready(&self) {
+        loop {
+            let answer = if self.is_forwarded && !self.listens.get() {
+                let timeout = self.begin.elapsed().clamp(TIMEOUT.0, TIMEOUT.1);
+                let answer = actix_rt::time::timeout(timeout, self.request()).await;
+                answer.unwrap_or_else(|_| Err(io::ErrorKind::TimedOut.into()))
+            } else {
+                // While a world is read, a request waits in Webots' queue, and is answered then.
+                self.request().await
+            };
+            match answer {
+                Ok(Answer::Ready) => return,
+                Ok(Answer::Processing) => self.processing.notify_one(),
+                Err(_) => {}
+            }
+            let pause = (self.begin.elapsed() / PART).clamp(PAUSE.0, PAUSE.1);
+            actix_rt::time::timeout(pause, self.loaded.notified()).await.ok();
+        }
+    }
+
+    async fn request(&self) -> io::Result<Answer> {
+        let mut stream = TcpStream::connect(self.address).await?;
+        if !self.is_forwarded {
+            self.listens();
+        }
+        stream.write_all(REQUEST).await?;
+        let mut answer = PROCESSING;
+        stream.read_exact(&mut answer).await?;
+        self.listens();
+        Ok(if answer == PROCESSING {
+            Answer::Processing
+        } else {
+            Answer::Ready
+        })
+    }
+
+    fn listens(&self) {
+        if !self.listens.replace(true) {
+            self.events.do_send(StartupEvent::Listening);
+        }
+    }
+
+    /// Sends what Webots reports about its progress. It reports to each WebSocket, also to one that requests nothing.
+    async fn forward_progress(&self) -> Infallible {
+        loop {
+            self.processing.notified().await;
+            let Ok((mut socket, _)) = connect_async(format!("ws://{}/", self.address)).await else {
+                continue;
+            };
+            while let Some(Ok(frame)) = socket.next().await {
+                let Frame::Text(text) = frame else { continue };
+                if let Some(progress) = text.strip_prefix("loading:") {
+                    // A full mailbox drops this line.
+                    self.events.try_send(StartupEvent::Loading(in_words(progress))).ok();
+                } else if text.starts_with("world:") {
+                    self.loaded.notify_one();
+                    break;
+                }
+            }
+        }
+    }
+}
+
+/// The progress `STATUS:PERCENT`, as text.
+fn in_words(progress: &str) -> String {
+    match progress.rsplit_once(':') {
+        Some((status, percent)) => format!("{}: {percent} %", status.trim()),
+        None => progress.to_owned(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::Ipv4Addr;
+
+    use futures_util::SinkExt;
+    use tokio::net::TcpListener;
+    use tokio::sync::mpsc;
+
+    use super::*;
+
+    struct Listener(mpsc::UnboundedSender<StartupEvent>);
+
+    impl Actor for Listener {
+        type Context = Context<Self>;
+    }
+
+    impl Handler<StartupEvent> for Listener {
+        type Result = ();
+
+        fn handle(&mut self, event: StartupEvent, _: &mut Self::Context) {
+            self.0.send(event).unwrap();
+        }
+    }
+
+    /// A stand-in for Webots, and the events of its start.
+    async fn start(is_forwarded: bool) -> (TcpListener, mpsc::UnboundedReceiver<StartupEvent>) {
+        let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).await.unwrap();
+        let (sender, events) = mpsc::unbounded_channel();
+        let events_of_start = Listener(sender).start().recipient();
+        let address = listener.local_addr().unwrap();
+        actix_rt::spawn(follow_startup(address, is_forwarded, events_of_start));
+        (listener, events)
+    }
+
+    /// The next connection, and its request.
+    async fn request(listener: &TcpListener) -> TcpStream {
+        let (mut stream, _) = listener.accept().await.unwrap();
+        let mut request = [0; REQUEST.len()];
+        stream.read_exact(&mut request).await.unwrap();
+        assert_eq!(request, REQUEST);
+        stream
+    }
+
+    #[actix_rt::test]
+    async fn an_accepted_connection_shows_that_it_listens_and_an_answer_that_it_is_ready() {
+        let (listener, mut events) = start(false).await;
+        let mut stream = request(&listener).await;
+        assert_eq!(events.recv().await, Some(StartupEvent::Listening));
+        // However long the world is read, there is one request.
+        let second = actix_rt::time::timeout(Duration::from_millis(300), listener.accept()).await;
+        assert!(second.is_err() && events.is_empty());
+        stream.write_all(b"FAILED").await.unwrap();
+        assert_eq!(events.recv().await, Some(StartupEvent::Ready));
+        assert_eq!(events.recv().await, None);
+    }
+
+    #[actix_rt::test]
+    async fn a_proxy_that_accepts_for_nobody_shows_nothing() {
+        let (listener, mut events) = start(true).await;
+        // It closes the first connection, and does not answer on the second.
+        drop(listener.accept().await.unwrap());
+        let _silent = listener.accept().await.unwrap();
+        let mut stream = request(&listener).await;
+        assert!(events.is_empty());
+        stream.write_all(b"FAILED").await.unwrap();
+        assert_eq!(events.recv().await, Some(StartupEvent::Listening));
+        assert_eq!(events.recv().await, Some(StartupEvent::Ready));
+    }
+
+    #[actix_rt::test]
+    async fn progress_is_forwarded_and_the_world_ends_the_wait() {
+        let (listener, mut events) = start(false).await;
+        request(&listener).await.write_all(b"PROCESSING").await.unwrap();
+        assert_eq!(events.recv().await, Some(StartupEvent::Listening));
+        // Requests continue beside the WebSocket.
+        let mut socket = loop {
+            let (mut stream, _) = listener.accept().await.unwrap();
+            let mut first = [0; 3];
+            stream.peek(&mut first).await.unwrap();
+            if first == *b"GET" {
+                break tokio_tungstenite::accept_async(stream).await.unwrap();
+            }
+            stream.write_all(b"PROCESSING").await.unwrap();
+        };
+        socket.send(Frame::text("loading:Downloading assets:40")).await.unwrap();
+        let progress = StartupEvent::Loading("Downloading assets: 40 %".to_owned());
+        assert_eq!(events.recv().await, Some(progress));
+        socket
+            .send(Frame::text("world:worlds/a.wbt:worlds/a.wbt"))
+            .await
+            .unwrap();
+        request(&listener).await.write_all(b"FAILED").await.unwrap();
+        assert_eq!(events.recv().await, Some(StartupEvent::Ready));
+    }
+}
