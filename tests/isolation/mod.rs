@@ -6,6 +6,7 @@ mod display;
 mod level;
 mod limits;
 mod lives;
-mod network;
+mod loading;
+pub mod network;
 mod reserve;
 mod resets;

@@ -21,7 +21,7 @@ pub fn start(file: Option<&Path>) -> std::io::Result<()> {
     // The HTTP decoder logs each malformed message as an error. Any client could flood the log with these. Resolver
     // errors are logged by the caller.
     let level = match file {
-        None => "debug,actix_http=info,actix_server=info,mio=info,rustls=info,h2=info",
+        None => "debug,actix_http=info,actix_server=info,mio=info,rustls=info,h2=info,tungstenite=info",
         Some(_) => "info,actix_server=warn",
     };
     let level = format!("{level},actix_http::h1::decoder=off,hickory_net=off,hickory_proto=off,hickory_resolver=off");
