@@ -216,7 +216,7 @@ impl Bare {
         };
         let mut answer = [0; 5];
         !self.command[0].to_string_lossy().ends_with("/pasta")
-            || stream.write_all(b"GET /robots.txt HTTP/1.0\r\n\r\n").is_ok() && stream.read_exact(&mut answer).is_ok()
+            || stream.write_all(b"CTR\nRobot-Name: %2F\n\n").is_ok() && stream.read_exact(&mut answer).is_ok()
     }
 
     /// Finds the commit of the branch, and the world in it.

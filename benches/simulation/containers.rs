@@ -206,10 +206,7 @@ fn answers(port: u16) -> bool {
     };
     stream.set_read_timeout(Some(Duration::from_secs(2))).unwrap();
     let mut answer = [0; 5];
-    stream
-        .write_all(b"GET /robots.txt HTTP/1.0\r\nHost: localhost\r\n\r\n")
-        .is_ok()
-        && stream.read_exact(&mut answer).is_ok()
+    stream.write_all(b"CTR\nRobot-Name: %2F\n\n").is_ok() && stream.read_exact(&mut answer).is_ok()
 }
 
 fn median(mut times: Vec<Duration>) -> Duration {

@@ -5,7 +5,8 @@
 //! - `class`: how long 1, 10, 100 and 200 clients that start at once take, compared with a bare loop;
 //! - `idle`: what idle simulations cost the server;
 //! - `late`: how late the server enforces a limit that it checks itself;
-//! - `start`: what a cached start costs over the git commands that it runs, and what a sandbox adds to it;
+//! - `start`: what a cached start costs over the git commands that it runs, what a sandbox adds to it, and how much later
+//!   than its Webots is ready a client receives the URL;
 //! - `stream`: how fast streams are, one and a hundred at once, through a simulation's own network and the machine's,
 //!   and how much memory pasta takes; needs an ordinary user, as level `own` always does;
 //! - `containers`: how long starts in containers take, one and thirty at once, compared with `docker compose up` by
@@ -142,6 +143,7 @@ async fn main() -> ExitCode {
     if is_wanted(Part::Start) {
         start::measure(&mut verdict, arguments.cached).await;
         start::compare_levels(&mut verdict, arguments.cached).await;
+        start::follow_loads(&mut verdict, arguments.cached.min(30)).await;
     }
     if is_wanted(Part::Class) {
         let sizes = if arguments.size.is_empty() {

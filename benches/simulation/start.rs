@@ -1,17 +1,21 @@
 //! Measures what a cached start costs beyond its git commands, and what a sandbox adds to it.
 
+use std::io::{Read, Write};
+use std::net::TcpStream;
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use crate::Verdict;
 use crate::support::client::Client;
-use crate::support::git::{Forge, world};
+use crate::support::git::{Forge, WORLD, world};
 use crate::support::program::simulation_server;
 use crate::support::webots::Webots;
 
 /// Limit of the time beyond that of git, and of that for a sandbox.
 const BOUND: Duration = Duration::from_millis(10);
+/// Limit of the time from the readiness of a world to the URL.
+const LATENESS: Duration = Duration::from_millis(50);
 
 pub async fn measure(verdict: &mut Verdict, starts: usize) {
     let forge = Forge::with_arm();
@@ -34,6 +38,62 @@ pub async fn measure(verdict: &mut Verdict, starts: usize) {
     let over = ours.saturating_sub(plain);
     println!("  {:.2} times as long", ours.as_secs_f64() / plain.as_secs_f64());
     verdict.bound("over git", over, BOUND);
+}
+
+/// Measures how much later than its world is ready a client receives the URL of its Webots, for worlds that are
+/// downloaded, read, or both.
+pub async fn follow_loads(verdict: &mut Verdict, starts: usize) {
+    for level in ["none", "sandbox"] {
+        for options in ["download=0.3", "load=0.3", "download=0.3 load=0.3"] {
+            let forge = Forge::with_arm();
+            let world = WORLD.replacen('\n', &format!("\n#demo-simulator: {options}\n"), 1);
+            forge.commit("lab/arm", "slow", &[("worlds/a.wbt", &world)]);
+            let webots = Webots::launcher();
+            let server = simulation_server(&webots.path(), forge.path(), 1)
+                .set("isolation", level)
+                .start()
+                .await;
+            let mut late = Vec::new();
+            for _ in 0..starts {
+                late.push(lateness(&server).await);
+            }
+            let worst = late.iter().max().copied().unwrap_or_default();
+            println!(
+                "{level}, {options}: the URL comes {:.1?} after readiness (median of {starts}), at most {worst:.1?}",
+                median(late)
+            );
+            verdict.bound("after readiness, at most", worst, LATENESS);
+        }
+    }
+}
+
+/// The time from the readiness of a world, which a thread of its own sees, to the URL.
+async fn lateness(server: &crate::support::program::Server) -> Duration {
+    let mut client = Client::start(server, &world("lab/arm", "slow", "worlds/a.wbt")).await;
+    client.until("loading: webots is starting").await;
+    let port = server.port + 1;
+    let ready = std::thread::spawn(move || {
+        while !is_ready(port) {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        Instant::now()
+    });
+    client.until("webots:").await;
+    let told = Instant::now();
+    let late = told.saturating_duration_since(ready.join().unwrap());
+    client.close_with(1000).await;
+    late
+}
+
+/// Whether the Webots at this port has a world; waits while it reads one.
+fn is_ready(port: u16) -> bool {
+    let Ok(mut stream) = TcpStream::connect(("127.0.0.1", port)) else {
+        return false;
+    };
+    let mut answer = [0; 6];
+    stream.write_all(b"CTR\nRobot-Name: %2F\n\n").is_ok()
+        && stream.read_exact(&mut answer).is_ok()
+        && answer == *b"FAILED"
 }
 
 /// Measures how much longer a program takes from its launch to its end in a sandbox.

@@ -21,6 +21,10 @@ def serve(client):
         if not received:
             return  # the server has looked whether anything listens
         head += received
+        if head.startswith(b"CTR"):  # the server asks whether the world is ready
+            client.sendall(b"FAILED")
+            client.close()
+            return
     keys = [line.split(b": ")[1] for line in head.split(b"\r\n") if line.lower().startswith(b"sec-websocket-key")]
     if not keys:
         client.close()
