@@ -13,7 +13,7 @@ use super::ends::Ends;
 use super::slots::SlotPool;
 use super::state::AppState;
 use super::{announcer, readiness};
-use crate::shared::domain::AdmissionRules;
+use crate::shared::domain::{AdmissionRules, Reason};
 use crate::shared::http::server::{self, HttpServerOptions};
 use crate::shared::http::{
     AddressQuota, BasicAuth, ConnectionLimiter, LiveUpdates, Metrics, STREAMS_PER_CLIENT, SharedPage, TCP_PER_CLIENT,
@@ -228,8 +228,9 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
         "Simulations that were asked for",
         "outcome",
     )?;
-    for outcome in ["ready", "refused", "full"] {
-        starts.with_label_values(&[outcome]);
+    starts.with_label_values(&["ready"]);
+    for refusal in Reason::REFUSALS {
+        starts.with_label_values(&[refusal.code()]);
     }
     let failed_starts = Arc::default();
     let problem = readiness::watch(

@@ -15,6 +15,7 @@
 //! | `ide: enable` | the project has an editor, on Webots' port + 500 |
 //! | `type:TYPE` | the project's type in its `webots.yml` |
 //! | `loading: TEXT` | progress |
+//! | `reason: {"code": CODE, "blame": WHO, "retry": WHERE, "output": TEXT}` | the same for programs, before the next |
 //! | `loading: Error: TEXT` | why the simulation failed; the connection is closed, except after `reset controller` |
 //! | `shutdownTimeout: SECONDS` | Webots was launched, and will be ended after this many seconds |
 //! | `kind: w3d` or `kind: x3d` | the 3D scene that this Webots streams: the message with which a viewer requests it |
@@ -29,9 +30,11 @@
 //! Webots' page inserts every TEXT into `innerHTML`, so it passes through [`client_text`] and [`without_paths`] here,
 //! and nowhere else.
 
-use serde::{Deserialize, Deserializer};
+use actix_web_actors::ws::CloseCode;
+use serde::{Deserialize, Deserializer, Serialize};
 use serde_json::Value;
 
+use crate::shared::domain::{Blame, Failure, Reason, Retry};
 use crate::shared::text::{client_text, without_paths};
 use crate::simulation::sessions::Token;
 
@@ -91,7 +94,7 @@ pub enum SceneKind {
 /// Why a message is invalid. The message is for the client.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "Wrong message: {0}. Allowed are {{\"start\": {{\"url\": ..., \"mode\": \"x3d\", \"w3d\" or \"mjpeg\"}}}} and {{\"reset controller\": \"NAME/FILE\"}}."
+    "Wrong message: {0}. Allowed are {{\"start\": {{\"url\": ..., \"mode\": \"x3d\", \"w3d\" or \"mjpeg\"}}}} and {{\"reset controller\": \"NAME/FILE\"}}"
 )]
 pub struct ClientRequestError(String);
 
@@ -114,6 +117,22 @@ impl ClientRequest {
     }
 }
 
+impl From<ClientRequestError> for Failure {
+    fn from(error: ClientRequestError) -> Self {
+        Self::new(Reason::InvalidRequest, error.to_string())
+    }
+}
+
+/// The content of `reason:`.
+#[derive(Serialize)]
+struct ReasonText {
+    code: Reason,
+    blame: Blame,
+    retry: Retry,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    output: Option<String>,
+}
+
 /// The heartbeat of Webots.
 pub const HEARTBEAT: &str = ".";
 
@@ -128,30 +147,59 @@ pub fn loading(text: &str) -> String {
     format!("loading: {}", client_text(&without_paths(text)))
 }
 
-/// Why a simulation failed.
-pub fn error(text: &str) -> String {
-    loading(&format!("Error: {text}"))
+/// A refusal, a failed start or an end: its reason for programs, then a sentence.
+pub fn failure(failure: &Failure) -> [String; 2] {
+    let Failure {
+        reason,
+        message,
+        output,
+    } = failure;
+    let reason_in_json = ReasonText {
+        code: *reason,
+        blame: reason.blame(),
+        retry: reason.retry(),
+        output: output.as_deref().map(|output| client_text(&without_paths(output))),
+    };
+    let mut sentence = message.clone();
+    let mut add = |more: &str| sentence = format!("{}. {more}", sentence.trim_end_matches('.'));
+    if let Some(output) = output {
+        add(&format!("Its last output: {output}"));
+    }
+    if reason.retry() == Retry::Elsewhere && *reason != Reason::ServerStopped {
+        add("Connect again: the session server chooses another simulation server");
+    }
+    if *reason != Reason::Finished {
+        sentence = format!("Error: {sentence}");
+    }
+    // It has texts only: no error is possible.
+    let json = serde_json::to_string(&reason_in_json).unwrap_or_default();
+    [format!("reason: {json}"), loading(&sentence)]
+}
+
+/// The code with which a connection closes after a refusal, a failed start or an end.
+pub fn close_code(reason: Reason) -> CloseCode {
+    match (reason, reason.retry()) {
+        (Reason::ServerStopped, _) => CloseCode::Away,
+        (Reason::Lost, _) => CloseCode::Error,
+        (_, Retry::Elsewhere) => CloseCode::Again,
+        (_, Retry::No | Retry::Here | Retry::Later) => CloseCode::Normal,
+    }
 }
 
 /// The server stops.
-pub fn stopping() -> String {
-    error("This simulation server is stopping")
+pub fn stopping() -> Failure {
+    Failure::new(Reason::ServerStopped, "This simulation server is stopping")
 }
 
 /// The answer to `reset controller` without a running simulation.
-pub fn nothing_to_reset() -> String {
-    error("A controller can be reset only while a simulation runs")
+pub fn nothing_to_reset() -> Failure {
+    Failure::new(
+        Reason::NothingToReset,
+        "A controller can be reset only while a simulation runs",
+    )
 }
 
-/// Why a simulation can't start here; another server may accept its client.
-pub fn elsewhere(why: &str) -> String {
-    let why = why.trim_end_matches('.');
-    error(&format!(
-        "{why}. Connect again: the session server chooses another simulation server"
-    ))
-}
-
-/// Why an administrator has stopped a simulation, without the prefix of an error.
+/// Why an administrator has stopped a simulation, as its client reads it.
 pub fn stopped_by_teacher(reason: &str) -> String {
     let words = "Your teacher has stopped this simulation";
     if reason.is_empty() {
@@ -204,16 +252,21 @@ pub fn idle(seconds: Option<u64>) -> String {
     seconds.map_or("idle: never".to_owned(), |seconds| format!("idle: {seconds}"))
 }
 
-/// Why a client can't resume a simulation, with the reason for its end if it is known.
-pub fn ended(why: Option<&str>) -> String {
-    error(&why.map_or("this simulation has ended".to_owned(), |why| {
-        format!("this simulation has ended: {why}")
-    }))
+/// Why a client can't resume a simulation that has ended for this reason; `None`: the reason is not known any more.
+pub fn ended(failure: Option<&Failure>) -> Failure {
+    let words = "this simulation has ended";
+    match failure {
+        None => Failure::new(Reason::Ended, words),
+        Some(failure) => Failure {
+            message: format!("{words}: {failure}"),
+            ..failure.clone()
+        },
+    }
 }
 
 /// Why a connection is closed: another one has used its token.
-pub fn taken_over() -> String {
-    error("this simulation was taken over elsewhere")
+pub fn taken_over() -> Failure {
+    Failure::new(Reason::TakenOver, "this simulation was taken over elsewhere")
 }
 
 /// The scene that viewers request from this Webots.

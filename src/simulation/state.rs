@@ -11,7 +11,7 @@ use super::ends::Ends;
 use super::readiness::FailedStarts;
 use super::sessions::Sessions;
 use super::slots::SlotPool;
-use crate::shared::domain::{AdmissionRules, Load, ProjectUrl};
+use crate::shared::domain::{AdmissionRules, Failure, Load, ProjectUrl, Reason};
 use crate::shared::http::{AddressQuota, BasicAuth, ConnectionLimiter, LiveUpdates, Metrics, SharedPage};
 use crate::shared::run::Phase;
 use crate::simulation::checkout::CheckoutService;
@@ -123,16 +123,17 @@ impl AppState {
     /// Checks whether a world may run here now: its URL, the rules, and that the server accepts clients.
     ///
     /// # Errors
-    /// The reason why not, as text for the client.
-    pub fn admit(&self, url: &str) -> Result<ProjectUrl, String> {
-        let world = ProjectUrl::parse(url).map_err(|wrong| wrong.to_string())?;
+    /// Why it may not.
+    pub fn admit(&self, url: &str) -> Result<ProjectUrl, Failure> {
+        let world = ProjectUrl::parse(url).map_err(|wrong| Failure::new(Reason::InvalidWorld, wrong.to_string()))?;
         if self.is_draining() {
-            return Err("This simulation server is about to end, and takes no new clients".to_owned());
+            let message = "This simulation server is about to end, and takes no new clients";
+            return Err(Failure::new(Reason::Draining, message));
         }
-        self.problem().map_or(Ok(()), Err)?;
-        self.rules
-            .admit(&world, self.load())
-            .map_err(|refusal| refusal.to_string())?;
+        if let Some(problem) = self.problem() {
+            return Err(Failure::new(Reason::NotReady, problem));
+        }
+        self.rules.admit(&world, self.load())?;
         Ok(world)
     }
 

@@ -21,7 +21,7 @@ use webots_fleet::shared::domain::{Load, ProjectUrl, ServerReport};
 use webots_fleet::shared::http::{Peer, TrustedProxies};
 use webots_fleet::simulation::config::SimulationConfig;
 use webots_fleet::simulation::container::{ProjectKind, WebotsYml};
-use webots_fleet::simulation::protocol::{ClientRequest, error};
+use webots_fleet::simulation::protocol::{ClientRequest, failure};
 
 /// The default number of cases of each kind.
 const CASES: u32 = 3_000;
@@ -73,7 +73,7 @@ fn any_message_is_answered_in_the_form_of_the_protocol() {
                 assert!(serde_json::from_str::<serde_json::Value>(&text).is_ok());
             }
             Err(wrong) => {
-                let told = error(&wrong.to_string());
+                let [_, told] = failure(&wrong.into());
                 assert!(told.starts_with("loading: Error: Wrong message: "), "{told}");
                 // Webots' page inserts the text as HTML.
                 assert!(!told.contains(['<', '>', '&']) && is_one_line(&told), "{told}");

@@ -150,7 +150,8 @@ async fn without_webots_a_client_is_told_what_to_do() {
         .send(&serde_json::json!({"start": {"url": world}}).to_string())
         .await;
     client.closed().await;
-    let [told] = client.heard.as_slice() else {
+    assert_eq!(client.reason()["code"], "not-ready");
+    let [_, told] = client.heard.as_slice() else {
         panic!("{:?}", client.heard)
     };
     assert!(told.starts_with("loading: Error: "), "{told}");

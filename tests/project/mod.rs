@@ -7,4 +7,5 @@ mod copy;
 mod demo;
 mod layering;
 mod pages;
+mod reasons;
 mod refusals;

@@ -97,7 +97,7 @@ async fn a_world_goes_only_where_it_will_be_accepted() {
     assert_eq!(client.until("").await, words);
     // The reason comes only to a client that asks for it.
     client.send(&json!({"url": url, "reason": true}).to_string()).await;
-    let reason = client.until("").await;
+    let reason = client.until("reason: ").await;
     let reason: Value = serde_json::from_str(reason.strip_prefix("reason: ").unwrap()).unwrap();
     let expected = json!({"code": "repository-not-allowed", "blame": "user", "retry": "no"});
     assert_eq!((reason, client.until("").await.as_str()), (expected, words));

@@ -150,7 +150,7 @@ async fn a_client_is_told_how_webots_ended() {
         ("exit 0", "loading: Webots has ended"),
         (
             "echo 'no licence' >&2; exit 3",
-            "loading: Error: Webots ended with exit code 3. Its last output: no licence",
+            "loading: Error: Webots ended with exit code 3",
         ),
         (
             "kill -SEGV $$",
@@ -171,6 +171,13 @@ async fn a_client_is_told_how_webots_ended() {
             }
             let told = client.heard.last().unwrap().clone();
             assert!(told.starts_with(words), "{told}");
+            let output = end.contains("licence").then_some("no licence");
+            assert_eq!(client.reason()["output"].as_str(), output, "{told}");
+            assert_eq!(
+                told.contains(". Its last output: no licence"),
+                output.is_some(),
+                "{told}"
+            );
             // If Webots ends before it listens, the server counts that as its own fault.
             let is_own = start.is_empty() && told.starts_with("loading: Error:");
             assert_eq!(client.closed().await, Some(if is_own { 1013 } else { 1000 }), "{told}");

@@ -42,7 +42,7 @@ async fn a_start_that_fails_because_of_the_server_is_sent_elsewhere() {
         );
         assert_eq!(client.closed().await, Some(1013));
         assert_eq!(failed_starts(&server).await, count);
-        assert_eq!(line(&server, client.id()).await[10], "no_webots");
+        assert_eq!(line(&server, client.id()).await[10], "launch-failed");
     }
     // A missing world is not the server's fault.
     let mut client = Client::start(&server, &world("lab/arm", "main", "worlds/none.wbt")).await;

@@ -20,7 +20,8 @@ async fn refused(server: &Server, token: &str) -> String {
     let mut client = Client::resuming(server, token).await;
     let told = client.until("").await;
     assert_eq!(client.closed().await, Some(1000), "{told}");
-    assert_eq!(client.heard.len(), 1, "{:?}", client.heard);
+    // Its reason, and the error.
+    assert_eq!(client.heard.len(), 2, "{:?}", client.heard);
     told
 }
 

@@ -37,7 +37,7 @@ async fn a_simulation_is_stopped_in_any_state() {
         let told = client.until("loading: Error:").await;
         assert_eq!(told, format!("{TOLD}: \u{2039}b\u{203a}Back to work"), "{state:?}");
         assert_eq!(client.closed().await, Some(1000), "{state:?}");
-        assert_eq!(line(server, &id).await[10], "administrator", "{state:?}");
+        assert_eq!(line(server, &id).await[10], "stopped-by-administrator", "{state:?}");
         assert_eq!(stop(server, &id, "").await, 404, "{state:?}");
         if let Some(other) = &mut scene.other {
             other.until(".").await;
@@ -46,7 +46,7 @@ async fn a_simulation_is_stopped_in_any_state() {
         }
         let metrics = server.metrics().await;
         assert!(
-            metrics.contains("webots_simulation_ends_total{reason=\"administrator\"} 1"),
+            metrics.contains("webots_simulation_ends_total{reason=\"stopped-by-administrator\"} 1"),
             "{metrics}"
         );
         let page = server.monitor().await;

@@ -226,12 +226,13 @@ impl Client {
     }
 
     /// The next text that begins like this; skips others. An empty beginning does not match the id of a simulation,
-    /// which precedes all answers.
+    /// which precedes all answers, nor a reason, which precedes each error.
     pub async fn until(&mut self, beginning: &str) -> String {
-        let is_id = |text: &str| beginning.is_empty() && text.starts_with("session: ");
+        let is_before =
+            |text: &str| beginning.is_empty() && (text.starts_with("session: ") || text.starts_with("reason: "));
         loop {
             match self.next().await {
-                Heard::Text(text) if text.starts_with(beginning) && !is_id(&text) => return text,
+                Heard::Text(text) if text.starts_with(beginning) && !is_before(&text) => return text,
                 Heard::Text(_) => {}
                 Heard::Closed(frame) => panic!("closed ({frame:?}) before {beginning:?}; heard {:#?}", self.heard),
             }
@@ -265,6 +266,13 @@ impl Client {
                 return frame.map(|frame| frame.code.into());
             }
         }
+    }
+
+    /// The last reason that the server has sent.
+    pub fn reason(&self) -> serde_json::Value {
+        let told = self.heard.iter().rev().find_map(|text| text.strip_prefix("reason: "));
+        let told = told.unwrap_or_else(|| panic!("no reason in {:#?}", self.heard));
+        serde_json::from_str(told).unwrap()
     }
 
     /// Whether nothing is received for this long.

@@ -3,7 +3,7 @@
 use std::io;
 use std::time::Duration;
 
-use crate::shared::domain::ProjectUrl;
+use crate::shared::domain::{Failure, ProjectUrl, Reason};
 use crate::simulation::process::{ExitReason, RunError};
 
 /// Why a checkout failed.
@@ -167,11 +167,21 @@ impl CheckoutError {
             message,
         }
     }
+}
 
-    /// Whether this server is the cause (its disk, network or processes), so that another server may succeed. A corrupt
-    /// repository does not count: its content may be the cause, and the next start fetches it again.
-    pub fn is_own(&self) -> bool {
-        self.cause == Cause::Machine
+impl From<CheckoutError> for Failure {
+    fn from(error: CheckoutError) -> Self {
+        let reason = match error.cause {
+            Cause::Refused => Reason::WorldNotFound,
+            Cause::NoRepository => Reason::RepositoryNotFound,
+            Cause::NoCommit => Reason::CommitNotFound,
+            Cause::Moved => Reason::RepositoryMoved,
+            Cause::TooLarge => Reason::ProjectTooLarge,
+            Cause::Slow(_) => Reason::CheckoutTimeout,
+            Cause::Damaged | Cause::Other => Reason::RemoteFailed,
+            Cause::Machine => Reason::ServerFault,
+        };
+        Self::new(reason, error.message)
     }
 }
 

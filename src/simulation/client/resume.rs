@@ -1,81 +1,97 @@
 //! How a session waits for its client, and continues with the client's next connection.
 
 use actix::prelude::*;
-use actix_web_actors::ws::CloseCode;
 use futures_util::stream::{self, StreamExt};
 
-use super::session::{Session, seconds_until};
+use super::session::{Attachment, Client, Ready, Session, State, seconds_until};
+use crate::shared::domain::Failure;
 use crate::shared::run::seconds_since_1970;
+use crate::simulation::ends::StopReason;
 use crate::simulation::protocol;
 use crate::simulation::sessions::{ClientAction, Connection, Resume, ToClient, Token};
 
 impl Session {
     /// Waits for a client that may return; ends the session if it can't be resumed.
     pub(super) fn await_client(&mut self, ctx: &mut Context<Self>) {
-        let absence = self.server.config.timing.absence;
-        if self.token.is_none() {
-            return ctx.stop();
+        if self.state.token().is_none() {
+            return self.leave(StopReason::Left, ctx);
         }
-        if self.deadline.is_some() {
+        if let Client::Away(_) = self.client {
             return;
         }
-        if self.ended.is_none() {
+        let absence = self.server.config.timing.absence;
+        if let State::Ready(_) = self.state {
             log::info!("{}: away; it may come back within {} s", self.name(), absence.as_secs());
             self.show_away(Some(seconds_since_1970() + absence.as_secs()));
         }
-        self.deadline = Some(ctx.run_later(absence, |_, ctx| ctx.stop()));
+        self.client = Client::Away(ctx.run_later(absence, |this, ctx| this.leave(StopReason::Away, ctx)));
     }
 
     fn show_away(&self, until: Option<u64>) {
-        if let Some(id) = self.id {
-            self.server.slots.update(id, |one| one.away_until = until);
-        }
+        self.server
+            .slots
+            .update(self.id, |simulation| simulation.away_until = until);
     }
 
-    /// Switches the session to this connection: an earlier one is closed, and its actions are ignored.
-    pub(super) fn attach(
-        &mut self,
-        Connection {
-            peer,
-            client,
-            mut actions,
-        }: Connection,
-        ctx: &mut Context<Self>,
-    ) {
-        self.peer = peer;
-        if let Some(before) = self.client.replace(client) {
-            before.do_send(ToClient::End(protocol::taken_over(), CloseCode::Normal));
-        }
+    /// Attaches a connection to a session.
+    pub(super) fn attached(connection: Connection, ctx: &mut Context<Self>) -> Attachment {
+        let Connection {
+            client, mut actions, ..
+        } = connection;
         let actions = stream::poll_fn(move |context| actions.poll_recv(context));
-        let (actions, attachment) = stream::abortable(actions.chain(stream::iter([ClientAction::Disconnect])));
+        let (actions, handle) = stream::abortable(actions.chain(stream::iter([ClientAction::Disconnect])));
         ctx.add_stream(actions);
-        if let Some(before) = self.attachment.replace(attachment) {
-            before.abort();
+        Attachment {
+            client,
+            actions: handle,
         }
     }
 
     /// Sends the client the kind of the scene, the URL of Webots and, if the session is resumable, a token to return with.
-    pub(super) fn offer(&mut self, ctx: &mut Context<Self>) {
-        let Some(url) = &self.url else { return };
-        if let Some(kind) = self.kind {
-            self.text(protocol::kind(kind).to_owned());
+    pub(super) fn offer(&self) {
+        let State::Ready(Ready {
+            launched, url, token, ..
+        }) = &self.state
+        else {
+            return;
+        };
+        if let Some(scene) = launched.scene {
+            self.text(protocol::kind(scene).to_owned());
         }
         self.text(protocol::webots(url));
-        if self.resumable {
-            let register = || self.server.sessions.register(ctx.address().recipient());
-            let token = self.token.map_or_else(register, Token::next);
-            self.token = Some(token);
+        if let Some(token) = token {
             self.text(protocol::absence(self.server.config.timing.absence.as_secs()));
-            self.text(protocol::resume(&token));
+            self.text(protocol::resume(token));
         }
     }
 
-    /// Why a client with this token may not return, as text for it; `None` if it may.
-    fn refusal(&self, token: Token) -> Option<String> {
-        if self.token != Some(token) {
-            return Some(protocol::taken_over());
+    /// Why a client with this token may not return; `None` if it may.
+    fn refusal(&self, token: Token) -> Option<Failure> {
+        match &self.state {
+            state if state.token() != Some(token) => Some(protocol::taken_over()),
+            State::Over { failure, .. } => Some(protocol::ended(Some(failure))),
+            _ => None,
         }
-        self.ended.as_ref().map(|why| protocol::ended(Some(why)))
+    }
+
+    /// Tells a client that has come back what it has missed.
+    fn tell_again(&self) {
+        let State::Ready(ready) = &self.state else { return };
+        self.text(protocol::session(self.id));
+        let rest = self
+            .server
+            .config
+            .timeout
+            .saturating_sub(ready.started.elapsed().as_secs());
+        self.text(protocol::shutdown_timeout(rest));
+        self.texts(ready.launched.texts.iter().cloned());
+        self.offer();
+        if let Some(end) = ready.idle_end {
+            self.text(protocol::idle(Some(seconds_until(end))));
+        }
+        if ready.is_watched {
+            self.text(protocol::watched(true));
+        }
     }
 }
 
@@ -83,30 +99,24 @@ impl Handler<Resume> for Session {
     type Result = ();
 
     fn handle(&mut self, Resume { token, connection }: Resume, ctx: &mut Self::Context) {
+        let peer = connection.peer;
         if let Some(refusal) = self.refusal(token) {
-            log::info!(
-                "{}: client {} does not come back: {refusal}",
-                self.name(),
-                connection.peer
-            );
-            return connection.client.do_send(ToClient::End(refusal, CloseCode::Normal));
+            log::info!("{}: client {peer} does not come back: {refusal}", self.name());
+            return connection.client.do_send(ToClient::End(refusal));
         }
-        log::info!("{}: goes on as client {}", self.name(), connection.peer);
-        self.attach(connection, ctx);
-        self.deadline.take().map(|deadline| ctx.cancel_future(deadline));
+        log::info!("{}: goes on as client {peer}", self.name());
+        self.peer = peer;
+        let attached = Self::attached(connection, ctx);
+        match std::mem::replace(&mut self.client, Client::Connected(attached)) {
+            Client::Connected(before) => before.client.do_send(ToClient::End(protocol::taken_over())),
+            Client::Away(deadline) => {
+                ctx.cancel_future(deadline);
+            }
+        }
+        if let State::Ready(Ready { token, .. }) = &mut self.state {
+            *token = token.map(Token::next);
+        }
         self.show_away(None);
-        self.id.into_iter().for_each(|id| self.text(protocol::session(id)));
-        let passed = self.launched.map_or(0, |launched| launched.elapsed().as_secs());
-        self.text(protocol::shutdown_timeout(
-            self.server.config.timeout.saturating_sub(passed),
-        ));
-        self.texts.iter().for_each(|text| self.text(text.clone()));
-        self.offer(ctx);
-        if let Some(end) = self.idle_end {
-            self.text(protocol::idle(Some(seconds_until(end))));
-        }
-        if self.is_watched {
-            self.text(protocol::watched(true));
-        }
+        self.tell_again();
     }
 }

@@ -8,78 +8,108 @@ use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
 use actix::prelude::*;
-use actix_web_actors::ws::CloseCode;
 use futures_util::stream::AbortHandle;
 
-use crate::shared::domain::ProjectUrl;
+use crate::shared::domain::{Failure, ProjectUrl, Reason};
 use crate::shared::http::Peer;
 use crate::shared::run::closing;
 use crate::simulation::checkout::Project;
 use crate::simulation::client_identity::ClientIdentity;
-use crate::simulation::ends::{EndReason, Taken};
+use crate::simulation::ends::{StopReason, lost};
 use crate::simulation::protocol::{self, Mode, SceneKind};
 use crate::simulation::sessions::{ClientAction, Connection, ToClient, Token};
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::slots::{Slot, SlotEvent, SlotLease};
 use crate::simulation::state::AppState;
-use crate::simulation::webots::{Keep, Stop, Webots, WebotsEvent, WebotsExit};
+use crate::simulation::webots::{Keep, Stop, Webots, WebotsEvent};
 
 /// The actor.
 pub struct Session {
     pub(super) server: Arc<AppState>,
+    /// The id of the simulation.
+    pub(super) id: SimulationId,
+    /// The address of its last connection.
     pub(super) peer: Peer,
-    /// The id of the simulation, once there is one.
-    pub(super) id: Option<SimulationId>,
-    /// The connection of its client; `None` once it has ended.
-    pub(super) client: Option<Recipient<ToClient>>,
-    /// Detaches that connection at once.
-    pub(super) attachment: Option<AbortHandle>,
+    pub(super) client: Client,
     pub(super) state: State,
-    /// The project that was checked out, as long as its Webots holds it.
-    pub(super) project: Weak<Project>,
-    /// How it is shown.
+    /// How its client wants to see it.
     pub(super) mode: Mode,
-    /// The 3D scene that its Webots streams, once that is known; `None` for a video.
-    pub(super) kind: Option<SceneKind>,
     /// Whether its client may resume it.
     pub(super) resumable: bool,
-    /// The last token that the client got; `None` before it can return.
-    pub(super) token: Option<Token>,
-    /// When Webots was started: the time limit starts then.
-    pub(super) launched: Option<Instant>,
-    /// The texts that its project requests, kept for a client that returns.
-    pub(super) texts: Vec<String>,
-    /// The URL of Webots, once it is ready.
-    pub(super) url: Option<String>,
-    /// When the simulation ends because it is paused; `None` if it does not.
-    pub(super) idle_end: Option<Instant>,
-    pub(super) is_watched: bool,
-    /// The timer that ends the wait for the client, while it waits.
-    pub(super) deadline: Option<SpawnHandle>,
-    /// Why the simulation has ended, if it has.
-    pub(super) ended: Option<String>,
     /// Whether a controller is being reset.
     is_resetting: bool,
 }
 
-/// The life cycle of a simulation, as its session knows it. Dropping a state releases what the session holds in it.
+/// The client of a session.
+pub(super) enum Client {
+    /// It is connected.
+    Connected(Attachment),
+    /// It may come back until this timer ends the session.
+    Away(SpawnHandle),
+}
+
+/// A connection that is attached to a session. Dropping it detaches the connection at once.
+pub(super) struct Attachment {
+    /// Receives what is for the client.
+    pub(super) client: Recipient<ToClient>,
+    /// Ends the stream of the client's actions.
+    pub(super) actions: AbortHandle,
+}
+
+impl Drop for Attachment {
+    fn drop(&mut self) {
+        self.actions.abort();
+    }
+}
+
+/// The life cycle of a simulation, as its session knows it. Each state holds what exists only in it; dropping a state
+/// releases that.
 pub(super) enum State {
     /// Waiting for a slot; the lease holds the position in the queue.
     Waiting { world: ProjectUrl, lease: SlotLease },
     /// The project is being checked out for this slot; the job ends with the actor.
     CheckingOut(Slot),
-    /// Webots was started.
-    Launched(WebotsHandle),
-    /// Nothing is held: the simulation was not admitted yet, or its client got the last text.
-    Over,
+    /// Webots was requested, and is not ready.
+    Launching(Launched),
+    /// Webots is ready.
+    Ready(Ready),
+    /// The simulation has ended, or was not admitted. A client that has this token may come back to hear why.
+    Over { failure: Failure, token: Option<Token> },
+}
+
+/// A simulation whose Webots was requested.
+pub(super) struct Launched {
+    pub(super) webots: WebotsHandle,
+    /// The project that was checked out, as long as its Webots holds it.
+    pub(super) project: Weak<Project>,
+    /// The 3D scene that its Webots streams; `None` for a video.
+    pub(super) scene: Option<SceneKind>,
+    /// The texts that its project requests, kept for a client that returns.
+    pub(super) texts: Vec<String>,
+}
+
+/// A simulation whose Webots is ready.
+pub(super) struct Ready {
+    pub(super) launched: Launched,
+    /// When Webots was started: the time limit counts from then.
+    pub(super) started: Instant,
+    /// The URL of Webots.
+    pub(super) url: String,
+    /// The last token that the client got; `None` if it can't return.
+    pub(super) token: Option<Token>,
+    /// When the simulation ends because it is paused; `None` if it does not.
+    pub(super) idle_end: Option<Instant>,
+    /// Whether an administrator watches it.
+    pub(super) is_watched: bool,
 }
 
 /// A running Webots. Dropping the handle stops it.
 pub(super) struct WebotsHandle(pub(super) Addr<Webots>);
 
 impl Drop for WebotsHandle {
+    /// A session that ends in order has requested this end before, and only the first reason counts.
     fn drop(&mut self) {
-        self.0.do_send(Stop(EndReason::Left));
+        self.0.do_send(Stop(StopReason::SessionLost));
     }
 }
 
@@ -91,69 +121,137 @@ pub(super) fn seconds_until(then: Instant) -> u64 {
     (then.saturating_duration_since(Instant::now()) + Duration::from_millis(999)).as_secs()
 }
 
+impl State {
+    /// The end of a session that has panicked; also what is left of a state while the next one is made of it.
+    pub(super) fn lost() -> Self {
+        Self::Over {
+            failure: lost(),
+            token: None,
+        }
+    }
+
+    fn launched(&self) -> Option<&Launched> {
+        match self {
+            Self::Launching(launched) | Self::Ready(Ready { launched, .. }) => Some(launched),
+            Self::Waiting { .. } | Self::CheckingOut(_) | Self::Over { .. } => None,
+        }
+    }
+
+    /// The last token that the client got, if it got one.
+    pub(super) fn token(&self) -> Option<Token> {
+        match self {
+            Self::Ready(Ready { token, .. }) | Self::Over { token, .. } => *token,
+            Self::Waiting { .. } | Self::CheckingOut(_) | Self::Launching(_) => None,
+        }
+    }
+}
+
 impl Session {
-    /// Opens the session of a client that requests a simulation.
+    /// Opens the session of a client that requests a simulation; or tells it why it gets none.
     pub fn open(server: Arc<AppState>, identity: ClientIdentity, connection: Connection, request: &protocol::Start) {
+        let world = match Self::admit(&server, connection.peer, &request.url) {
+            Ok(world) => world,
+            Err(failure) => return connection.client.do_send(ToClient::End(failure)),
+        };
+        let id = SimulationId::next();
+        let peer = connection.peer;
+        log::info!("{id}: client {peer}: asks for {world}{identity}");
         Self::create(|ctx| {
-            let mut session = Self {
+            let me = ctx.address().recipient();
+            let state = match SlotLease::acquire(&server.slots, id, me, &world, (peer, identity)) {
+                Ok(lease) => State::Waiting { world, lease },
+                Err(failure) => State::Over { failure, token: None },
+            };
+            let session = Self {
                 resumable: request.resumable.unwrap_or_default() && !server.config.timing.absence.is_zero(),
                 server,
-                peer: connection.peer,
-                id: None,
-                client: None,
-                attachment: None,
-                state: State::Over,
-                project: Weak::new(),
+                id,
+                peer,
+                client: Client::Connected(Self::attached(connection, ctx)),
+                state,
                 mode: request.mode.unwrap_or_default(),
-                kind: None,
-                token: None,
-                launched: None,
-                texts: Vec::new(),
-                url: None,
-                idle_end: None,
-                is_watched: false,
-                deadline: None,
-                ended: None,
                 is_resetting: false,
             };
-            session.attach(connection, ctx);
-            session.request_slot(&request.url, identity, ctx);
+            session.text(protocol::session(id));
+            if let State::Over { failure, .. } = &session.state {
+                session.count(failure.reason.code());
+                session.tell(failure);
+                ctx.stop();
+            }
             session
         });
     }
 
     pub(super) fn name(&self) -> String {
-        let id = self.id.map(|id| format!("{id}: ")).unwrap_or_default();
-        format!("{id}client {}", self.peer)
+        format!("{}: client {}", self.id, self.peer)
+    }
+
+    fn send(&self, message: ToClient) {
+        if let Client::Connected(Attachment { client, .. }) = &self.client {
+            client.do_send(message);
+        }
     }
 
     /// Sends the client a text that it must not miss.
     pub(super) fn text(&self, text: String) {
-        if let Some(client) = &self.client {
-            client.do_send(ToClient::Text(text));
+        self.send(ToClient::Text(text));
+    }
+
+    /// Sends the client texts that it must not miss.
+    pub(super) fn texts(&self, texts: impl IntoIterator<Item = String>) {
+        for text in texts {
+            self.text(text);
         }
     }
 
     /// Sends the client a text that is dropped if it can't keep up.
     fn hint(&self, text: String) {
-        if let Some(client) = &self.client {
+        if let Client::Connected(Attachment { client, .. }) = &self.client {
             client.try_send(ToClient::Text(text)).ok();
         }
     }
 
-    /// Releases everything, and sends the client the last text. A client that missed it receives `why` when it returns.
-    pub(super) fn finish(&mut self, last_words: String, why: &str, code: CloseCode, ctx: &mut Context<Self>) {
-        self.state = State::Over;
-        if let Some(client) = self.client.take() {
-            client.do_send(ToClient::End(last_words, code));
+    /// Sends the client the reason for a refusal, a failed start or an end.
+    fn tell(&self, failure: &Failure) {
+        log::info!("{}: {failure} ({})", self.name(), failure.reason);
+        self.send(ToClient::End(failure.clone()));
+    }
+
+    /// Releases everything, and sends the client the reason. A client that missed it receives it when it returns.
+    pub(super) fn finish(&mut self, failure: Failure, ctx: &mut Context<Self>) {
+        if let State::Over { .. } = self.state {
+            return;
         }
-        self.ended.get_or_insert_with(|| why.to_owned());
+        self.tell(&failure);
+        let token = self.state.token();
+        self.state = State::Over { failure, token };
         self.await_client(ctx);
     }
 
+    /// Reports why the simulation ends, before the state is dropped. Webots' own report takes precedence.
+    pub(super) fn report(&self, reason: StopReason) {
+        match &self.state {
+            State::Waiting { lease, .. } | State::CheckingOut(Slot { lease, .. }) => lease.end(Failure::from(reason)),
+            State::Launching(Launched { webots, .. })
+            | State::Ready(Ready {
+                launched: Launched { webots, .. },
+                ..
+            }) => {
+                webots.0.do_send(Stop(reason));
+            }
+            State::Over { .. } => {}
+        }
+    }
+
+    /// Ends the session without a text to its client, which is not there.
+    pub(super) fn leave(&self, reason: StopReason, ctx: &mut Context<Self>) {
+        self.report(reason);
+        ctx.stop();
+    }
+
     fn reset_controller(&mut self, file: String, ctx: &mut Context<Self>) {
-        let Some(project) = self.project.upgrade() else {
-            return self.text(protocol::nothing_to_reset());
+        let Some(project) = self.state.launched().and_then(|launched| launched.project.upgrade()) else {
+            return self.texts(protocol::failure(&protocol::nothing_to_reset()));
         };
         if self.is_resetting {
             return log::info!("{}: a controller is being reset already", self.name());
@@ -166,37 +264,47 @@ impl Session {
             match restored {
                 Ok(file) => this.text(protocol::reset_controller(&file)),
                 // This error does not end the simulation.
-                Err(error) => this.text(protocol::error(&error.to_string())),
+                Err(error) => {
+                    let failure = Failure::new(Reason::NothingToReset, error.to_string());
+                    this.texts(protocol::failure(&failure));
+                }
             }
         });
         restored.spawn(ctx);
     }
 
-    /// Reports how the simulation ends, before the state is dropped. Webots' own report takes precedence.
-    pub(super) fn end(&self, reason: EndReason, why: &str) {
-        match &self.state {
-            State::Waiting { lease, .. } | State::CheckingOut(Slot { lease, .. }) => {
-                lease.end(reason, why, Taken::default());
-            }
-            State::Launched(WebotsHandle(webots)) => webots.do_send(Stop(reason)),
-            State::Over => {}
+    fn become_ready(&mut self, started: Instant, url: String, ctx: &mut Context<Self>) {
+        let launched = match std::mem::replace(&mut self.state, State::lost()) {
+            State::Launching(launched) => launched,
+            // It has ended meanwhile.
+            other => return self.state = other,
+        };
+        self.count("ready");
+        self.server.failed_starts.reset();
+        let register = || self.server.sessions.register(ctx.address().recipient());
+        self.state = State::Ready(Ready {
+            launched,
+            started,
+            url,
+            token: self.resumable.then(register),
+            idle_end: None,
+            is_watched: false,
+        });
+        self.offer();
+        if self.resumable {
+            let absence = self.server.config.timing.absence.as_secs();
+            // While Webots is busy it sends nothing, and its client would assume a lost connection.
+            ctx.run_interval(SIGN_OF_LIFE, move |this, _| this.hint(protocol::absence(absence)));
         }
     }
 
-    fn exited(&mut self, WebotsExit { clean, own, why }: &WebotsExit, ctx: &mut Context<Self>) {
-        if *own {
-            return if self.url.is_some() {
-                self.refer(why, ctx);
-            } else {
-                self.fail_own(why, ctx);
-            };
+    fn exited(&mut self, failure: Failure, ctx: &mut Context<Self>) {
+        match self.state {
+            State::Ready(_) => self.finish(failure, ctx),
+            State::Launching(_) => self.fail(failure, ctx),
+            // The session has ended it; the client knows why.
+            State::Over { .. } | State::Waiting { .. } | State::CheckingOut(_) => {}
         }
-        let words = if *clean {
-            protocol::loading(why)
-        } else {
-            protocol::error(why)
-        };
-        self.finish(words, why, CloseCode::Normal, ctx);
     }
 }
 
@@ -207,8 +315,8 @@ impl Actor for Session {
         closing(self.server.phase.subscribe())
             .into_actor(self)
             .map(|(), this, ctx| {
-                this.end(EndReason::Stopped, "The server was stopped");
-                this.finish(protocol::stopping(), "", CloseCode::Away, ctx);
+                this.report(StopReason::ServerStopped);
+                this.finish(protocol::stopping(), ctx);
                 ctx.stop();
             })
             .spawn(ctx);
@@ -220,15 +328,12 @@ impl StreamHandler<ClientAction> for Session {
         match action {
             ClientAction::ResetController(file) => self.reset_controller(file, ctx),
             ClientAction::Keep => {
-                if let State::Launched(WebotsHandle(webots)) = &self.state {
-                    webots.do_send(Keep);
+                if let Some(Launched { webots, .. }) = self.state.launched() {
+                    webots.0.do_send(Keep);
                 }
             }
-            ClientAction::Leave => ctx.stop(),
-            ClientAction::Disconnect => {
-                self.client = None;
-                self.await_client(ctx);
-            }
+            ClientAction::Leave => self.leave(StopReason::Left, ctx),
+            ClientAction::Disconnect => self.await_client(ctx),
         }
     }
 
@@ -240,27 +345,29 @@ impl Handler<SlotEvent> for Session {
 
     fn handle(&mut self, event: SlotEvent, ctx: &mut Self::Context) {
         match event {
-            SlotEvent::Granted(port) => {
-                if let State::Waiting { world, lease } = std::mem::replace(&mut self.state, State::Over) {
-                    self.check_out(world, Slot { lease, port }, ctx);
-                }
-            }
-            SlotEvent::Queued(ahead) => protocol::queue(ahead).into_iter().for_each(|text| self.text(text)),
+            SlotEvent::Granted(port) => match std::mem::replace(&mut self.state, State::lost()) {
+                State::Waiting { world, lease } => self.check_out(world, Slot { lease, port }, ctx),
+                // It has ended while it waited.
+                other => self.state = other,
+            },
+            SlotEvent::Queued(ahead) => self.texts(protocol::queue(ahead)),
             SlotEvent::Watched(is_watched) => {
-                self.is_watched = is_watched;
+                if let State::Ready(ready) = &mut self.state {
+                    ready.is_watched = is_watched;
+                }
                 self.text(protocol::watched(is_watched));
             }
             SlotEvent::Stopped(why) => {
-                self.end(EndReason::Administrator, "The administrator has stopped it");
-                self.finish(protocol::error(&why), &why, CloseCode::Normal, ctx);
+                self.report(StopReason::Administrator);
+                self.finish(Failure::new(Reason::StoppedByAdministrator, why), ctx);
             }
-            // Its client may have come back meanwhile.
-            SlotEvent::MakeRoom if self.client.is_none() => {
-                let why = "Others wait for a place, and your address has left several simulations behind";
-                self.end(EndReason::Left, why);
-                self.finish(protocol::error(why), why, CloseCode::Normal, ctx);
+            SlotEvent::MakeRoom => {
+                // Its client may have come back meanwhile.
+                if let Client::Away(_) = self.client {
+                    self.report(StopReason::MakesRoom);
+                    self.finish(StopReason::MakesRoom.into(), ctx);
+                }
             }
-            SlotEvent::MakeRoom => {}
         }
     }
 }
@@ -273,31 +380,25 @@ impl Handler<WebotsEvent> for Session {
             WebotsEvent::Progress(text) => self.hint(protocol::loading(&text)),
             WebotsEvent::Text(text) => {
                 let text = protocol::of_project(&text);
-                self.texts.push(text.clone());
+                if let State::Launching(launched) = &mut self.state {
+                    launched.texts.push(text.clone());
+                }
                 self.text(text);
             }
-            WebotsEvent::Started => {
-                self.launched = Some(Instant::now());
-                self.text(protocol::shutdown_timeout(self.server.config.timeout));
-            }
-            WebotsEvent::Listening(port, stream) => {
-                self.count("ready");
-                self.server.failed_starts.reset();
-                self.url = Some(self.server.config.stream_url(port, &stream.reveal()));
-                self.offer(ctx);
-                if self.resumable {
-                    let absence = self.server.config.timing.absence.as_secs();
-                    // While Webots is busy it sends nothing, and its client would assume a lost connection.
-                    ctx.run_interval(SIGN_OF_LIFE, move |this, _| this.hint(protocol::absence(absence)));
-                }
+            WebotsEvent::Started => self.text(protocol::shutdown_timeout(self.server.config.timeout)),
+            WebotsEvent::Ready { started, port, stream } => {
+                let url = self.server.config.stream_url(port, &stream.reveal());
+                self.become_ready(started, url, ctx);
             }
             WebotsEvent::Heartbeat => self.hint(protocol::HEARTBEAT.to_owned()),
             WebotsEvent::Hanging(seconds) => self.hint(protocol::hanging(seconds)),
             WebotsEvent::IdleEnd(end) => {
-                self.idle_end = end;
+                if let State::Ready(ready) = &mut self.state {
+                    ready.idle_end = end;
+                }
                 self.text(protocol::idle(end.map(seconds_until)));
             }
-            WebotsEvent::Exited(exit) => self.exited(&exit, ctx),
+            WebotsEvent::Exited(failure) => self.exited(failure, ctx),
         }
     }
 }

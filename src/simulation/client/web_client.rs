@@ -11,11 +11,13 @@ use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, Webso
 use tokio::sync::mpsc::{UnboundedSender, unbounded_channel};
 
 use super::session::Session;
+use crate::shared::domain::{Failure, Reason};
 use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::websocket::wrong_message;
 use crate::shared::http::{ConnectionPermit, Peer};
 use crate::shared::run::closing;
 use crate::simulation::client_identity::ClientIdentity;
+use crate::simulation::ends::lost;
 use crate::simulation::protocol::{self, ClientRequest};
 use crate::simulation::sessions::{ClientAction, Connection, Resume, ToClient, Token};
 use crate::simulation::state::AppState;
@@ -50,8 +52,11 @@ impl WebClient {
         }
     }
 
-    fn finish(last_words: String, code: CloseCode, ctx: &mut Context) {
-        ctx.text(last_words);
+    /// Sends the client why there is nothing more to come, and closes the connection.
+    fn finish(failure: &Failure, code: CloseCode, ctx: &mut Context) {
+        for text in protocol::failure(failure) {
+            ctx.text(text);
+        }
         ctx.close(Some(CloseReason {
             code,
             description: None,
@@ -60,10 +65,10 @@ impl WebClient {
     }
 
     /// Ends the connection and its simulation because of what the client has sent.
-    fn reject(&self, problem: &str, code: CloseCode, ctx: &mut Context) {
+    fn reject(&self, problem: &Failure, code: CloseCode, ctx: &mut Context) {
         log::info!("client {}: {problem}", self.peer);
         self.send(ClientAction::Leave);
-        Self::finish(protocol::error(problem), code, ctx);
+        Self::finish(problem, code, ctx);
     }
 
     /// Sends an action to the client's session, if there is one.
@@ -74,14 +79,14 @@ impl WebClient {
         }
     }
 
-    /// Attaches this connection to a session. `last` is sent if the session drops the connection without a last text.
-    fn attach(&mut self, last: ToClient, ctx: &mut Context) -> Connection {
+    /// Attaches this connection to a session. The client gets `end` if the session drops the connection without one.
+    fn attach(&mut self, end: Failure, ctx: &mut Context) -> Connection {
         let (session, actions) = unbounded_channel();
         let attached = session.clone();
-        // The session's earlier texts come first; after a last text from the session, this actor has stopped.
+        // The session's earlier texts come first; after an end from the session, this actor has stopped.
         let gone = async move { attached.closed().await };
         gone.into_actor(self)
-            .map(move |(), _, ctx| ctx.address().do_send(last))
+            .map(move |(), _, ctx| ctx.address().do_send(ToClient::End(end)))
             .spawn(ctx);
         self.session = Some(session);
         Connection {
@@ -94,11 +99,11 @@ impl WebClient {
     /// Asks the session of a token to continue with this connection.
     fn resume(&mut self, token: &str, ctx: &mut Context) {
         // Also sent if the session ends before it reads the request.
-        let ended = ToClient::End(protocol::ended(None), CloseCode::Normal);
+        let ended = protocol::ended(None);
         let found = Token::parse(token).and_then(|token| Some((token, self.server.sessions.find(token)?)));
         let Some((token, session)) = found else {
             log::info!("client {}: comes back to a simulation that has ended", self.peer);
-            return Handler::handle(self, ended, ctx);
+            return Self::finish(&ended, protocol::close_code(ended.reason), ctx);
         };
         session.do_send(Resume {
             token,
@@ -109,7 +114,7 @@ impl WebClient {
     fn handle_request(&mut self, text: &str, ctx: &mut Context) {
         let request = match ClientRequest::parse(text) {
             Ok(request) => request,
-            Err(wrong) => return self.reject(&wrong.to_string(), CloseCode::Normal, ctx),
+            Err(wrong) => return self.reject(&wrong.into(), CloseCode::Normal, ctx),
         };
         match (request, &self.session) {
             (
@@ -127,7 +132,11 @@ impl WebClient {
                     ..
                 },
                 _,
-            ) => ctx.text(protocol::nothing_to_reset()),
+            ) => {
+                for text in protocol::failure(&protocol::nothing_to_reset()) {
+                    ctx.text(text);
+                }
+            }
             (
                 ClientRequest {
                     resume: Some(token), ..
@@ -137,9 +146,9 @@ impl WebClient {
             (ClientRequest { keep: true, .. }, Some(_)) => self.send(ClientAction::Keep),
             (ClientRequest { start: Some(start), .. }, None) => {
                 let identity = ClientIdentity::new(self.user.as_deref(), start.name.as_deref());
-                // Sent only if the session panics: otherwise it sends a last text itself.
-                let lost = ToClient::End(protocol::error("The server has lost this simulation"), CloseCode::Error);
-                Session::open(Arc::clone(&self.server), identity, self.attach(lost, ctx), &start);
+                // Sent only if the session panics: otherwise it sends an end itself.
+                let connection = self.attach(lost(), ctx);
+                Session::open(Arc::clone(&self.server), identity, connection, &start);
             }
             _ => log::info!(
                 "client {}: a message that asks for nothing, or for a second simulation on one connection; ignored",
@@ -162,7 +171,7 @@ impl Actor for WebClient {
             .map(|(), this, ctx| {
                 // A client with a session is notified by its session.
                 if this.session.is_none() {
-                    Self::finish(protocol::stopping(), CloseCode::Away, ctx);
+                    Self::finish(&protocol::stopping(), CloseCode::Away, ctx);
                 }
             })
             .spawn(ctx);
@@ -188,11 +197,13 @@ impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
                 ctx.stop();
             }
             Ok(Message::Text(_) | Message::Ping(_)) => {
-                self.reject("Too many requests on one connection", CloseCode::Policy, ctx);
+                let message = "Too many requests on one connection";
+                let problem = Failure::new(Reason::TooManyRequests, message);
+                self.reject(&problem, CloseCode::Policy, ctx);
             }
             other => {
                 let (problem, code) = wrong_message(other);
-                self.reject(&problem, code, ctx);
+                self.reject(&Failure::new(Reason::InvalidRequest, problem), code, ctx);
             }
         }
     }
@@ -204,7 +215,7 @@ impl Handler<ToClient> for WebClient {
     fn handle(&mut self, message: ToClient, ctx: &mut Self::Context) {
         match message {
             ToClient::Text(text) => ctx.text(text),
-            ToClient::End(last_words, code) => Self::finish(last_words, code, ctx),
+            ToClient::End(failure) => Self::finish(&failure, protocol::close_code(failure.reason), ctx),
         }
     }
 }

@@ -23,7 +23,8 @@ pub(super) fn append(path: &Path, level: &str, ended: &Ended) -> io::Result<()> 
 
 fn line(level: &str, ended: &Ended) -> String {
     let time = |seconds| timestamp(SystemTime::UNIX_EPOCH + Duration::from_secs(seconds));
-    let (simulation, taken) = (&ended.simulation, ended.how.taken);
+    let simulation = &ended.simulation;
+    let taken = ended.end.taken;
     let fields = [
         simulation.id.to_string(),
         time(simulation.since),
@@ -38,7 +39,7 @@ fn line(level: &str, ended: &Ended) -> String {
             .time
             .map(|time| format!("{:.1}", time.as_secs_f64()))
             .unwrap_or_default(),
-        ended.how.reason.label().to_owned(),
+        ended.end.failure.reason.code().to_owned(),
         quoted(simulation.identity.user.as_deref().unwrap_or_default()),
         quoted(simulation.identity.label.as_deref().unwrap_or_default()),
     ];

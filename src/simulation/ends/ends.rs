@@ -10,8 +10,9 @@ use parking_lot::Mutex;
 use prometheus::IntCounterVec;
 use tokio::sync::oneshot;
 
-use super::ended::{EndReason, Ended};
+use super::ended::Ended;
 use super::{csv, kept_output};
+use crate::shared::domain::Reason;
 use crate::shared::http::Metrics;
 
 /// Records how simulations end. Clones share the records.
@@ -45,8 +46,8 @@ impl Ends {
         let counter = metrics
             .counter("webots_simulation_ends_total", "Simulations that have ended", "reason")
             .map_err(std::io::Error::other)?;
-        for (_, label) in EndReason::ALL {
-            counter.with_label_values(&[label]);
+        for reason in Reason::FAILED_STARTS.iter().chain(Reason::ENDS) {
+            counter.with_label_values(&[reason.code()]);
         }
         let (writer, jobs) = channel();
         std::thread::Builder::new()
@@ -61,7 +62,7 @@ impl Ends {
 
     /// Records an end.
     pub fn record(&self, ended: Ended) {
-        self.counter.with_label_values(&[ended.how.reason.label()]).inc();
+        self.counter.with_label_values(&[ended.end.failure.reason.code()]).inc();
         let ended = Arc::new(ended);
         let mut latest = self.latest.lock();
         if latest.len() == LISTED {

@@ -96,35 +96,29 @@ pub fn last_lines(file: &Path, most: u64) -> io::Result<String> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::ended::{End, EndReason, Taken};
     use super::*;
-    use crate::shared::domain::ProjectUrl;
+    use crate::shared::domain::{Failure, ProjectUrl, Reason};
     use crate::shared::http::Peer;
     use crate::simulation::client_identity::ClientIdentity;
     use crate::simulation::snapshot::Simulation;
 
-    fn ended(logs: &Path, reason: EndReason) -> Ended {
+    fn ended(logs: &Path, reason: Reason) -> Ended {
         let world = ProjectUrl::parse("https://github.com/lab/arm/blob/main/worlds/arm.wbt").unwrap();
         let mut simulation = Simulation::new(SimulationId::next(), &world, ClientIdentity::default());
         simulation.log = Some(logs.join(FOLDER_OF_RUNNING).join(format!("{}.log", simulation.id)));
-        let how = End {
-            reason,
-            why: String::new(),
-            taken: Taken::default(),
-        };
         Ended {
             simulation,
             client: Peer::Proxy(std::net::Ipv4Addr::LOCALHOST.into()),
             at: 0,
             events: vec!["12:00:00 it began".to_owned()],
-            how,
+            end: Failure::new(reason, "").into(),
         }
     }
 
     #[test]
     fn an_output_is_kept_with_the_events() {
         let folder = tempfile::tempdir().unwrap();
-        let one = ended(folder.path(), EndReason::Crashed);
+        let one = ended(folder.path(), Reason::Crashed);
         let log = one.simulation.log.clone().unwrap();
         fs::create_dir_all(log.parent().unwrap()).unwrap();
         fs::write(log.with_extension("log.1"), "before the rotation\n").unwrap();
@@ -141,7 +135,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let kept = folder.path().join(ENDED);
         for _ in 0..110 {
-            keep(folder.path(), &ended(folder.path(), EndReason::Hung)).unwrap();
+            keep(folder.path(), &ended(folder.path(), Reason::Hung)).unwrap();
         }
         prune(folder.path());
         assert_eq!(files(&kept).len(), 100);

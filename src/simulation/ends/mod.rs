@@ -4,7 +4,9 @@ mod csv;
 mod ended;
 mod ends;
 mod kept_output;
+mod stop_reason;
 
-pub use ended::{End, EndReason, Ended, Taken};
+pub use ended::{End, Ended, Taken};
 pub use ends::Ends;
 pub use kept_output::{FOLDER_OF_RUNNING, last_lines, output_file};
+pub use stop_reason::{StopReason, lost};

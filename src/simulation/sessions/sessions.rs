@@ -4,10 +4,10 @@ use std::collections::HashMap;
 use std::fmt;
 
 use actix::prelude::*;
-use actix_web_actors::ws::CloseCode;
 use parking_lot::Mutex;
 use tokio::sync::mpsc::UnboundedReceiver;
 
+use crate::shared::domain::Failure;
 use crate::shared::http::Peer;
 
 /// A connection of a client, for the session that it is attached to.
@@ -17,7 +17,7 @@ pub struct Connection {
     /// Receives what is for the client.
     pub client: Recipient<ToClient>,
     /// The client's actions. They end with the connection: the client may come back. A session drops the receiver when
-    /// it ends, or after it has sent the client the last text.
+    /// it ends, or after it has sent the client its end.
     pub actions: UnboundedReceiver<ClientAction>,
 }
 
@@ -27,8 +27,8 @@ pub struct Connection {
 pub enum ToClient {
     /// A text of the protocol.
     Text(String),
-    /// The last text of the protocol, and the code with which the connection then closes.
-    End(String, CloseCode),
+    /// Why there is nothing more to come. The connection then closes.
+    End(Failure),
 }
 
 /// An action of a client.

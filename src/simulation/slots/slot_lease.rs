@@ -4,12 +4,12 @@ use std::sync::Arc;
 
 use actix::Recipient;
 
-use super::present::{Access, Holder, Present, SlotEvent};
+use super::simulation_record::{Access, Holder, SimulationRecord, SlotEvent};
 use super::slot_pool::SlotPool;
-use crate::shared::domain::ProjectUrl;
+use crate::shared::domain::{Failure, ProjectUrl};
 use crate::shared::http::Peer;
 use crate::simulation::client_identity::ClientIdentity;
-use crate::simulation::ends::{End, EndReason, Taken};
+use crate::simulation::ends::End;
 use crate::simulation::sessions::Token;
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::snapshot::Simulation;
@@ -33,15 +33,19 @@ impl SlotLease {
     /// its user.
     ///
     /// # Errors
-    /// Why it may not wait, as text for the client.
+    /// Why it may not wait.
     pub fn acquire(
         slots: &Arc<SlotPool>,
         id: SimulationId,
         listener: Recipient<SlotEvent>,
         world: &ProjectUrl,
         (client, identity): (Peer, ClientIdentity),
-    ) -> Result<Self, String> {
-        slots.acquire(Present::new(Simulation::new(id, world, identity), client, listener))?;
+    ) -> Result<Self, Failure> {
+        slots.acquire(SimulationRecord::new(
+            Simulation::new(id, world, identity),
+            client,
+            listener,
+        ))?;
         Ok(Self {
             id,
             slots: Arc::clone(slots),
@@ -58,29 +62,25 @@ impl SlotLease {
         self.slots.update(self.id, change);
     }
 
-    /// Logs an event of the simulation under its id, and records `shown`, the text that clients may read.
-    pub fn log(&self, level: log::Level, event: &str, shown: &str) {
+    /// Logs an event of the simulation under its id, and records `note`, the text that clients may read.
+    pub fn log(&self, level: log::Level, event: &str, note: &str) {
         log::log!(target: "simulation", level, "{}: {event}", self.id);
-        self.slots.change(self.id, |present| present.note(shown));
+        self.slots.change(self.id, |record| record.note(note));
     }
 
     /// Notes why the server is about to end the simulation: those at its streams are told when Webots closes these.
     pub fn ending(&self, why: &str) {
-        self.slots.change(self.id, |present| {
-            present.ending.get_or_init(|| why.to_owned());
+        self.slots.change(self.id, |record| {
+            record.ending.get_or_init(|| why.to_owned());
         });
     }
 
     /// Reports how the simulation ends, before the lease is dropped. Only the first report counts. Its tokens become
     /// invalid, because another simulation may soon have its port.
-    pub fn end(&self, reason: EndReason, why: &str, taken: Taken) {
-        self.slots.change(self.id, |present| {
-            present.accesses.clear();
-            present.how.get_or_insert(End {
-                reason,
-                why: why.to_owned(),
-                taken,
-            });
+    pub fn end(&self, end: impl Into<End>) {
+        self.slots.change(self.id, |record| {
+            record.accesses.clear();
+            record.end.get_or_insert_with(|| end.into());
         });
     }
 
@@ -88,7 +88,7 @@ impl SlotLease {
     pub fn open_stream(&self) -> Token {
         let access = Access::new(Holder::Client);
         let token = access.token;
-        self.slots.change(self.id, |present| present.accesses.push(access));
+        self.slots.change(self.id, |record| record.accesses.push(access));
         token
     }
 }

@@ -13,13 +13,13 @@ use std::time::Duration;
 
 use parking_lot::Mutex;
 
-use super::present::{Party, Present, SlotEvent};
-use crate::shared::domain::Instances;
+use super::simulation_record::{Party, SimulationRecord, SlotEvent};
+use crate::shared::domain::{Failure, Instances, Reason};
 use crate::simulation::ends::Ends;
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::snapshot::{Simulation, Snapshot, Stage};
 
-/// The slots of this server, and the simulations that have one or wait for one.
+/// The slots of this server, and the simulations that have one or wait for record.
 pub struct SlotPool(pub(super) Mutex<Slots>);
 
 pub(super) struct Slots {
@@ -30,7 +30,7 @@ pub(super) struct Slots {
     /// Number of leases that were requested, including those of clients that were refused.
     arrivals: u64,
     /// All simulations in the order in which they were requested. Those without a port are the queue.
-    pub(super) present: BTreeMap<SimulationId, Present>,
+    pub(super) records: BTreeMap<SimulationId, SimulationRecord>,
     ends: Ends,
 }
 
@@ -47,14 +47,13 @@ impl SlotPool {
         per_user: Option<usize>,
         ends: Ends,
     ) -> Arc<Self> {
-        let present = BTreeMap::new();
         Arc::new(Self(Mutex::new(Slots {
             ports,
             queue_capacity,
             per_address,
             per_user,
             arrivals: 0,
-            present,
+            records: BTreeMap::new(),
             ends,
         })))
     }
@@ -70,26 +69,31 @@ impl SlotPool {
     /// Adds a simulation to the queue, and grants it a slot if it is its turn.
     ///
     /// # Errors
-    /// Why it may not wait, as text for the client: the slots and the queue are full, or its address or its user has
-    /// reached its limit.
-    pub(super) fn acquire(&self, mut present: Present) -> Result<(), String> {
+    /// Why it may not wait: the slots and the queue are full, or its address or its user has reached its limit.
+    pub(super) fn acquire(&self, mut record: SimulationRecord) -> Result<(), Failure> {
         let mut slots = self.0.lock();
         slots.arrivals += 1;
-        let address = present
+        let address = record
             .client
             .rate_limit_key()
             .map(Party::Address)
             .zip(slots.per_address);
-        let user = present.shown.identity.user.clone().map(Party::User).zip(slots.per_user);
-        present.parties = address.into_iter().chain(user).collect();
-        let id = present.shown.id;
-        let refusal = slots.refusal(&present);
-        slots.present.insert(id, present);
+        let user = record
+            .simulation
+            .identity
+            .user
+            .clone()
+            .map(Party::User)
+            .zip(slots.per_user);
+        record.parties = address.into_iter().chain(user).collect();
+        let id = record.simulation.id;
+        let refusal = slots.refusal(&record);
+        slots.records.insert(id, record);
         slots.grant();
         if let Some(refusal) = refusal
-            && slots.queue().any(|one| one.shown.id == id)
+            && slots.queue().any(|record| record.simulation.id == id)
         {
-            slots.present.remove(&id);
+            slots.records.remove(&id);
             return Err(refusal);
         }
         slots.serve();
@@ -99,30 +103,33 @@ impl SlotPool {
     /// Frees the slot of a simulation, or its position in the queue.
     pub(super) fn release(&self, id: SimulationId) {
         let mut slots = self.0.lock();
-        if let Some(present) = slots.present.remove(&id) {
-            slots.ends.record(present.ended());
+        if let Some(record) = slots.records.remove(&id) {
+            slots.ends.record(record.ended());
         }
         slots.serve();
     }
 
     /// Changes the record of a simulation, if it has not ended.
-    pub(super) fn change(&self, id: SimulationId, change: impl FnOnce(&mut Present)) {
-        if let Some(present) = self.0.lock().present.get_mut(&id) {
-            change(present);
+    pub(super) fn change(&self, id: SimulationId, change: impl FnOnce(&mut SimulationRecord)) {
+        if let Some(record) = self.0.lock().records.get_mut(&id) {
+            change(record);
         }
     }
 
     /// Changes what pages show of a simulation, if it has not ended.
     pub fn update(&self, id: SimulationId, change: impl FnOnce(&mut Simulation)) {
-        self.change(id, |present| change(&mut present.shown));
+        self.change(id, |record| change(&mut record.simulation));
     }
 
-    /// Stops the simulation with this id; `why` is the text for its client. Returns whether there is one.
+    /// Stops the simulation with this id; `why` is the text for its client. Returns whether there is record.
     pub fn stop(&self, id: &str, why: String) -> bool {
         let slots = self.0.lock();
-        let found = slots.present.values().find(|one| one.shown.id.to_string() == id);
+        let found = slots
+            .records
+            .values()
+            .find(|record| record.simulation.id.to_string() == id);
         found
-            .inspect(|one| one.listener.do_send(SlotEvent::Stopped(why)))
+            .inspect(|record| record.listener.do_send(SlotEvent::Stopped(why)))
             .is_some()
     }
 
@@ -134,7 +141,7 @@ impl SlotPool {
     /// All simulations at this moment.
     pub fn snapshot(&self) -> Snapshot {
         let slots = self.0.lock();
-        let simulations = slots.present.values().map(|one| one.shown.clone()).collect();
+        let simulations = slots.records.values().map(|record| record.simulation.clone()).collect();
         Snapshot {
             instances: slots.instances(),
             simulations,
@@ -143,18 +150,18 @@ impl SlotPool {
 }
 
 impl Slots {
-    fn queue(&self) -> impl Iterator<Item = &Present> {
-        self.present.values().filter(|one| one.shown.port.is_none())
+    fn queue(&self) -> impl Iterator<Item = &SimulationRecord> {
+        self.records.values().filter(|record| record.simulation.port.is_none())
     }
 
     /// The simulations in the queue whose client's address and user may have another slot.
-    fn eligible(&self) -> impl Iterator<Item = &Present> {
+    fn eligible(&self) -> impl Iterator<Item = &SimulationRecord> {
         let mut lent: HashMap<&Party, usize> = HashMap::new();
         for (party, _) in self
-            .present
+            .records
             .values()
-            .filter(|one| one.shown.port.is_some())
-            .flat_map(|one| &one.parties)
+            .filter(|record| record.simulation.port.is_some())
+            .flat_map(|record| &record.parties)
         {
             *lent.entry(party).or_default() += 1;
         }
@@ -165,26 +172,31 @@ impl Slots {
     }
 
     fn next_in_queue(&self) -> Option<SimulationId> {
-        self.eligible().next().map(|next| next.shown.id)
+        self.eligible().next().map(|next| next.simulation.id)
     }
 
-    /// Why one more simulation may not wait, as text for its client; `None` if it may.
-    fn refusal(&self, present: &Present) -> Option<String> {
-        for party in &present.parties {
-            let waiting = self.queue().filter(|one| one.parties.contains(party)).count();
+    /// Why one more simulation may not wait; `None` if it may.
+    fn refusal(&self, record: &SimulationRecord) -> Option<Failure> {
+        for party in &record.parties {
+            let waiting = self.queue().filter(|record| record.parties.contains(party)).count();
             // Even with a high limit, a party leaves a part of the queue to others.
             if waiting >= party.1.min((self.queue_capacity * 3 / 4).max(1)) {
-                let all = self.present.values().filter(|one| one.parties.contains(party)).count();
+                let all = self
+                    .records
+                    .values()
+                    .filter(|record| record.parties.contains(party))
+                    .count();
                 return Some(party.0.refusal(all - waiting, waiting));
             }
         }
-        let places = self.ports.len();
+        let slots = self.ports.len();
         let waiting = self.queue().count();
         (waiting >= self.queue_capacity).then(|| {
-            format!(
-                "All {places} places of this simulation server are taken, and {waiting} clients are waiting already. Try \
+            let message = format!(
+                "All {slots} places of this simulation server are taken, and {waiting} clients are waiting already. Try \
                  again later"
-            )
+            );
+            Failure::new(Reason::QueueFull, message)
         })
     }
 
@@ -193,9 +205,9 @@ impl Slots {
         self.grant();
         self.make_room();
         for (ahead, waiting) in self
-            .present
+            .records
             .values_mut()
-            .filter(|one| one.shown.port.is_none())
+            .filter(|record| record.simulation.port.is_none())
             .enumerate()
         {
             if waiting.sent_position.replace(ahead) != Some(ahead) {
@@ -207,7 +219,7 @@ impl Slots {
     fn grant(&mut self) {
         while let Some(next) = self.next_in_queue()
             && let Some(port) = self.free_port()
-            && let Some(first) = self.present.get_mut(&next)
+            && let Some(first) = self.records.get_mut(&next)
         {
             first.lend(port);
         }
@@ -221,7 +233,10 @@ impl Slots {
         if waiting == 0 || self.free_port().is_some() {
             return;
         }
-        let leaving = self.present.values().filter(|one| one.is_away() && one.makes_room);
+        let leaving = self
+            .records
+            .values()
+            .filter(|record| record.is_away() && record.makes_room);
         for _ in leaving.count()..waiting {
             let Some(longest_away) = self.longest_away() else {
                 return;
@@ -232,32 +247,42 @@ impl Slots {
     }
 
     /// The simulation that waits for its client the longest, of addresses for which more than their share waits.
-    fn longest_away(&mut self) -> Option<&mut Present> {
+    fn longest_away(&mut self) -> Option<&mut SimulationRecord> {
         let share = (self.ports.len() / 4).max(1);
         let mut away: HashMap<IpAddr, usize> = HashMap::new();
-        let address = |one: &Present| one.client.rate_limit_key().filter(|_| one.is_away() && !one.makes_room);
-        for address in self.present.values().filter_map(address) {
+        let address = |record: &SimulationRecord| {
+            record
+                .client
+                .rate_limit_key()
+                .filter(|_| record.is_away() && !record.makes_room)
+        };
+        for address in self.records.values().filter_map(address) {
             *away.entry(address).or_default() += 1;
         }
-        let has_too_many = |one: &&mut Present| address(one).is_some_and(|address| away.get(&address) > Some(&share));
-        self.present
+        let has_too_many =
+            |record: &&mut SimulationRecord| address(record).is_some_and(|address| away.get(&address) > Some(&share));
+        self.records
             .values_mut()
             .filter(has_too_many)
-            .min_by_key(|one| one.shown.away_until)
+            .min_by_key(|record| record.simulation.away_until)
     }
 
     /// The lowest port that is neither leased nor used by another program.
     fn free_port(&self) -> Option<u16> {
-        let taken: HashSet<u16> = self.present.values().filter_map(|one| one.shown.port).collect();
+        let taken: HashSet<u16> = self
+            .records
+            .values()
+            .filter_map(|record| record.simulation.port)
+            .collect();
         self.ports.clone().find(|port| !taken.contains(port) && is_free(*port))
     }
 
     fn instances(&self) -> Instances {
         let count = |stages: &[Stage]| {
             let matching = self
-                .present
+                .records
                 .values()
-                .filter(|one| stages.contains(&one.shown.stage))
+                .filter(|record| stages.contains(&record.simulation.stage))
                 .count();
             u32::try_from(matching).unwrap_or(u32::MAX)
         };

@@ -4,7 +4,7 @@ use std::sync::{Arc, OnceLock};
 
 use tokio::sync::Semaphore;
 
-use super::present::{Access, Holder, Present, SlotEvent};
+use super::simulation_record::{Access, Holder, SimulationRecord, SlotEvent};
 use super::slot_pool::SlotPool;
 use crate::simulation::sessions::Token;
 use crate::simulation::simulation_id::SimulationId;
@@ -31,7 +31,7 @@ pub struct WatchGuard {
     slots: Arc<SlotPool>,
 }
 
-impl Present {
+impl SimulationRecord {
     /// Notifies the session if one watcher is connected: it is the first one, or the last one that leaves.
     fn notify_of_watchers(&self, is_watched: bool) {
         if self
@@ -49,14 +49,14 @@ impl Present {
 impl SlotPool {
     /// The stream of a token, if the token is valid.
     pub fn stream(&self, token: Token) -> Option<StreamTarget> {
-        self.0.lock().present.values().find_map(|one| {
-            let access = one.accesses.iter().find(|access| access.token == token)?;
+        self.0.lock().records.values().find_map(|record| {
+            let access = record.accesses.iter().find(|access| access.token == token)?;
             Some(StreamTarget {
-                simulation: one.shown.id,
-                port: one.shown.port?,
+                simulation: record.simulation.id,
+                port: record.simulation.port?,
                 read_only: access.holder != Holder::Client,
                 connections: Arc::clone(&access.connections),
-                ending: Arc::clone(&one.ending),
+                ending: Arc::clone(&record.ending),
             })
         })
     }
@@ -64,7 +64,7 @@ impl SlotPool {
     /// Issues a token to watch a simulation; `None` if it has no stream.
     pub fn watch(&self, simulation: SimulationId) -> Option<Token> {
         let mut slots = self.0.lock();
-        let accesses = &mut slots.present.get_mut(&simulation)?.accesses;
+        let accesses = &mut slots.records.get_mut(&simulation)?.accesses;
         if accesses.is_empty() {
             return None;
         }
@@ -77,13 +77,13 @@ impl SlotPool {
     /// Marks a watcher's token as used; `None` if it already was.
     pub fn start_watching(self: &Arc<Self>, simulation: SimulationId, token: Token) -> Option<WatchGuard> {
         let mut slots = self.0.lock();
-        let present = slots.present.get_mut(&simulation)?;
-        let invited = present
+        let record = slots.records.get_mut(&simulation)?;
+        let invited = record
             .accesses
             .iter_mut()
             .find(|access| access.token == token && access.holder == Holder::Invited)?;
         invited.holder = Holder::Watcher;
-        present.notify_of_watchers(true);
+        record.notify_of_watchers(true);
         Some(WatchGuard {
             token,
             simulation,
@@ -94,9 +94,9 @@ impl SlotPool {
 
 impl Drop for WatchGuard {
     fn drop(&mut self) {
-        self.slots.change(self.simulation, |present| {
-            present.notify_of_watchers(false);
-            present.accesses.retain(|access| access.token != self.token);
+        self.slots.change(self.simulation, |record| {
+            record.notify_of_watchers(false);
+            record.accesses.retain(|access| access.token != self.token);
         });
     }
 }

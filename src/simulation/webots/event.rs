@@ -4,6 +4,7 @@ use std::time::Instant;
 
 use actix::prelude::*;
 
+use crate::shared::domain::Failure;
 use crate::simulation::sessions::Token;
 
 /// An event of a running Webots.
@@ -16,8 +17,15 @@ pub enum WebotsEvent {
     Text(String),
     /// Its process was started.
     Started,
-    /// It listens on this port, and this is the token for its stream.
-    Listening(u16, Token),
+    /// It is ready.
+    Ready {
+        /// When its process was started: the time limit counts from then.
+        started: Instant,
+        /// The port on which it listens.
+        port: u16,
+        /// The token for its stream.
+        stream: Token,
+    },
     /// It has sent a heartbeat.
     Heartbeat,
     /// It has sent no heartbeat for this many seconds.
@@ -25,17 +33,5 @@ pub enum WebotsEvent {
     /// It is paused and ends at this time if it stays so; `None`: that end is cancelled.
     IdleEnd(Option<Instant>),
     /// It has ended, and why.
-    Exited(WebotsExit),
-}
-
-/// Why a Webots has exited.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct WebotsExit {
-    /// Whether it exited by itself, without an error.
-    pub clean: bool,
-    /// Whether this server is the cause, so that another one may accept the client: Docker has failed or stopped, or
-    /// Webots has exited before it listened (it listens before it loads its world).
-    pub own: bool,
-    /// The reason, as text for the client.
-    pub why: String,
+    Exited(Failure),
 }

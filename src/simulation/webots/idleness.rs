@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 use actix::prelude::*;
 
 use super::event::WebotsEvent;
-use super::webots::Webots;
-use crate::simulation::ends::EndReason;
+use super::webots::{IdleEnd, Ready, State, Webots};
+use crate::shared::domain::{Failure, Reason};
 
 /// Time between the notice to the client and the end; at most half of `idleTimeout`.
 const NOTICE: Duration = Duration::from_mins(2);
@@ -21,7 +21,11 @@ pub struct Keep;
 impl Webots {
     /// Records that the simulation was used: if it is paused now, its `idleTimeout` begins.
     pub(super) fn used(&mut self, ctx: &mut Context<Self>) {
-        if let Some((timer, is_announced)) = self.idle_end.take() {
+        let State::Ready(Ready { process, idle_end, .. }) = &mut self.state else {
+            return;
+        };
+        let is_running = process.is_running;
+        if let Some(IdleEnd { timer, is_announced }) = idle_end.take() {
             ctx.cancel_future(timer);
             if is_announced {
                 self.send(WebotsEvent::IdleEnd(None));
@@ -29,21 +33,25 @@ impl Webots {
         }
         let minutes = self.spec.config.idle_timeout;
         let limit = Duration::from_secs_f64(60.0 * minutes);
-        if limit.is_zero() || self.runs || !self.listening {
+        if limit.is_zero() || is_running {
             return;
         }
         let notice = NOTICE.min(limit / 2);
         let timer = ctx.run_later(limit.saturating_sub(notice), move |this, ctx| {
             this.send(WebotsEvent::IdleEnd(Some(Instant::now() + notice)));
-            let timer = ctx.run_later(notice, move |this, _| {
-                this.stop(
-                    EndReason::Idle,
-                    &format!("The simulation was paused for {minutes} minutes"),
-                );
+            let timer = ctx.run_later(notice, move |this, ctx| {
+                let message = format!("The simulation was paused for {minutes} minutes");
+                this.stop(Failure::new(Reason::Idle, message), ctx);
             });
-            this.idle_end = Some((timer, true));
+            this.set_idle_end(timer, true);
         });
-        self.idle_end = Some((timer, false));
+        self.set_idle_end(timer, false);
+    }
+
+    fn set_idle_end(&mut self, timer: SpawnHandle, is_announced: bool) {
+        if let State::Ready(ready) = &mut self.state {
+            ready.idle_end = Some(IdleEnd { timer, is_announced });
+        }
     }
 }
 

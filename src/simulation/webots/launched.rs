@@ -1,26 +1,48 @@
 //! Starts the process of a Webots, on the machine or in containers, and waits until its whole process tree has ended.
 
+use std::path::PathBuf;
 use std::time::Duration;
 
 use actix::prelude::*;
 
 use super::launch_spec::LaunchSpec;
 use super::output::{self, OutputEvent, Tail};
-use crate::shared::run::{RotatedFile, seconds_since_1970};
+use crate::shared::domain::{Failure, Reason};
+use crate::shared::run::RotatedFile;
 use crate::simulation::container::{Cause, SimulationContainers};
-use crate::simulation::ends::{EndReason, FOLDER_OF_RUNNING, Taken};
+use crate::simulation::ends::{FOLDER_OF_RUNNING, Taken};
 use crate::simulation::process::{ExitReason, ProcessGroup};
-use crate::simulation::snapshot::Stage;
 
-/// How a Webots has ended.
+/// How the processes of a Webots have ended.
 #[derive(Debug)]
-pub struct End {
+pub struct Exit {
     /// The exit of its process.
-    pub reason: ExitReason,
+    pub status: ExitReason,
     /// The cause, if control groups or Docker report one.
     pub cause: Option<Cause>,
     /// The resources that it has used.
     pub taken: Taken,
+}
+
+/// A Webots that was launched.
+pub struct Launched {
+    /// Its processes.
+    pub group: ProcessGroup,
+    /// The last lines of its output.
+    pub tail: Tail,
+    /// The file that its output is kept in, if it can be written.
+    pub log: Option<PathBuf>,
+}
+
+/// How far a Webots has come. Until it listens, nothing of a world is read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Reached {
+    /// It was started.
+    Start,
+    /// It has listened.
+    Listening,
+    /// It was ready.
+    Ready,
 }
 
 /// Size from which the file of its output is rotated, in bytes.
@@ -28,8 +50,8 @@ const MAX_LOG: u64 = 500_000;
 /// Timeout of reading the rest of an output.
 const LAST_OUTPUT: Duration = Duration::from_secs(1);
 
-/// Starts a Webots in these containers, or else on the machine. Returns its processes and the last lines of its output. The
-/// future resolves when its whole process tree has ended.
+/// Starts a Webots in these containers, or else on the machine. The future resolves when its whole process tree has
+/// ended.
 ///
 /// # Errors
 /// When a process, a thread or a directory can't be created.
@@ -37,7 +59,7 @@ pub fn launch(
     spec: &LaunchSpec,
     containers: Option<SimulationContainers>,
     events: Recipient<OutputEvent>,
-) -> std::io::Result<(ProcessGroup, Tail, impl Future<Output = End> + use<>)> {
+) -> std::io::Result<(Launched, impl Future<Output = Exit> + use<>)> {
     let folder = spec.config.log_dir.0.join("simulation").join(FOLDER_OF_RUNNING);
     let log = folder.join(format!("{}.log", spec.slot.lease.id()));
     let file = RotatedFile::open(&log, MAX_LOG, "").inspect_err(|error| {
@@ -56,16 +78,11 @@ pub fn launch(
         None => spec.spawn_spec()?,
     };
     let (group, ended) = ProcessGroup::start(&process, output.into(), errors.into())?;
-    let pid = group.leader();
-    spec.slot.lease.update(move |one| {
-        (one.stage, one.launched) = (Stage::Launching, Some(seconds_since_1970()));
-        (one.pid, one.log) = (Some(pid), log);
-    });
     let ended = async move {
-        let reason = ended.await;
+        let status = ended.await;
         let mut in_container = None;
         if let Some(containers) = containers {
-            in_container = containers.cause(reason).await;
+            in_container = containers.cause(status).await;
             containers.remove().await;
         }
         // This also kills processes that have left the process group.
@@ -77,39 +94,46 @@ pub fn launch(
         };
         // The last output shows the cause. A process that can't be killed may keep the pipe open.
         actix_rt::time::timeout(LAST_OUTPUT, all_read).await.ok();
-        End {
-            reason,
+        Exit {
+            status,
             cause: in_container.or(on_machine.then_some(Cause::OutOfMemory)),
             taken,
         }
     };
-    Ok((group, tail, ended))
+    Ok((Launched { group, tail, log }, ended))
 }
 
-impl End {
-    /// The kind and the reason (as text) of an end that was not requested; `was_ready`: whether Webots had listened.
-    pub fn verdict(&self, was_ready: bool) -> (EndReason, String) {
-        let kind = match (self.cause, self.reason) {
-            (Some(cause), _) if cause.is_own() => EndReason::Fault,
-            (Some(_), _) => EndReason::Limit,
-            (None, ExitReason::Code(0)) => EndReason::Finished,
-            (None, _) if was_ready => EndReason::Crashed,
-            (None, _) => EndReason::NoWebots,
+impl Exit {
+    /// Why a Webots that nobody has asked to end has ended, given how far it came.
+    pub fn failure(&self, reached: Reached) -> Failure {
+        if let Some(cause) = self.cause {
+            return failure_of(cause);
+        }
+        let reason = match (self.status, reached) {
+            (ExitReason::Code(0), _) => Reason::Finished,
+            (_, Reached::Start) => Reason::LaunchFailed,
+            (_, Reached::Listening) => Reason::LoadFailed,
+            (_, Reached::Ready) => Reason::Crashed,
         };
-        let why = match self.cause {
-            Some(cause) => words(cause).to_owned(),
-            None => format!("Webots {}", self.reason),
-        };
-        (kind, why)
+        Failure::new(reason, format!("Webots {}", self.status))
     }
 }
 
-/// The cause of a container's end, as text for the client.
-fn words(cause: Cause) -> &'static str {
+/// The cause that control groups or Docker report.
+fn failure_of(cause: Cause) -> Failure {
     match cause {
-        Cause::OutOfMemory => "The simulation has taken more memory than it may (limits.memory)",
-        Cause::NotStarted => "Docker can't start the simulation's container on this simulation server",
-        Cause::Docker => "Docker has stopped on this simulation server, and all simulations in it have ended",
+        Cause::OutOfMemory => Failure::new(
+            Reason::MemoryLimit,
+            "The simulation has taken more memory than it may (limits.memory)",
+        ),
+        Cause::NotStarted => Failure::new(
+            Reason::LaunchFailed,
+            "Docker can't start the simulation's container on this simulation server",
+        ),
+        Cause::Docker => Failure::new(
+            Reason::DockerUnavailable,
+            "Docker has stopped on this simulation server, and all simulations in it have ended",
+        ),
     }
 }
 
@@ -118,47 +142,60 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_end_has_its_kind() {
-        let end = |reason, cause| End {
-            reason,
-            cause,
-            taken: Taken::default(),
-        };
-        let (ok, killed) = (ExitReason::Code(0), ExitReason::Signal(9));
-        for (end, was_ready, kind, words) in [
-            (end(ok, None), true, EndReason::Finished, "Webots has ended"),
+    fn each_end_has_its_reason() {
+        let ok = ExitReason::Code(0);
+        let killed = ExitReason::Signal(9);
+        for (status, cause, reached, reason, words) in [
+            (ok, None, Reached::Ready, Reason::Finished, "Webots has ended"),
             (
-                end(killed, None),
-                true,
-                EndReason::Crashed,
+                killed,
+                None,
+                Reached::Ready,
+                Reason::Crashed,
                 "Webots was ended by the signal SIGKILL",
             ),
             (
-                end(ExitReason::Code(3), None),
-                false,
-                EndReason::NoWebots,
+                ExitReason::Code(3),
+                None,
+                Reached::Listening,
+                Reason::LoadFailed,
                 "Webots ended with exit code 3",
             ),
             (
-                end(ExitReason::NotStarted, None),
-                false,
-                EndReason::NoWebots,
+                ExitReason::Code(3),
+                None,
+                Reached::Start,
+                Reason::LaunchFailed,
+                "Webots ended with exit code 3",
+            ),
+            (
+                ExitReason::NotStarted,
+                None,
+                Reached::Start,
+                Reason::LaunchFailed,
                 "Webots could not be started",
             ),
             (
-                end(killed, Some(Cause::OutOfMemory)),
-                true,
-                EndReason::Limit,
-                super::words(Cause::OutOfMemory),
+                killed,
+                Some(Cause::OutOfMemory),
+                Reached::Start,
+                Reason::MemoryLimit,
+                "The simulation has taken more memory than it may (limits.memory)",
             ),
             (
-                end(ok, Some(Cause::Docker)),
-                true,
-                EndReason::Fault,
-                super::words(Cause::Docker),
+                ok,
+                Some(Cause::Docker),
+                Reached::Ready,
+                Reason::DockerUnavailable,
+                "Docker has stopped on this simulation server, and all simulations in it have ended",
             ),
         ] {
-            assert_eq!(end.verdict(was_ready), (kind, words.to_owned()), "{end:?}");
+            let exit = Exit {
+                status,
+                cause,
+                taken: Taken::default(),
+            };
+            assert_eq!(exit.failure(reached), Failure::new(reason, words), "{exit:?}");
         }
     }
 }

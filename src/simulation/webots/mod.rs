@@ -9,7 +9,7 @@ mod release;
 mod startup;
 mod webots;
 
-pub use event::{WebotsEvent, WebotsExit};
+pub use event::WebotsEvent;
 pub use idleness::Keep;
 pub use launch_spec::LaunchSpec;
 pub use release::Release;

@@ -62,18 +62,12 @@ impl OutputEvent {
 }
 
 impl Tail {
-    /// The lines as the end of a sentence, for the client: Webots usually prints there what is wrong. The path of the
-    /// project is removed.
-    pub fn last_words(&self, project: &Path) -> String {
+    /// The lines as one text, for the client: Webots usually prints there what is wrong. The path of the project is
+    /// removed.
+    pub fn text(&self, project: &Path) -> String {
         let lines = self.0.lock();
-        if lines.is_empty() {
-            return ".".to_owned();
-        }
         let lines: Vec<&str> = lines.iter().rev().map(String::as_str).collect();
-        format!(
-            ". Its last output: {}",
-            lines.join(" | ").replace(&format!("{}/", project.display()), "")
-        )
+        lines.join(" | ").replace(&format!("{}/", project.display()), "")
     }
 
     fn push(&self, line: String) {

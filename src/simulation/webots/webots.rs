@@ -1,201 +1,272 @@
 //! Actor: one running Webots. Owns its process group, its instance directory and its slot; ends with all three.
 //!
-//! Created by a session once its project is checked out. Starts Webots, waits until its world is ready, monitors its heartbeat
-//! and the time limit, sends [`WebotsEvent`]s, and ends when Webots' whole process tree has ended. Never restarted.
+//! Created by a session once its project is checked out. Starts Webots, waits until its world is ready, monitors its
+//! heartbeat and the time limit, sends [`WebotsEvent`]s, and ends when Webots' whole process tree has ended. Never restarted.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use actix::fut::wrap_future;
 use actix::prelude::*;
 use log::Level;
 use tokio::sync::Notify;
 
-use super::event::{WebotsEvent, WebotsExit};
+use super::event::WebotsEvent;
 use super::launch_spec::LaunchSpec;
-use super::launched::{self, End};
+use super::launched::{self, Exit, Launched, Reached};
 use super::output::{OutputEvent, Tail};
 use super::startup::StartupEvent;
+use crate::shared::domain::{Blame, Failure, Reason};
+use crate::shared::run::seconds_since_1970;
 use crate::simulation::container::{SimulationContainers, StartError};
-use crate::simulation::ends::{EndReason, Taken};
+use crate::simulation::ends::{End, StopReason, lost};
 use crate::simulation::process::ProcessGroup;
 use crate::simulation::snapshot::Stage;
 
-/// Requests Webots' end, because its client has left or for another reason.
+/// Requests Webots' end.
 #[derive(Message)]
 #[rtype(result = "()")]
-pub struct Stop(pub EndReason);
+pub struct Stop(pub StopReason);
 
 /// The actor.
 pub struct Webots {
     pub(super) spec: LaunchSpec,
-    /// The preparation of its containers, while it runs.
-    preparing: Option<SpawnHandle>,
-    group: Option<ProcessGroup>,
+    pub(super) state: State,
+}
+
+/// The life cycle of a Webots. Each state holds what exists only in it.
+pub(super) enum State {
+    /// Its containers are prepared, if it has any. Cancelling this job discards what was created.
+    Preparing(SpawnHandle),
+    /// Its process runs, and is not ready.
+    Launching(Launching),
+    /// Its world is ready.
+    Ready(Ready),
+    /// It was stopped, and its process tree ends.
+    Stopping(Stopping),
+    /// It has ended, and the actor stops. The session is notified when the actor is dropped.
+    Ended(Failure),
+}
+
+pub(super) struct Launching {
+    process: Process,
+    /// Follows its start, once that has begun.
+    startup: Option<SpawnHandle>,
+    /// Whether it is known to have listened.
+    has_listened: bool,
+}
+
+pub(super) struct Ready {
+    pub(super) process: Process,
+    last_heartbeat: Instant,
+    /// Whether it has missed heartbeats.
+    is_hanging: bool,
+    /// The wait until it ends because it is paused.
+    pub(super) idle_end: Option<IdleEnd>,
+}
+
+/// The wait until a simulation ends because it is paused.
+pub(super) struct IdleEnd {
+    /// The timer that continues the wait.
+    pub(super) timer: SpawnHandle,
+    /// Whether its client was notified of that end.
+    pub(super) is_announced: bool,
+}
+
+pub(super) struct Stopping {
+    tail: Tail,
+    /// Whether it was ready before.
+    was_ready: bool,
+    /// Why it was stopped.
+    failure: Failure,
+}
+
+/// A process that runs.
+pub(super) struct Process {
+    group: ProcessGroup,
+    tail: Tail,
+    started: Instant,
     /// Restarts the controller of a competition's participant.
     restart: Option<Arc<Notify>>,
-    /// Follows its start.
-    startup: Option<SpawnHandle>,
-    tail: Tail,
-    /// Whether its world is ready.
-    pub(super) listening: bool,
-    /// Whether the simulation is not paused.
-    pub(super) runs: bool,
-    /// The wait until one that is paused ends, and whether its client was notified of that end.
-    pub(super) idle_end: Option<(SpawnHandle, bool)>,
-    last_heartbeat: Instant,
-    hanging: bool,
-    /// Why it was stopped, if it was.
-    stopped_for: Option<(EndReason, String)>,
-    /// How it has ended, if it has: its session is notified when this actor is dropped.
-    exit: Option<WebotsExit>,
+    /// Whether the simulation is not paused, as its output shows.
+    pub(super) is_running: bool,
 }
 
 /// Number of missed heartbeats after which Webots counts as hanging.
 const MISSED_HEARTBEATS: u32 = 6;
 
-impl Webots {
-    /// Creates the actor; Webots starts with it.
-    pub fn new(spec: LaunchSpec) -> Self {
-        Self {
-            spec,
-            preparing: None,
-            group: None,
-            restart: None,
-            startup: None,
-            tail: Tail::default(),
-            listening: false,
-            runs: false,
-            idle_end: None,
-            last_heartbeat: Instant::now(),
-            hanging: false,
-            stopped_for: None,
-            exit: None,
+impl State {
+    /// The state as pages and programs see it.
+    fn stage(&self) -> Stage {
+        match self {
+            Self::Preparing(_) => Stage::CheckingOut,
+            Self::Launching(_) => Stage::Launching,
+            Self::Ready(ready) if ready.process.is_running => Stage::Running,
+            Self::Ready(_) => Stage::Idle,
+            Self::Stopping(_) | Self::Ended(_) => Stage::Stopping,
         }
     }
 
-    /// Prepares its containers, if it has any, then starts it. Dropping the preparation discards what was created.
-    fn prepare(&mut self, ctx: &mut Context<Self>) {
-        let Some(containers) = self.spec.containers.clone() else {
-            return self.launch(None, ctx);
-        };
-        let (client, request) = (self.spec.events.clone(), self.spec.request());
-        // A full mailbox drops this line.
-        let progress = move |text| drop(client.try_send(WebotsEvent::Progress(text)));
+    /// The process, unless it is ending.
+    fn process(&mut self) -> Option<&mut Process> {
+        match self {
+            Self::Launching(Launching { process, .. }) | Self::Ready(Ready { process, .. }) => Some(process),
+            Self::Preparing(_) | Self::Stopping(_) | Self::Ended(_) => None,
+        }
+    }
+}
+
+impl Webots {
+    /// Creates the actor, and prepares the containers of this Webots, if it has any; then it is launched.
+    pub fn create(spec: LaunchSpec, ctx: &mut Context<Self>) -> Self {
+        let containers = spec.containers.clone();
+        let session = spec.events.clone();
+        let request = spec.request();
         let prepared = async move {
+            let Some(containers) = containers else { return Ok(None) };
+            // A full mailbox drops this line.
+            let progress = move |text| drop(session.try_send(WebotsEvent::Progress(text)));
             let mut prepared = containers.prepare(request, &progress).await?;
-            prepared.start_others().await.map(|()| prepared)
+            prepared.start_others().await.map(|()| Some(prepared))
         };
-        self.preparing = Some(
-            ctx.spawn(prepared.into_actor(self).map(|prepared, this, ctx| match prepared {
-                Ok(containers) => this.launch(Some(containers), ctx),
-                Err(StartError::Project(why)) => this.over(EndReason::NoWebots, &why, Taken::default(), ctx),
-                Err(StartError::Server(why)) => this.over(EndReason::Fault, &why, Taken::default(), ctx),
-            })),
-        );
+        let job = wrap_future::<_, Self>(prepared).map(|prepared, this, ctx| match prepared {
+            Ok(containers) => this.launch(containers, ctx),
+            Err(error) => this.end(not_prepared(error).into(), ctx),
+        });
+        Self {
+            spec,
+            state: State::Preparing(ctx.spawn(job)),
+        }
     }
 
     fn launch(&mut self, containers: Option<SimulationContainers>, ctx: &mut Context<Self>) {
-        self.preparing = None;
-        if let Some(containers) = &containers {
-            self.restart = containers.restart();
-            containers
-                .warnings
-                .iter()
-                .cloned()
-                .for_each(|warning| self.send(WebotsEvent::Progress(warning)));
-            containers
-                .texts
-                .iter()
-                .cloned()
-                .for_each(|text| self.send(WebotsEvent::Text(text)));
+        let restart = containers.as_ref().and_then(SimulationContainers::restart);
+        if let Some(SimulationContainers { warnings, texts, .. }) = &containers {
+            for warning in warnings {
+                self.send(WebotsEvent::Progress(warning.clone()));
+            }
+            for text in texts {
+                self.send(WebotsEvent::Text(text.clone()));
+            }
         }
-        if let Err(error) = self.spawn(containers, ctx) {
-            let why = format!("Webots can't be started: {error}");
-            return self.over(EndReason::Fault, &why, Taken::default(), ctx);
-        }
+        let process = match self.spawn(containers, restart, ctx) {
+            Ok(process) => process,
+            Err(error) => {
+                let message = format!("Webots can't be started: {error}");
+                return self.end(Failure::new(Reason::LaunchFailed, message).into(), ctx);
+            }
+        };
+        self.enter(State::Launching(Launching {
+            process,
+            startup: None,
+            has_listened: false,
+        }));
         self.send(WebotsEvent::Started);
         // In containers, the wait begins when the container reports that it runs.
-        self.spec.containers.is_none().then(|| self.follow_startup(ctx));
-        ctx.run_interval(self.spec.config.timing.heartbeat, Self::check_heartbeat);
-        let limit = self.spec.config.timing.launch;
-        ctx.run_later(limit, move |this, _| {
-            if !this.listening {
-                let why = format!("Webots did not become ready within {} seconds", limit.as_secs());
-                this.stop(EndReason::NoWebots, &why);
-            }
-        });
+        if self.spec.containers.is_none() {
+            self.follow_startup(ctx);
+        }
+        ctx.run_later(self.spec.config.timing.launch, Self::check_launch);
         let limit = self.spec.config.timeout;
-        ctx.run_later(Duration::from_secs(limit), move |this, _| {
-            this.stop(
-                EndReason::TimeLimit,
-                &format!("The time limit of {limit} seconds was reached"),
-            );
+        ctx.run_later(Duration::from_secs(limit), move |this, ctx| {
+            let message = format!("The time limit of {limit} seconds was reached");
+            this.stop(Failure::new(Reason::TimeLimit, message), ctx);
         });
     }
 
-    /// Starts the process, and calls [`Self::ended`] when it has ended.
-    fn spawn(&mut self, containers: Option<SimulationContainers>, ctx: &mut Context<Self>) -> std::io::Result<()> {
+    /// Starts the process, and calls [`Self::exited`] when it has ended.
+    fn spawn(
+        &self,
+        containers: Option<SimulationContainers>,
+        restart: Option<Arc<Notify>>,
+        ctx: &mut Context<Self>,
+    ) -> std::io::Result<Process> {
         // Another program may have taken the port during the checkout, and would be mistaken for Webots.
         if self.spec.is_port_taken() {
             return Err(std::io::ErrorKind::AddrInUse.into());
         }
-        let (group, tail, ended) = launched::launch(&self.spec, containers, ctx.address().recipient())?;
-        let (program, world) = (self.spec.program.display(), self.spec.project.world.path.display());
+        let (launched, exit) = launched::launch(&self.spec, containers, ctx.address().recipient())?;
+        let Launched { group, tail, log } = launched;
+        let program = self.spec.program.display();
+        let world = self.spec.project.world.path.display();
         let pid = group.leader();
         self.log(Level::Info, &format!("started {program} for {world} (process {pid})"));
-        (self.tail, self.group) = (tail, Some(group));
-        ended
-            .into_actor(self)
-            .map(|end, this, ctx| this.ended(&end, ctx))
-            .spawn(ctx);
-        let excess = self.spec.until_too_much(pid).into_actor(self);
-        excess.map(|why, this, _| this.stop(EndReason::Limit, &why)).spawn(ctx);
-        Ok(())
+        self.spec.slot.lease.update(|simulation| {
+            simulation.launched = Some(seconds_since_1970());
+            simulation.pid = Some(pid);
+            simulation.log = log;
+        });
+        let exit = wrap_future::<_, Self>(exit).map(|exit, this, ctx| this.exited(&exit, ctx));
+        ctx.spawn(exit);
+        let excess = wrap_future::<_, Self>(self.spec.until_too_much(pid));
+        ctx.spawn(excess.map(|why, this, ctx| this.stop(Failure::new(Reason::DiskLimit, why), ctx)));
+        Ok(Process {
+            group,
+            tail,
+            started: Instant::now(),
+            restart,
+            is_running: false,
+        })
     }
 
     /// Follows its start, unless that has begun or its heartbeat shows when it is ready.
     fn follow_startup(&mut self, ctx: &mut Context<Self>) {
-        if self.startup.is_none() && !self.spec.is_ready_by_heartbeat() {
-            let startup = self.spec.follow_startup(ctx.address().recipient());
-            self.startup = Some(ctx.spawn(startup.into_actor(self)));
+        if let State::Launching(Launching {
+            startup: startup @ None,
+            ..
+        }) = &mut self.state
+            && !self.spec.is_ready_by_heartbeat()
+        {
+            let events = self.spec.follow_startup(ctx.address().recipient());
+            *startup = Some(ctx.spawn(wrap_future(events)));
         }
     }
 
-    fn ready(&mut self, ctx: &mut Context<Self>) {
-        if self.stopped_for.is_some() || self.listening {
-            return;
-        }
+    fn become_ready(&mut self, ctx: &mut Context<Self>) {
+        let process = match self.take_state() {
+            State::Launching(Launching { process, .. }) => process,
+            // It was ready before, by its port or its first heartbeat; or it is ending.
+            other => return self.state = other,
+        };
         self.log(Level::Info, "ready");
-        self.listening = true;
-        self.last_heartbeat = Instant::now();
-        self.show_pace();
-        let stream = self.spec.slot.lease.open_stream();
-        self.send(WebotsEvent::Listening(self.spec.slot.port, stream));
+        let started = process.started;
+        self.enter(State::Ready(Ready {
+            process,
+            last_heartbeat: Instant::now(),
+            is_hanging: false,
+            idle_end: None,
+        }));
+        self.send(WebotsEvent::Ready {
+            started,
+            port: self.spec.slot.port,
+            stream: self.spec.slot.lease.open_stream(),
+        });
+        ctx.run_interval(self.spec.config.timing.heartbeat, Self::check_heartbeat);
         self.used(ctx);
     }
 
-    /// Shows whether the simulation runs, unless Webots is starting or ending.
-    fn show_pace(&self) {
-        if self.listening && self.stopped_for.is_none() {
-            let stage = if self.runs { Stage::Running } else { Stage::Idle };
-            self.spec.slot.lease.update(move |one| one.stage = stage);
+    fn check_launch(&mut self, ctx: &mut Context<Self>) {
+        if let State::Launching(_) = &self.state {
+            let reason = match self.reached() {
+                Reached::Start => Reason::LaunchFailed,
+                Reached::Listening | Reached::Ready => Reason::LoadTimeout,
+            };
+            let limit = self.spec.config.timing.launch.as_secs();
+            let message = format!("Webots did not become ready within {limit} seconds");
+            self.stop(Failure::new(reason, message), ctx);
         }
     }
 
-    fn check_heartbeat(&mut self, _: &mut Context<Self>) {
-        // Until its world is ready, the timeout of its launch applies: it sends no heartbeat while it reads the world.
-        if !self.listening {
-            return;
-        }
-        let silence = self.last_heartbeat.elapsed();
+    /// Called only once the world is ready: Webots sends no heartbeat while it reads the world.
+    fn check_heartbeat(&mut self, ctx: &mut Context<Self>) {
+        let State::Ready(ready) = &mut self.state else { return };
+        let silence = ready.last_heartbeat.elapsed();
         let hangs_after = self.spec.config.timing.heartbeat * MISSED_HEARTBEATS;
         if silence > hangs_after + self.spec.config.hang_limit {
-            self.stop(
-                EndReason::Hung,
-                &format!("Webots gave no sign of life for {} seconds", silence.as_secs()),
-            );
-        } else if silence > hangs_after && !self.hanging {
-            self.hanging = true;
+            let message = format!("Webots gave no sign of life for {} seconds", silence.as_secs());
+            self.stop(Failure::new(Reason::Hung, message), ctx);
+        } else if silence > hangs_after && !ready.is_hanging {
+            ready.is_hanging = true;
             self.log(Level::Warn, &format!("no sign of life for {} s", silence.as_secs()));
             self.send(WebotsEvent::Hanging(silence.as_secs()));
         }
@@ -203,54 +274,102 @@ impl Webots {
 
     /// Ends Webots: gracefully, or at once if it exceeds a limit, which it could exceed further in a grace period. Only
     /// the first reason counts.
-    pub(super) fn stop(&mut self, kind: EndReason, why: &str) {
-        if self.stopped_for.is_some() {
-            return;
+    pub(super) fn stop(&mut self, failure: Failure, ctx: &mut Context<Self>) {
+        let was_ready = matches!(self.state, State::Ready(_));
+        let Process { mut group, tail, .. } = match self.take_state() {
+            State::Preparing(job) => {
+                ctx.cancel_future(job);
+                return self.end(failure.into(), ctx);
+            }
+            State::Launching(Launching { process, .. }) | State::Ready(Ready { process, .. }) => process,
+            other @ (State::Stopping(_) | State::Ended(_)) => return self.state = other,
+        };
+        let is_excess = failure.reason == Reason::DiskLimit;
+        let level = if is_excess { Level::Warn } else { Level::Info };
+        self.log(level, &format!("ending: {failure}"));
+        // Something has failed, otherwise.
+        if failure.reason.blame() == Blame::User || failure.reason == Reason::ServerStopped {
+            self.spec.slot.lease.ending(&failure.message);
         }
-        self.log(
-            if kind == EndReason::Limit {
-                Level::Warn
-            } else {
-                Level::Info
-            },
-            &format!("ending: {why}"),
-        );
-        self.stopped_for = Some((kind, why.to_owned()));
-        if kind.is_intended() {
-            self.spec.slot.lease.ending(why);
-        }
-        self.spec.slot.lease.update(|one| one.stage = Stage::Stopping);
-        if kind == EndReason::Limit {
-            self.group = None;
+        if is_excess {
+            drop(group);
         } else {
-            self.group.iter_mut().for_each(ProcessGroup::terminate);
+            group.terminate();
+        }
+        self.enter(State::Stopping(Stopping {
+            tail,
+            was_ready,
+            failure,
+        }));
+    }
+
+    /// How far it came. In containers the project determines what runs: whatever happens there is not the server's
+    /// fault, as far as Docker knows.
+    fn reached(&self) -> Reached {
+        match &self.state {
+            State::Ready(_) => Reached::Ready,
+            State::Launching(launching) if launching.has_listened || self.spec.containers.is_some() => {
+                Reached::Listening
+            }
+            _ => Reached::Start,
         }
     }
 
-    fn ended(&mut self, end: &End, ctx: &mut Context<Self>) {
-        self.log(Level::Info, &format!("Webots {}", end.reason));
-        let (kind, why) = self.stopped_for.take().unwrap_or_else(|| end.verdict(self.listening));
-        self.over(kind, &why, end.taken, ctx);
-    }
-
-    /// Reports the end, and stops. If Webots has not become ready, that is this server's fault; in containers it is the
-    /// project's, because the project determines what they run.
-    fn over(&mut self, kind: EndReason, why: &str, taken: Taken, ctx: &mut Context<Self>) {
-        self.spec.slot.lease.end(kind, why, taken);
-        let clean = kind == EndReason::Finished;
-        let own = kind == EndReason::Fault || !(clean || self.listening || self.spec.containers.is_some());
-        let mut why = why.to_owned();
-        if !clean {
-            why += &self.tail.last_words(&self.spec.project.instance.project());
+    fn exited(&mut self, exit: &Exit, ctx: &mut Context<Self>) {
+        self.log(Level::Info, &format!("Webots {}", exit.status));
+        let observed = exit.failure(self.reached());
+        let (failure, tail, was_ready) = match self.take_state() {
+            State::Launching(Launching { process, .. }) => (observed, process.tail, false),
+            State::Ready(Ready { process, .. }) => (observed, process.tail, true),
+            State::Stopping(Stopping {
+                failure,
+                tail,
+                was_ready,
+            }) => (failure, tail, was_ready),
+            // Only a process that was started exits, once.
+            other @ (State::Preparing(_) | State::Ended(_)) => return self.state = other,
+        };
+        let reason = failure.reason;
+        let mut told = failure.clone();
+        if matches!(reason, Reason::LaunchFailed | Reason::LoadFailed | Reason::LoadTimeout) {
+            told.message = format!("{}.{}", told.message, self.spec.launcher.remark());
         }
-        if kind == EndReason::NoWebots && self.group.is_some() {
-            why += self.spec.launcher.remark();
+        if reason != Reason::Finished {
+            told = told.with_output(tail.text(&self.spec.project.instance.project()));
         }
-        if self.listening {
+        let end = End {
+            failure,
+            taken: exit.taken,
+        };
+        self.spec.slot.lease.end(end);
+        if was_ready {
             self.spec.keep_assets();
         }
-        self.exit = Some(WebotsExit { clean, own, why });
+        self.state = State::Ended(told);
         ctx.stop();
+    }
+
+    /// Ends before Webots was started.
+    fn end(&mut self, end: End, ctx: &mut Context<Self>) {
+        self.spec.slot.lease.end(end.clone());
+        self.state = State::Ended(end.failure);
+        ctx.stop();
+    }
+
+    /// Enters a state, and shows it.
+    fn enter(&mut self, state: State) {
+        self.state = state;
+        self.show();
+    }
+
+    fn show(&self) {
+        let stage = self.state.stage();
+        self.spec.slot.lease.update(|simulation| simulation.stage = stage);
+    }
+
+    /// Takes the state out, in order to enter another one.
+    fn take_state(&mut self) -> State {
+        std::mem::replace(&mut self.state, State::Ended(lost()))
     }
 
     pub(super) fn send(&self, event: WebotsEvent) {
@@ -259,52 +378,56 @@ impl Webots {
 
     /// Logs an event with the port, and records it without: a client that has only a token must not learn the port.
     fn log(&self, level: Level, event: &str) {
-        self.spec
-            .slot
-            .lease
-            .log(level, &format!("port {}: {event}", self.spec.slot.port), event);
+        let with_port = format!("port {}: {event}", self.spec.slot.port);
+        self.spec.slot.lease.log(level, &with_port, event);
     }
 }
 
 impl Drop for Webots {
     /// Notifies the session of the end, even after a panic.
     fn drop(&mut self) {
-        let why = "The server has lost this simulation".to_owned();
-        let exit = self.exit.take().unwrap_or(WebotsExit {
-            clean: false,
-            own: true,
-            why,
-        });
-        self.send(WebotsEvent::Exited(exit));
+        let failure = match self.take_state() {
+            State::Ended(failure) => failure,
+            _ => lost(),
+        };
+        self.send(WebotsEvent::Exited(failure));
     }
 }
 
 impl Actor for Webots {
     type Context = Context<Self>;
-
-    fn started(&mut self, ctx: &mut Self::Context) {
-        self.prepare(ctx);
-    }
 }
 
 impl Handler<OutputEvent> for Webots {
     type Result = ();
 
     fn handle(&mut self, event: OutputEvent, ctx: &mut Self::Context) {
-        self.last_heartbeat = Instant::now();
-        self.hanging = false;
+        if let State::Ready(ready) = &mut self.state {
+            ready.last_heartbeat = Instant::now();
+            ready.is_hanging = false;
+        }
         match event {
-            OutputEvent::Heartbeat if self.listening => self.send(WebotsEvent::Heartbeat),
-            OutputEvent::Heartbeat if self.spec.is_ready_by_heartbeat() => self.ready(ctx),
-            OutputEvent::Heartbeat => {}
+            OutputEvent::Heartbeat => match &self.state {
+                State::Ready(_) => self.send(WebotsEvent::Heartbeat),
+                State::Launching(_) if self.spec.is_ready_by_heartbeat() => self.become_ready(ctx),
+                _ => {}
+            },
             OutputEvent::ContainerRuns => self.follow_startup(ctx),
             OutputEvent::Reset => {
-                self.restart.iter().for_each(|controller| controller.notify_one());
+                if let Some(Process {
+                    restart: Some(controller),
+                    ..
+                }) = self.state.process()
+                {
+                    controller.notify_one();
+                }
                 self.used(ctx);
             }
             OutputEvent::Paused | OutputEvent::Running => {
-                self.runs = event == OutputEvent::Running;
-                self.show_pace();
+                if let Some(process) = self.state.process() {
+                    process.is_running = event == OutputEvent::Running;
+                    self.show();
+                }
                 self.used(ctx);
             }
         }
@@ -316,9 +439,13 @@ impl Handler<StartupEvent> for Webots {
 
     fn handle(&mut self, event: StartupEvent, ctx: &mut Self::Context) {
         match event {
-            StartupEvent::Listening => {}
+            StartupEvent::Listening => {
+                if let State::Launching(launching) = &mut self.state {
+                    launching.has_listened = true;
+                }
+            }
             StartupEvent::Loading(progress) => self.send(WebotsEvent::Progress(progress)),
-            StartupEvent::Ready => self.ready(ctx),
+            StartupEvent::Ready => self.become_ready(ctx),
         }
     }
 }
@@ -326,16 +453,15 @@ impl Handler<StartupEvent> for Webots {
 impl Handler<Stop> for Webots {
     type Result = ();
 
-    fn handle(&mut self, Stop(kind): Stop, ctx: &mut Self::Context) {
-        let why = match kind {
-            EndReason::Stopped => "The server was stopped",
-            EndReason::Administrator => "The administrator has stopped it",
-            _ => "Its client has gone",
-        };
-        self.stop(kind, why);
-        if let Some(preparing) = self.preparing.take() {
-            ctx.cancel_future(preparing);
-            self.over(kind, why, Taken::default(), ctx);
-        }
+    fn handle(&mut self, Stop(reason): Stop, ctx: &mut Self::Context) {
+        self.stop(reason.into(), ctx);
+    }
+}
+
+/// Why containers could not be prepared.
+fn not_prepared(error: StartError) -> Failure {
+    match error {
+        StartError::Project(why) => Failure::new(Reason::InvalidProject, why),
+        StartError::Server(why) => Failure::new(Reason::DockerUnavailable, why),
     }
 }

@@ -7,21 +7,22 @@ use std::time::SystemTime;
 use actix::{Message, Recipient};
 use tokio::sync::Semaphore;
 
+use crate::shared::domain::{Failure, Reason};
 use crate::shared::http::Peer;
 use crate::shared::run::{seconds_since_1970, timestamp};
 use crate::shared::text::{excerpt, without_paths};
-use crate::simulation::ends::{End, EndReason, Ended, Taken};
+use crate::simulation::ends::{End, Ended, lost};
 use crate::simulation::sessions::Token;
 use crate::simulation::snapshot::{Simulation, Stage};
 
 /// A simulation of this server.
-pub(super) struct Present {
+pub(super) struct SimulationRecord {
     /// The number of clients ahead in the queue, as last sent.
     pub sent_position: Option<usize>,
     /// Receives its events.
     pub listener: Recipient<SlotEvent>,
-    /// The part that pages show. It has no port while it is in the queue.
-    pub shown: Simulation,
+    /// The simulation, as pages show it. It has no port while it is in the queue.
+    pub simulation: Simulation,
     /// Its client, which counts for its address.
     pub client: Peer,
     /// The address and the user of its client, if their slots are limited, each with its limit.
@@ -32,8 +33,8 @@ pub(super) struct Present {
     pub ending: Arc<OnceLock<String>>,
     /// Whether it was told to make room for a client that waits.
     pub makes_room: bool,
-    /// How it ends. Only the first report counts.
-    pub how: Option<End>,
+    /// Its end, once that is reported. Only the first report counts.
+    pub end: Option<End>,
     events: Vec<String>,
 }
 
@@ -45,7 +46,7 @@ pub enum SlotEvent {
     Queued(usize),
     /// This port may be used until the lease is dropped.
     Granted(u16),
-    /// The first watcher of the simulation connects, or the last one leaves.
+    /// The first administrator who watches the simulation connects, or the last one leaves.
     Watched(bool),
     /// The administrator stops the simulation; the text is for its client.
     Stopped(String),
@@ -80,9 +81,9 @@ impl Access {
 pub(super) enum Holder {
     /// The client of the simulation.
     Client,
-    /// A watcher who has not connected yet. The token admits one connection.
+    /// An administrator who will watch, and has not connected yet. The token admits one connection.
     Invited,
-    /// A connected watcher. The token is valid as long as that connection.
+    /// An administrator who watches. The token is valid as long as that connection.
     Watcher,
 }
 
@@ -94,16 +95,17 @@ pub(super) enum Party {
 }
 
 impl Party {
-    /// Why it gets no other slot, as text for the client: it has `slots`, and `waiting` of its clients wait.
-    pub(super) fn refusal(&self, slots: usize, waiting: usize) -> String {
+    /// Why it gets no other slot: it has `slots`, and `waiting` of its clients wait.
+    pub(super) fn refusal(&self, slots: usize, waiting: usize) -> Failure {
         let have = match self {
             Self::Address(_) => "Clients of your address have",
             Self::User(_) => "You have",
         };
-        format!(
+        let message = format!(
             "{have} {slots} places of this simulation server, and {waiting} more are waiting. The rest is kept for \
              others. Try again later"
-        )
+        );
+        Failure::new(Reason::ShareUsed, message)
     }
 }
 
@@ -112,35 +114,35 @@ const MAX_EVENTS: usize = 60;
 /// Longest text of an event, in characters.
 const MAX_EVENT_LENGTH: usize = 500;
 
-impl Present {
+impl SimulationRecord {
     /// A simulation that a client has just requested.
-    pub(super) fn new(shown: Simulation, client: Peer, listener: Recipient<SlotEvent>) -> Self {
-        let event = format!("its client asks for {}", shown.world);
-        let mut present = Self {
+    pub(super) fn new(simulation: Simulation, client: Peer, listener: Recipient<SlotEvent>) -> Self {
+        let event = format!("its client asks for {}", simulation.world);
+        let mut record = Self {
             sent_position: None,
             listener,
-            shown,
+            simulation,
             client,
             parties: Vec::new(),
             accesses: Vec::new(),
             ending: Arc::default(),
             makes_room: false,
-            how: None,
+            end: None,
             events: Vec::new(),
         };
-        present.note(&event);
-        present
+        record.note(&event);
+        record
     }
 
     /// Whether it has a slot and waits for its client, which has lost its connection.
     pub(super) fn is_away(&self) -> bool {
-        self.shown.port.is_some() && self.shown.away_until.is_some()
+        self.simulation.port.is_some() && self.simulation.away_until.is_some()
     }
 
     /// Grants it a port.
     pub(super) fn lend(&mut self, port: u16) {
-        self.shown.port = Some(port);
-        self.shown.stage = Stage::CheckingOut;
+        self.simulation.port = Some(port);
+        self.simulation.stage = Stage::CheckingOut;
         self.note(&format!("it is given port {port}, its world is checked out"));
         self.listener.do_send(SlotEvent::Granted(port));
     }
@@ -154,28 +156,17 @@ impl Present {
         }
     }
 
-    /// The record of its end, once its owner has stopped. If the owner has reported no end, its client has left, or the
-    /// owner has panicked while Webots ran.
+    /// Its end, once its owner has stopped. An owner that has reported none has panicked.
     pub(super) fn ended(mut self) -> Ended {
-        let how = self.how.take().unwrap_or_else(|| {
-            let (reason, why) = match self.shown.launched {
-                None => (EndReason::Left, "Its client has gone"),
-                Some(_) => (EndReason::Fault, "The server has lost this simulation"),
-            };
-            End {
-                reason,
-                why: why.to_owned(),
-                taken: Taken::default(),
-            }
-        });
+        let end = self.end.take().unwrap_or_else(|| lost().into());
         self.events.truncate(MAX_EVENTS - 1);
-        self.note(&format!("ended ({}): {}", how.reason.label(), how.why));
+        self.note(&format!("ended ({}): {}", end.failure.reason, end.failure));
         Ended {
-            simulation: self.shown,
+            simulation: self.simulation,
             client: self.client,
             at: seconds_since_1970(),
             events: self.events,
-            how,
+            end,
         }
     }
 }
