@@ -11,12 +11,14 @@ mod world;
 
 #[test]
 fn a_black_hole_takes_few_clients() {
-    for scenario in compare::hole_scenarios(&[5]) {
-        let [with, without] = compare::share_that_fails(&scenario);
-        assert!(
-            with < without / 2.0,
-            "{scenario:?}: {with:.1} % fail with ejection, {without:.1} % without"
-        );
+    for fails_after in [0.5, 40.0] {
+        for scenario in compare::hole_scenarios(&[5], fails_after) {
+            let [with, without] = compare::share_that_fails(&scenario);
+            assert!(
+                with < without / 2.0,
+                "{scenario:?}: {with:.1} % fail with ejection, {without:.1} % without"
+            );
+        }
     }
 }
 

@@ -40,7 +40,7 @@ pub(crate) fn scenarios(fleets: &[usize], refreshes: &[f64]) -> Vec<Scenario> {
                             sizes,
                             sessions,
                             foreign: Foreign::None,
-                            hole: false,
+                            fails_after: None,
                         });
                     }
                 }
@@ -60,12 +60,12 @@ pub(crate) fn foreign_scenarios(fleets: &[usize]) -> Vec<Scenario> {
     all
 }
 
-/// Scenarios in which one server is a black hole: each start fails there at once.
-pub(crate) fn hole_scenarios(fleets: &[usize]) -> Vec<Scenario> {
+/// Scenarios in which one server is a black hole: each start fails there after so many seconds.
+pub(crate) fn hole_scenarios(fleets: &[usize], fails_after: f64) -> Vec<Scenario> {
     let mut all = scenarios(fleets, &[1.0]);
     all.retain(|scenario| scenario.sessions == Sessions::Exponential && scenario.sizes == Sizes::Equal);
     for scenario in &mut all {
-        scenario.hole = true;
+        scenario.fails_after = Some(fails_after);
     }
     all
 }

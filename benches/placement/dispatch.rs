@@ -12,6 +12,8 @@ use webots_fleet::shared::domain::{Instances, Load, ServerReport};
 pub(crate) struct Seen {
     pub(crate) load: f64,
     pub(crate) present: u32,
+    /// Clients of these whose simulation has not started yet.
+    pub(crate) starting: u32,
     pub(crate) arrivals: u64,
     pub(crate) failed_starts: u32,
 }
@@ -68,12 +70,14 @@ impl Dispatcher for Own {
     fn report(&mut self, server: usize, now: f64, seen: Seen) {
         let Seen {
             load,
-            present: running,
+            present,
+            starting,
             arrivals,
             failed_starts,
         } = seen;
         let instances = Instances {
-            running,
+            running: present - starting,
+            starting,
             places: 100_000,
             arrivals,
             ..Instances::default()

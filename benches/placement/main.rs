@@ -29,6 +29,9 @@ use std::time::{Duration, Instant};
 use webots_fleet::session::placement::{LoadBalancer, PlacementPolicy};
 use webots_fleet::shared::domain::{Instances, Load, ServerReport};
 
+/// Seconds after which the starts of a black hole fail.
+const HOLES: [f64; 2] = [0.5, 40.0];
+
 fn main() -> ExitCode {
     let begin = Instant::now();
     // `cargo test --all-targets` runs this program too, without the argument that `cargo bench` adds.
@@ -57,7 +60,9 @@ fn main() -> ExitCode {
         if quick { &[5] } else { &[5, 50] },
         if quick { &[1.0] } else { &[1.0, 3.0] },
     );
-    black_hole(if quick { &[5] } else { &[5, 50] });
+    for fails_after in HOLES {
+        black_hole(if quick { &[5] } else { &[5, 50] }, fails_after);
+    }
     speed();
     println!(
         "\n{} scenarios in {:.0} s",
@@ -95,10 +100,10 @@ fn measure(scenarios: &[Scenario]) -> usize {
 }
 
 /// Prints which share of the clients fails if one server is a black hole.
-fn black_hole(fleets: &[usize]) {
-    println!("\nOne server fails each start after half a second. Clients whose starts fail, in %:\n");
+fn black_hole(fleets: &[usize], fails_after: f64) {
+    println!("\nOne server fails each start after {fails_after} s. Clients whose starts fail, in %:\n");
     println!("| servers | arrivals | with ejection | without |\n|---|---|---|---|");
-    for scenario in hole_scenarios(fleets) {
+    for scenario in hole_scenarios(fleets, fails_after) {
         let [with, without] = share_that_fails(&scenario);
         println!(
             "| {} | {:?} | {with:.1} | {without:.1} |",

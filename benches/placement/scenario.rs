@@ -69,8 +69,8 @@ pub(crate) struct Scenario {
     pub(crate) sizes: Sizes,
     pub(crate) sessions: Sessions,
     pub(crate) foreign: Foreign,
-    /// Whether the first server is a black hole: each start fails there at once.
-    pub(crate) hole: bool,
+    /// If the first server is a black hole, the seconds after which each start fails there.
+    pub(crate) fails_after: Option<f64>,
 }
 
 /// The outcome of a run.

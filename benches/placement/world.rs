@@ -11,8 +11,6 @@ use std::collections::{BinaryHeap, VecDeque};
 const UNIT_COST: f64 = 2.0;
 /// Seconds until a new simulation reaches its full load.
 const RAMP: f64 = 3.0;
-/// Seconds until a start in a black hole fails.
-const FAILS_AFTER: f64 = 0.5;
 
 /// One machine.
 struct Machine {
@@ -28,8 +26,10 @@ struct Machine {
     samples: VecDeque<f64>,
     /// The load of other programs.
     foreign: f64,
-    /// Whether each start fails here, and how many have in a row.
-    is_hole: bool,
+    /// If each start fails here, the seconds after which it does.
+    fails_after: Option<f64>,
+    /// Clients whose start has not failed yet.
+    failing: u32,
     failed_starts: u32,
 }
 
@@ -76,6 +76,7 @@ impl Machine {
         Seen {
             load: self.samples.iter().sum::<f64>() / self.samples.len() as f64,
             present: self.present,
+            starting: self.failing,
             arrivals: self.arrivals,
             failed_starts: self.failed_starts,
         }
@@ -100,7 +101,11 @@ pub(crate) fn run(scenario: &Scenario, seed: u64, dispatcher: &mut impl Dispatch
     let mut random = StdRng::seed_from_u64(seed);
     let mut machines = machines(scenario, &mut random);
     let room = |machine: &Machine| (THRESHOLD - machine.base) / machine.client_cost;
-    let capacity = machines.iter().filter(|machine| !machine.is_hole).map(room).sum();
+    let capacity = machines
+        .iter()
+        .filter(|machine| machine.fails_after.is_none())
+        .map(room)
+        .sum();
     let clients = clients(scenario, capacity, &mut random);
     // The servers are probed in turn, each once per refresh.
     let mut asked = 0_usize;
@@ -134,12 +139,16 @@ pub(crate) fn run(scenario: &Scenario, seed: u64, dispatcher: &mut impl Dispatch
             let (Client { weight, session, .. }, machine): (&Client, &mut Machine) =
                 (&clients[client], &mut machines[server]);
             let cost = weight * machine.client_cost;
-            if step == Step::Comes && machine.is_hole {
+            if step == Step::Comes
+                && let Some(fails_after) = machine.fails_after
+            {
                 machine.present += 1;
+                machine.failing += 1;
                 machine.arrivals += 1;
-                events.push(Reverse((micros(now + FAILS_AFTER), Step::Fails, client, server)));
+                events.push(Reverse((micros(now + fails_after), Step::Fails, client, server)));
             } else if step == Step::Fails {
                 machine.present -= 1;
+                machine.failing -= 1;
                 machine.failed_starts += 1;
                 failed += 1;
             } else if step == Step::Comes {
@@ -207,7 +216,8 @@ fn machines(scenario: &Scenario, random: &mut StdRng) -> Vec<Machine> {
                 starting: VecDeque::new(),
                 samples: VecDeque::new(),
                 foreign: 0.0,
-                is_hole: scenario.hole && i == 0,
+                fails_after: scenario.fails_after.filter(|_| i == 0),
+                failing: 0,
                 failed_starts: 0,
             }
         })

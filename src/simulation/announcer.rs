@@ -21,9 +21,11 @@ const SHOWN: usize = 200;
 /// Starts the announcements of a server.
 pub fn start(config: &SimulationConfig) {
     let allowed: Vec<&str> = config.allowed_repositories.iter().map(UrlPrefix::as_str).collect();
+    // Worlds of other repositories run in containers only.
+    let share_idle_time = if config.docker { config.share_idle_time } else { 0.0 };
     let form = vec![
         ("url", config.http_url()),
-        ("shareIdleTime", config.share_idle_time.to_string()),
+        ("shareIdleTime", share_idle_time.to_string()),
         ("allowedRepositories", allowed.join(",")),
     ];
     for address in &config.notify {
@@ -41,11 +43,12 @@ async fn announce(address: String, form: Vec<(&'static str, String)>, pause: Dur
         let problem = match client.post(&address).send_form(&form).await {
             Ok(mut answer) if answer.status().is_success() => {
                 let body = answer.body().limit(MAX_ANSWER_SIZE).await.unwrap_or_default();
-                // Some services refuse with status 200 and a text.
-                log::info!(
-                    "announced to {address}, which answered {:?}",
-                    excerpt(&String::from_utf8_lossy(&body), SHOWN)
-                );
+                let text = excerpt(&String::from_utf8_lossy(&body), SHOWN);
+                if is_refusal(&body) {
+                    log::warn!("{address} refuses this server: {text:?}");
+                } else {
+                    log::info!("announced to {address}, which answered {text:?}");
+                }
                 return;
             }
             Ok(answer) => format!("it answered {}", answer.status()),
@@ -55,4 +58,10 @@ async fn announce(address: String, form: Vec<(&'static str, String)>, pause: Dur
         actix_rt::time::sleep(pause).await;
     }
     log::error!("gave up announcing to {address}");
+}
+
+/// Whether the body of an answer with status 200 is `{"error": ...}`, as webots.cloud refuses.
+fn is_refusal(body: &[u8]) -> bool {
+    let answer: Result<serde_json::Value, _> = serde_json::from_slice(body);
+    answer.is_ok_and(|answer| answer.get("error").is_some_and(|error| !error.is_null()))
 }

@@ -98,6 +98,17 @@ impl AppState {
         }
     }
 
+    /// Returns the load for programs that know nothing else of this server: as [`Self::load`], but at least
+    /// [`Load::NO_SLOT`] while no slot is free.
+    pub fn load_with_slots(&self) -> Load {
+        let instances = self.slots.instances();
+        if instances.present() < instances.places || self.load() > Load::NO_SLOT {
+            self.load()
+        } else {
+            Load::NO_SLOT
+        }
+    }
+
     /// Whether the server accepts no client, regardless of its world.
     pub fn takes_nobody(&self) -> bool {
         self.is_draining() || self.problem.borrow().is_some()

@@ -6,7 +6,32 @@ use std::net::TcpListener;
 use std::time::Duration;
 
 use super::scene::nothing_left;
-use crate::support::{Client, arm, demo_server, until};
+use crate::support::{Client, arm, demo_server, http, until};
+
+#[actix_rt::test]
+async fn a_server_without_a_free_place_says_so_in_its_load_and_on_its_page() {
+    let server = demo_server(1).start().await;
+    let load = async || http::get(&server.url("/load")).await.text().parse::<f64>().unwrap();
+    let page = async || http::get(&server.url("/monitor")).await.text();
+    assert!(load().await < 99.0);
+    let mut client = Client::start_from(&server, "203.0.113.9", &arm()).await;
+    client.until("webots:").await;
+    assert!(load().await >= 99.0);
+    let reported = server.status().await["load"].as_f64().unwrap();
+    assert!(
+        reported < 99.0,
+        "session servers that know slots learn from the real load"
+    );
+    let shown = page().await;
+    assert!(shown.contains("All places are taken."), "{shown}");
+    let mut waits = Client::start_from(&server, "203.0.113.10", &arm()).await;
+    waits.until("queue: 0").await;
+    assert!(page().await.contains("All places are taken; clients wait in line."));
+    client.leave().await;
+    waits.until("webots:").await;
+    waits.leave().await;
+    until("the place is free", async || load().await < 99.0).await;
+}
 
 #[actix_rt::test]
 async fn simulations_left_behind_make_room_for_who_waits() {

@@ -180,6 +180,10 @@ async fn the_server_announces_itself_and_waits_for_nobody() {
     let url = format!("http://{}/announce", listener.local_addr().unwrap());
     let (sender, requests) = std::sync::mpsc::channel();
     let mut answers = [(500, ""), (200, r#"{"success": true}"#)].into_iter();
+    // webots.cloud refuses like this.
+    let refusing = TcpListener::bind("127.0.0.1:0").unwrap();
+    let refusing_url = format!("http://{}/", refusing.local_addr().unwrap());
+    listen(refusing, |_| Some((200, r#"{"error": "unknown server"}"#)));
     listen(listener, move |request| {
         let answer = answers.next()?;
         sender.send(request).ok()?;
@@ -190,7 +194,8 @@ async fn the_server_announces_itself_and_waits_for_nobody() {
     let notify = json!([
         url,
         format!("http://{}/", hanging.local_addr().unwrap()),
-        format!("http://{closed}/")
+        format!("http://{closed}/"),
+        refusing_url
     ]);
     let allowed = json!(["https://github.com/lab", "https://github.com/other/x"]);
     let builder = demo_server(1).set("notify", notify);
@@ -206,7 +211,7 @@ async fn the_server_announces_itself_and_waits_for_nobody() {
         "the start waited for an announcement"
     );
     let body = format!(
-        "url=http%3A%2F%2Flocalhost%3A{}&shareIdleTime=25&allowedRepositories=https%3A%2F%2Fgithub.com%2Flab%2Chttps%3A%2F%2Fgithub.com%2Fother%2Fx",
+        "url=http%3A%2F%2Flocalhost%3A{}&shareIdleTime=0&allowedRepositories=https%3A%2F%2Fgithub.com%2Flab%2Chttps%3A%2F%2Fgithub.com%2Fother%2Fx",
         server.port
     );
     for _ in 0..2 {
@@ -219,6 +224,8 @@ async fn the_server_announces_itself_and_waits_for_nobody() {
         );
         assert_eq!(String::from_utf8(content).unwrap(), body);
     }
+    let refused = format!("{refusing_url} refuses this server: \"{{\\\"error\\\": \\\"unknown server\\\"}}\"");
+    until("a refusal is a warning", async || server.log().contains(&refused)).await;
     let answered = format!("announced to {url}, which answered \"{{\\\"success\\\": true}}\"");
     until("it was told", async || server.log().contains(&answered)).await;
     assert!(

@@ -1,7 +1,7 @@
 //! Who uses which simulation: the user that a trusted web server reports, and the name that a client gives itself.
 
 use futures_util::StreamExt;
-use serde_json::json;
+use serde_json::{Value, json};
 
 use crate::support::http::{self, PASSWORD, get_as_administrator, get_with_password};
 use crate::support::{Builder, Client, Server, arm, demo_server, until};
@@ -140,6 +140,22 @@ async fn a_user_is_believed_from_a_trusted_web_server_only() {
             known,
             "{trusted} {header} {headers:?}"
         );
+    }
+}
+
+#[actix_rt::test]
+async fn strangers_get_no_paths_process_ids_or_name_of_the_machine() {
+    let server = with_users(1).start().await;
+    let mut client = start(&server, &[], None).await;
+    client.until("webots:").await;
+    let strangers: Value = serde_json::from_str(&http::get(&server.url("/status")).await.text()).unwrap();
+    let answer = get_with_password(&server.url("/status"), PASSWORD).await;
+    let administrators: Value = serde_json::from_str(&answer.text()).unwrap();
+    for (status, is_shown) in [(strangers, false), (administrators, true)] {
+        let simulation = &status["simulations"][0];
+        assert_eq!(simulation["pid"].is_i64(), is_shown, "{simulation}");
+        assert_eq!(simulation["log"].is_string(), is_shown, "{simulation}");
+        assert_ne!(status["host"]["name"] == "", is_shown, "{}", status["host"]);
     }
 }
 

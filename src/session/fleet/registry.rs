@@ -15,12 +15,12 @@ use super::line_keeper::{LineKeeper, StopWaiting, Wait};
 use super::name_table::look_up_all;
 use super::server_monitor::{Parent, ProbeResult};
 use super::server_record::{Answer, FleetStatus, Intake, ServerRecord, ServerState, ServerStatus};
-use super::server_table::{ServerTable, accepts};
+use super::server_table::ServerTable;
 use super::slot_link::LinkEvent;
 use super::state_history::StateHistory;
 use crate::session::config::SessionConfig;
 use crate::session::line::Place;
-use crate::shared::domain::{Failure, Load, ProjectUrl, PublicAddress, Reason, ServerReport};
+use crate::shared::domain::{Admission, Failure, Load, ProjectUrl, PublicAddress, Reason, ServerReport};
 use crate::shared::http::AddressQuota;
 
 /// Requests the least loaded simulation server that accepts this world.
@@ -138,13 +138,18 @@ impl Registry {
     /// Chooses a server for a client of this address.
     fn pick(&mut self, world: Option<&ProjectUrl>, from: Option<IpAddr>) -> Result<PublicAddress, Failure> {
         let ServerTable { records, fleet, .. } = &mut self.servers;
-        let accepts = accepts(records);
         let line = &self.line;
-        let eligible = |address: &PublicAddress| {
-            world.is_none_or(|world| accepts(address, world)) && !line.claims(records, address)
+        let admission = |address: &PublicAddress, load: f64| {
+            if line.claims(records, address) {
+                return None;
+            }
+            let Some(world) = world else {
+                return Some(Admission::Dedicated);
+            };
+            let answer = records.get(address)?.state.last_answer()?;
+            answer.report.check(world, Load::try_from(load).ok()?).ok()
         };
-        let picked = fleet.pick(Instant::now(), self.quota.take(from), eligible);
-        drop(accepts);
+        let picked = fleet.pick_admitted(Instant::now(), self.quota.take(from), admission);
         picked.ok_or_else(|| self.servers.refusal(world))
     }
 

@@ -47,15 +47,22 @@ impl ClientDelta {
     }
 }
 
-/// Sort key of a server: ejected servers come last, then the lowest load comes first, and of equal loads the server
-/// that was chosen longest ago.
+/// Sort key of a server: those to which others are preferred, because they are ejected, come last; then the lowest load
+/// comes first, and of equal loads the server that was chosen longest ago.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct Rank {
-    is_ejected: bool,
+    pub(super) comes_last: bool,
     /// The bits of the load, which sort as the load does: it is not negative.
     load: u64,
     /// Unique in a fleet.
     last_pick: u64,
+}
+
+impl Rank {
+    /// The load with all clients that were sent to the server, in percent.
+    pub(super) fn load(self) -> f64 {
+        f64::from_bits(self.load)
+    }
 }
 
 /// One server of the fleet.
@@ -129,7 +136,8 @@ impl Backend {
         self.unseen = self.settling.iter().map(|change| change.unseen(now)).sum();
         self.learn(report);
         self.last = Some(report);
-        (self.up, self.accepting) = (true, accepting);
+        self.up = true;
+        self.accepting = accepting;
         // A report of only a load teaches nothing, because it does not show which part of the load is clients: such a
         // server keeps the configured cost.
         let counts = report.instances.is_some();
@@ -212,10 +220,17 @@ impl Backend {
     pub(super) fn current_rank(&self, policy: &PlacementPolicy) -> Option<Rank> {
         let load = self.load_with(self.in_flight.len()).filter(|_| self.has_room(policy))?;
         Some(Rank {
-            is_ejected: self.ejection.until.is_some(),
+            comes_last: self.comes_last(),
             load: load.to_bits(),
             last_pick: self.last_pick,
         })
+    }
+
+    /// Whether others are preferred, because starts fail here.
+    pub(super) fn comes_last(&self) -> bool {
+        let starts = |instances: Instances| instances.starting > 0 || instances.queued > 0;
+        let is_starting = self.last.and_then(|report| report.instances).is_some_and(starts);
+        self.ejection.comes_last(is_starting || !self.in_flight.is_empty())
     }
 
     fn load_with(&self, in_flight: usize) -> Option<f64> {

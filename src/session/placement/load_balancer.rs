@@ -2,9 +2,10 @@
 
 use super::backend::{Backend, Rank, count};
 use super::cost::{Estimate, FleetCost};
+use super::ejection::Ejection;
 use super::policy::PlacementPolicy;
 use super::replicas::Replicas;
-use crate::shared::domain::ServerReport;
+use crate::shared::domain::{Admission, ServerReport};
 use std::collections::{BTreeMap, HashMap};
 use std::hash::Hash;
 use std::time::{Duration, Instant};
@@ -94,14 +95,21 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
         sort_in(server, id, &self.policy, &mut self.ranking);
     }
 
-    /// Returns the server with the lowest load among those that have room and are `eligible`, and counts the client as
-    /// sent there. Of servers with equal loads it is the one that was chosen longest ago; ejected servers come last.
+    /// Returns the server for a client among those that have room, and counts the client as sent there. `admission` is
+    /// on what terms a server takes the client at a load, in percent; `None` if it does not. A server that is
+    /// [`Admission::Dedicated`] to it comes before one that shares its idle time, then the one with the lowest load, and
+    /// of equal loads the one that was chosen longest ago. Ejected servers come last.
     ///
     /// A client that does not take room counts when servers are compared, but no number of such clients makes a server
     /// full before they have arrived.
-    pub fn pick(&mut self, now: Instant, takes_room: bool, eligible: impl Fn(&Id) -> bool) -> Option<Id> {
+    pub fn pick_admitted(
+        &mut self,
+        now: Instant,
+        takes_room: bool,
+        admission: impl Fn(&Id, f64) -> Option<Admission>,
+    ) -> Option<Id> {
         self.expire(now);
-        let id = self.ranking.values().find(|id| eligible(id))?.clone();
+        let id = self.first(admission)?.clone();
         self.picks += 1;
         let server = self.servers.get_mut(&id)?;
         server.last_pick = self.picks;
@@ -143,6 +151,29 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
             .is_some_and(|server| server.would_take(&self.policy))
     }
 
+    /// As [`Self::pick_admitted`], among servers that are `eligible` on the same terms.
+    pub fn pick(&mut self, now: Instant, takes_room: bool, eligible: impl Fn(&Id) -> bool) -> Option<Id> {
+        self.pick_admitted(now, takes_room, |id, _| eligible(id).then_some(Admission::Dedicated))
+    }
+
+    fn first(&self, admission: impl Fn(&Id, f64) -> Option<Admission>) -> Option<&Id> {
+        let mut shared: Option<(&Rank, &Id)> = None;
+        for (rank, id) in &self.ranking {
+            if shared.is_some_and(|(first, _)| first.comes_last != rank.comes_last) {
+                // The others are ejected.
+                break;
+            }
+            match admission(id, rank.load()) {
+                Some(Admission::Dedicated) => return Some(id),
+                Some(Admission::Shared) => {
+                    shared.get_or_insert((rank, id));
+                }
+                None => {}
+            }
+        }
+        shared.map(|(_, id)| id)
+    }
+
     /// Gives up overdue placements, and ends ejections.
     fn expire(&mut self, now: Instant) {
         if self.checked.is_some_and(|checked| now < checked + CHECK_INTERVAL) {
@@ -167,7 +198,7 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
     pub fn is_ejected(&self, id: &Id) -> bool {
         self.servers
             .get(id)
-            .is_some_and(|server| server.ejection.until.is_some())
+            .is_some_and(|server| server.ejection != Ejection::Closed)
     }
 
     /// The load, in percent, that is expected once it shows all clients that reserve room; `None` if the server is
@@ -317,6 +348,56 @@ mod tests {
         assert!(fleet.available(now, |_| true));
         assert_eq!(fleet.pick(now, true, |_| true), Some(0));
         assert_eq!(fleet.pick(now, true, |id| *id == 1), Some(1));
+    }
+
+    #[test]
+    fn after_its_ejection_a_server_gets_one_client_until_a_start_succeeds() {
+        let begin = Instant::now();
+        let after = begin + Duration::from_secs(121);
+        let failing = |failed_starts, starting, arrivals| ServerReport {
+            failed_starts,
+            ..report(
+                1.0,
+                Some(Instances {
+                    starting,
+                    places: 100,
+                    arrivals,
+                    ..Instances::default()
+                }),
+            )
+        };
+        let mut fleet = fleet(2.0, begin, [failing(3, 0, 3), full_report(50.0, 0, 0)]);
+        let three = |fleet: &mut LoadBalancer<u32>, at| {
+            let picks = (0..3).filter_map(|_| fleet.pick(at, true, |_| true));
+            picks.filter(|id| *id == 0).count()
+        };
+        assert_eq!(three(&mut fleet, begin), 0, "ejected");
+        assert_eq!(three(&mut fleet, after), 1, "the trial");
+        fleet.report(&0, after, &failing(3, 1, 4), true);
+        assert_eq!(three(&mut fleet, after), 0, "it is starting");
+        fleet.report(&0, after, &failing(3, 0, 4), true);
+        assert_eq!(three(&mut fleet, after), 1, "it has left: another trial");
+        fleet.report(&0, after, &failing(4, 0, 5), true);
+        assert_eq!(three(&mut fleet, after), 0, "it has failed");
+        fleet.report(&0, after, &failing(0, 0, 5), true);
+        assert_eq!(three(&mut fleet, after), 3, "it has succeeded");
+    }
+
+    #[test]
+    fn a_server_that_is_dedicated_to_a_world_comes_first_and_a_burst_exceeds_no_shared_idle_time() {
+        let now = Instant::now();
+        let mut fleet = fleet(2.0, now, [70.0, 41.0].map(load_only));
+        // Server 0 is dedicated, server 1 shares its idle time up to 50 %.
+        let admission = |id: &u32, load: f64| match id {
+            0 => Some(Admission::Dedicated),
+            _ => (load <= 50.0).then_some(Admission::Shared),
+        };
+        let picked: Vec<_> = (0..100)
+            .map_while(|_| fleet.pick_admitted(now, true, admission))
+            .collect();
+        let (dedicated, shared) = picked.split_at(13);
+        assert!(dedicated.iter().all(|id| *id == 0), "{picked:?}");
+        assert_eq!(shared, [1; 5], "41, 43, 45, 47 and 49 %");
     }
 
     #[test]

@@ -18,13 +18,22 @@ pub struct AdmissionRules<Prefixes = Vec<UrlPrefix>> {
     pub share_idle_time: f64,
 }
 
+/// On what terms a server runs a world.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Admission {
+    /// At any load: its repository is one of those that the server allows.
+    Dedicated,
+    /// While its load is low (`shareIdleTime`).
+    Shared,
+}
+
 impl<Prefixes: AsRef<[UrlPrefix]>> AdmissionRules<Prefixes> {
     /// Whether a world may run at this load. A world of a blocked repository never may; the original checks the blocked
     /// repositories only for worlds that are not allowed.
     ///
     /// # Errors
     /// Why it may not.
-    pub fn admit(&self, world: &ProjectUrl, load: Load) -> Result<(), Failure> {
+    pub fn admit(&self, world: &ProjectUrl, load: Load) -> Result<Admission, Failure> {
         self.check(world, load)
             .map_err(|reason| self.failure(reason, world, load))
     }
@@ -33,18 +42,18 @@ impl<Prefixes: AsRef<[UrlPrefix]>> AdmissionRules<Prefixes> {
     ///
     /// # Errors
     /// Why it may not.
-    pub fn check(&self, world: &ProjectUrl, load: Load) -> Result<(), Reason> {
+    pub fn check(&self, world: &ProjectUrl, load: Load) -> Result<Admission, Reason> {
         let covered = |prefixes: &Prefixes| prefixes.as_ref().iter().any(|prefix| prefix.covers(world));
         if covered(&self.blocked) {
             Err(Reason::RepositoryBlocked)
         } else if covered(&self.allowed) {
-            Ok(())
+            Ok(Admission::Dedicated)
         } else if !self.docker || self.share_idle_time <= 0.0 {
             Err(Reason::RepositoryNotAllowed)
         } else if load.percent() > self.share_idle_time {
             Err(Reason::NoIdleTime)
         } else {
-            Ok(())
+            Ok(Admission::Shared)
         }
     }
 
@@ -114,7 +123,7 @@ mod tests {
         for (repository, docker, share, load, words, why) in table {
             let world = ProjectUrl::parse(&format!("https://github.com/{repository}/blob/main/worlds/a.wbt")).unwrap();
             let verdict = rules(docker, share).admit(&world, Load::try_from(load).unwrap());
-            let text = verdict.map_or_else(|refusal| refusal.to_string(), |()| String::new());
+            let text = verdict.map_or_else(|refusal| refusal.to_string(), |_| String::new());
             assert!(
                 if words.is_empty() {
                     text.is_empty()

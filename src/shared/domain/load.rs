@@ -12,6 +12,8 @@ pub struct Load(f64);
 impl Load {
     /// The load of an idle machine.
     pub const ZERO: Self = Self(0.0);
+    /// The least load that a machine without a free slot tells those who know only loads.
+    pub const NO_SLOT: Self = Self(99.0);
     /// The load of a machine that accepts no more clients.
     pub const FULL: Self = Self(100.0);
 

@@ -13,7 +13,7 @@ mod slot_link;
 mod url_prefix;
 
 pub use address::{PublicAddress, complete_host};
-pub use admission::AdmissionRules;
+pub use admission::{Admission, AdmissionRules};
 pub use client_urls::{ClientUrls, PublicUrl};
 pub use fleet_key::{FleetKey, Purpose, SIGNATURE};
 pub use load::Load;

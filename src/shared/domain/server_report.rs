@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::admission::AdmissionRules;
+use super::admission::{Admission, AdmissionRules};
 use super::load::Load;
 use super::project_url::ProjectUrl;
 use super::reason::Reason;
@@ -118,7 +118,7 @@ impl ServerReport {
     ///
     /// # Errors
     /// Why it does not.
-    pub fn check(&self, world: &ProjectUrl, load: Load) -> Result<(), Reason> {
+    pub fn check(&self, world: &ProjectUrl, load: Load) -> Result<Admission, Reason> {
         let is_open = self.allowed_repositories.is_empty() || self.share_idle_time > 0.0;
         let share_idle_time = match self.docker {
             Some(_) => self.share_idle_time,

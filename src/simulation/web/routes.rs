@@ -53,16 +53,23 @@ async fn client(
 async fn load(server: web::Data<AppState>) -> HttpResponse {
     HttpResponse::Ok()
         .content_type("text/plain")
-        .body(server.load().to_string())
+        .body(server.load_with_slots().to_string())
 }
 
 async fn status_json(request: HttpRequest, server: web::Data<AppState>) -> actix_web::Result<HttpResponse> {
     let visitor = Visitor::of(&request, &server)?;
     let mut snapshot = server.slots.snapshot();
-    if !visitor.sees_ports(&server.config) {
-        snapshot.simulations.iter_mut().for_each(|one| one.port = None);
+    for simulation in &mut snapshot.simulations {
+        if !visitor.sees_ports(&server.config) {
+            simulation.port = None;
+        }
+        if visitor == Visitor::Stranger {
+            simulation.pid = None;
+            simulation.log = None;
+        }
     }
-    Ok(HttpResponse::Ok().json(status_page(&server, &snapshot)))
+    let names_machine = visitor != Visitor::Stranger;
+    Ok(HttpResponse::Ok().json(status_page(&server, &snapshot, names_machine)))
 }
 
 async fn metrics_text(server: web::Data<AppState>) -> actix_web::Result<HttpResponse> {

@@ -17,9 +17,14 @@ struct StatusPage {
     more: Value,
 }
 
-/// The state of the server at this moment.
-pub fn status_page(server: &AppState, snapshot: &Snapshot) -> impl Serialize + use<> {
-    let (readings, rules) = (server.readings.borrow().clone(), &server.rules);
+/// The state of the server at this moment. Its name is empty for strangers.
+pub fn status_page(server: &AppState, snapshot: &Snapshot, names_machine: bool) -> impl Serialize + use<> {
+    let readings = server.readings.borrow().clone();
+    let rules = &server.rules;
+    let mut host = readings.host.clone();
+    if !names_machine {
+        host.name.clear();
+    }
     let report = ServerReport {
         load: server.load(),
         version: env!("CARGO_PKG_VERSION").to_owned(),
@@ -38,7 +43,7 @@ pub fn status_page(server: &AppState, snapshot: &Snapshot) -> impl Serialize + u
         "network": server.launcher.network(),
         // Seconds since the start.
         "uptime": server.started.elapsed().as_secs(),
-        "host": readings.host,
+        "host": host,
         "machine": readings.machine,
         "gpus": readings.gpus,
         "gpuProblem": readings.gpu_problem,
