@@ -73,10 +73,7 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     actix_rt::spawn(service_manager::feed_watchdog(async move || {
         registry.send(GetStatus).await.is_ok()
     }));
-    tokio::select! {
-        () = handle_commands(&mut signals, &file, &server) => {}
-        fault = permanent::stopped("Registry", server.registry.clone()) => return Err(fault.into()),
-    }
+    until_stopped(&mut signals, &file, &server).await?;
     log::info!("stopping");
     service_manager::stopping("stopping");
     phase_sender.send_replace(Phase::Closing);
@@ -85,6 +82,17 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     drop(serving);
     log::info!("stopped");
     Ok(())
+}
+
+/// Waits until a signal stops the server.
+///
+/// # Errors
+/// When the registry has panicked.
+async fn until_stopped(signals: &mut Signals, file: &Path, server: &AppState) -> Result<(), AppError> {
+    tokio::select! {
+        () = handle_commands(signals, file, server) => Ok(()),
+        fault = permanent::stopped("Registry", server.registry.clone()) => Err(fault.into()),
+    }
 }
 
 /// Handles signals, until the server must stop.
@@ -180,5 +188,40 @@ fn reload(file: &Path, server: &AppState) {
             server.registry.do_send(Reconfigure(Arc::new(config)));
         }
         Err(error) => log::error!("the configuration stays as it was: {error}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use actix::prelude::*;
+
+    use super::*;
+
+    /// A registry that receives this panics.
+    #[derive(Message)]
+    #[rtype(result = "()")]
+    struct Panic;
+
+    impl Handler<Panic> for Registry {
+        type Result = ();
+
+        fn handle(&mut self, _: Panic, _: &mut Self::Context) {
+            // Panics without printing.
+            std::panic::resume_unwind(Box::new("a test has asked for it"));
+        }
+    }
+
+    #[actix_rt::test]
+    async fn a_registry_that_panics_ends_the_server() {
+        let config: SessionConfig = serde_json::from_str(r#"{"simulationServers": ["127.0.0.1:1"]}"#).unwrap();
+        let connections = ConnectionLimiter::new(10, 10, None);
+        let (_phase, phase) = watch::channel(Phase::Open);
+        let server = assemble(config, connections, phase).unwrap();
+        let mut signals = Signals::catch().unwrap();
+        server.registry.do_send(Panic);
+        let ended = until_stopped(&mut signals, Path::new("none"), &server);
+        let ended = actix_rt::time::timeout(Duration::from_secs(20), ended).await.unwrap();
+        // Any error makes the program end with exit code 1.
+        assert_eq!(ended.unwrap_err().to_string(), "the actor Registry is gone");
     }
 }

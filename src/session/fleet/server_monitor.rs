@@ -317,3 +317,36 @@ fn bad_answer(cause: impl Display) -> Failure {
     let cause = excerpt(&cause.to_string(), MAX_TEXT_LENGTH);
     Failure::new(Reason::InvalidAnswer, format!("an answer that makes no sense: {cause}"))
 }
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+    use proptest::sample::select;
+
+    use super::*;
+
+    /// Any text, or one with which a server or another program tells a reason.
+    fn texts() -> impl Strategy<Value = String> {
+        const KNOWN: [&str; 5] = [
+            "no answer within 3 s",
+            "no connection: it was closed without an answer",
+            "No space left on device (os error 28)",
+            "Cannot connect to the Docker daemon at unix:///var/run/docker.sock",
+            "no simulation server available at the moment",
+        ];
+        let codes = Reason::ALL.iter().map(|reason| reason.code());
+        let known: Vec<&str> = KNOWN.into_iter().chain(codes).collect();
+        prop_oneof![any::<String>(), select(known).prop_map(str::to_owned)]
+    }
+
+    proptest! {
+        #[test]
+        fn what_a_server_writes_decides_nothing(text in texts()) {
+            let healthy = ServerReport { version: text.clone(), ..ServerReport::load_only(Load::ZERO) };
+            prop_assert!(usable(healthy.clone()).is_ok());
+            let failure = usable(ServerReport { problem: Some(text.clone()), ..healthy }).unwrap_err();
+            prop_assert_eq!((failure.reason, failure.message.as_str()), (Reason::NotReady, "it can start no simulation"));
+            prop_assert_eq!(bad_answer(text).reason, Reason::InvalidAnswer);
+        }
+    }
+}
