@@ -20,7 +20,7 @@
 //! | [`simulation::checkout`] | worlds checked out with git; `timing.checkout` limits a whole checkout (`checkout_service`), each git command, and by a quarter of it a silent remote (`git`); `projectSize` limits its size; the simulation server's `config/mirrors` has GitHub's address and the mirrors of others |
 //! | `simulation::isolation` | how a simulation is launched: its level of isolation (`launcher`), the variables that it inherits, limits; the control group that ends with it (`cgroup`) |
 //! | [`simulation::container`] | simulations in containers: what a project requests, its image, its compose project (`compose_project`, with its GPU and user) |
-//! | [`simulation::ends`] | how simulations have ended: counter, table, their logs (`kept_output`) |
+//! | [`simulation::ends`] | how simulations have ended: counter, table, their logs (`kept_output`); for which reasons an end can be requested (`stop_reason`) |
 //! | [`simulation::webots`] | one running Webots: its command line and GPU (`launch_spec`), its log (path and size in `launched`, its lines in `output`), the wait for its end (`launched`) |
 //! | [`simulation::client`] | a client's WebSocket (`web_client`), the session of its simulation, which sends it nearly all messages (`session`; `start`: before Webots runs, with the choice of the GPU) |
 //! | [`simulation::sessions`] | how a connection is attached to its session, and how a client resumes it |
@@ -41,6 +41,19 @@
 //! below them, in the order that `tests/project/layering.rs` lists. `session` and `simulation` never see each other. A
 //! child never names its parent. The parent gives it a `Recipient` for the child's events, which the child's file
 //! defines.
+//!
+//! # Words
+//!
+//! - **session**: the [`simulation::client::Session`] of one simulation. The *session server* is the other program.
+//! - **simulation**: what a client requests: a slot, a checkout, a Webots. It has an id.
+//! - **slot**: a streaming port for one simulation, or the right to have one. Texts for users say *place*.
+//! - **queue**: the clients that wait for a slot of one simulation server.
+//! - **connection**: a TCP connection or a WebSocket, never a slot (the key `maxConnections` has its name from the original).
+//! - **client**: who holds a WebSocket of either server; **viewer**: who shows the stream of a Webots.
+//! - **reason**: why a request was refused, a start has failed or a simulation has ended, as a code
+//!   ([`shared::domain::Reason`]); a **failure** ([`shared::domain::Failure`]) has also its sentence and the output of others.
+//! - **stage**: the state of a simulation as pages show it ([`simulation::snapshot::Stage`]); it follows from the state of its actor.
+//! - **ready**: Webots has its world, so that viewers may connect. Until then it may **listen**.
 //!
 //! # Who talks to whom
 //!

@@ -42,32 +42,40 @@ fn main() {
         let Part::Guard(arguments) = Arguments::parse().part;
         std::process::exit(guardian::guard(&arguments, || ()).into());
     }
-    run(
-        "time::a_simulation_ends_at_its_time_limit_in_any_state",
-        time::a_simulation_ends_at_its_time_limit_in_any_state,
-    );
-    run(
-        "time::who_is_away_at_the_time_limit_hears_it",
-        time::who_is_away_at_the_time_limit_hears_it,
-    );
-    run(
-        "panics::a_client_leaves_nothing_in_any_state",
-        panics::a_client_leaves_nothing_in_any_state,
-    );
-    run(
-        "panics::an_actor_that_must_live_ends_the_server",
-        panics::an_actor_that_must_live_ends_the_server,
-    );
+    let has_run = [
+        run(
+            "time::a_simulation_ends_at_its_time_limit_in_any_state",
+            time::a_simulation_ends_at_its_time_limit_in_any_state,
+        ),
+        run(
+            "time::who_is_away_at_the_time_limit_hears_it",
+            time::who_is_away_at_the_time_limit_hears_it,
+        ),
+        run(
+            "panics::a_client_leaves_nothing_in_any_state",
+            panics::a_client_leaves_nothing_in_any_state,
+        ),
+        run(
+            "panics::an_actor_that_must_live_ends_the_server",
+            panics::an_actor_that_must_live_ends_the_server,
+        ),
+    ];
+    if !has_run.contains(&true) {
+        eprintln!("no test has such a name: arguments are parts of names, or flags in one word, which are ignored");
+        std::process::exit(1);
+    }
 }
 
-/// Runs a test, unless the command line names only others.
-fn run<F: Future<Output = ()>>(name: &str, test: fn() -> F) {
+/// Runs a test, unless the command line names only others. Returns whether it has run.
+fn run<F: Future<Output = ()>>(name: &str, test: fn() -> F) -> bool {
     let mut wanted = std::env::args()
         .skip(1)
         .filter(|argument| !argument.starts_with('-'))
         .peekable();
-    if wanted.peek().is_none() || wanted.any(|part| name.contains(&part)) {
+    let is_wanted = wanted.peek().is_none() || wanted.any(|part| name.contains(&part));
+    if is_wanted {
         actix_rt::System::new().block_on(test());
         println!("test {name} ... ok");
     }
+    is_wanted
 }
