@@ -24,6 +24,32 @@ struct Made {
     objects: Vec<Value>,
 }
 
+#[test]
+fn no_autoscaler_ends_what_drains() {
+    for made in ALL.iter() {
+        for name in ["simulation", "door"] {
+            let deployment = made
+                .objects
+                .iter()
+                .find(|object| object["kind"] == "Deployment" && object["metadata"]["name"] == name)
+                .unwrap();
+            let annotations = &deployment["spec"]["template"]["metadata"]["annotations"];
+            let key = "cluster-autoscaler.kubernetes.io/safe-to-evict";
+            assert_eq!(annotations[key], "false", "{}: {name}", made.name);
+        }
+    }
+}
+
+#[test]
+fn the_logs_of_a_swarms_servers_are_limited() {
+    let stack = std::fs::read_to_string(project("deploy/swarm/stack.yml")).unwrap();
+    let stack: Value = serde_saphyr::from_str(&stack).unwrap();
+    for (name, service) in stack["services"].as_object().unwrap() {
+        assert_eq!(service["logging"]["driver"], "local", "{name}");
+        assert_eq!(service["logging"]["options"]["max-size"], "10m", "{name}");
+    }
+}
+
 /// The base, the overlays, and the base with all components. Empty, with a message, if kubectl is missing or too old.
 static ALL: LazyLock<Vec<Made>> = LazyLock::new(|| {
     needs!("kubectl", Vec::new());

@@ -10,4 +10,5 @@ mod packet_filter;
 mod ports;
 mod preflight;
 mod prometheus;
+mod release;
 mod scaling;
