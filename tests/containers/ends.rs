@@ -143,6 +143,9 @@ async fn a_start_that_docker_refuses_is_the_servers_fault() {
     let server = server(1).set("container", serde_json::json!({ "mounts": ["/nowhere/x:relative"] }));
     let server = server.start().await;
     let (told, code) = refused(&server, &arm()).await;
-    assert!(told.contains("failed:"), "{told}");
+    assert!(
+        told.contains("Docker can't start the containers of this simulation"),
+        "{told}"
+    );
     assert_eq!((code, &server.status().await["failedStarts"]), (Some(1013), &1.into()));
 }

@@ -1,8 +1,10 @@
 //! What a project tries with symlinks, memory, folders and devices in its images.
 
-use super::daemon::{as_ordinary, ask, docker, dockerfile, of_service, refused, running, server, server_built};
+use super::daemon::{
+    alone, as_ordinary, ask, check, docker, dockerfile, of_service, refused, running, server, server_built,
+};
 use super::image::NAME;
-use crate::support::{arm, arm_at, is_told};
+use crate::support::{Client, arm, arm_at, is_told};
 
 #[actix_rt::test]
 async fn a_link_in_an_image_leads_no_build_to_files_of_the_machine() {
@@ -76,4 +78,49 @@ async fn a_device_made_by_a_dockerfile_opens_nothing() {
             "{device}: {told}"
         );
     }
+}
+
+#[actix_rt::test]
+async fn what_a_dockerfile_prints_blames_neither_docker_nor_the_server() {
+    let Some(_docker) = docker().await else { return };
+    let server = server(1).start().await;
+    for sentence in [
+        "Cannot connect to the Docker daemon at unix:///var/run/docker.sock. Is the docker daemon running?",
+        "error during connect: this error may indicate that the docker daemon is not running",
+        "permission denied while trying to connect to the Docker daemon socket",
+        "Error response from daemon: manifest unknown",
+        "write /x: no space left on device",
+        "This simulation server has no Webots that it can run",
+        "all places on the grid are taken",
+        "Step 1/1 : FROM nothing",
+    ] {
+        let line = format!("RUN echo \"{sentence}\"; echo \"{sentence}\" >&2; exit 1 #{sentence}");
+        server
+            .forge()
+            .commit("lab/arm", "main", &[("Dockerfile", &dockerfile(&line))]);
+        let (told, code) = refused(&server, &arm()).await;
+        assert!(told.contains("The image of this project can't be built"), "{told}");
+        assert_eq!(code, Some(1000), "{told}");
+    }
+    assert_eq!(server.status().await["failedStarts"], 0);
+}
+
+#[actix_rt::test]
+async fn a_network_that_the_packet_filter_does_not_match_is_refused() {
+    let Some(_docker) = alone().await else { return };
+    let remove = || ask(&["network", "rm", "webots-fleet"]);
+    if ask(&["network", "ls", "--format", "{{.Name}}"]).contains("webots-fleet") {
+        remove();
+    }
+    ask(&["network", "create", "webots-fleet"]);
+    let server = server(1).start().await;
+    let (told, code) = refused(&server, &arm()).await;
+    let checked = check(&server);
+    // The other tests need the right one, whatever this one finds.
+    remove();
+    let words = "The Docker network webots-fleet on this simulation server has another interface";
+    assert!(told.contains(words) && told.contains("docker network rm"), "{told}");
+    assert_eq!(code, Some(1013));
+    assert!(checked.contains(&format!("warning: docker: {words}")), "{checked}");
+    Client::start(&server, &arm()).await.patiently("webots:").await;
 }

@@ -1,8 +1,11 @@
 //! The cache of repositories: its size limit, damage, and its owner.
 
-use std::path::Path;
+use std::fs::File;
+use std::os::unix::fs::{FileExt, PermissionsExt};
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use futures_util::future::join_all;
 use nix::sys::signal::Signal;
 
 use super::opened::{cached, reader, world_text};
@@ -106,15 +109,59 @@ async fn a_damaged_cache_heals() {
     }
 }
 
-fn cut_packs(repository: &Path) {
+fn packs(repository: &Path) -> Vec<PathBuf> {
     let files = std::fs::read_dir(repository.join("objects/pack"))
         .unwrap()
         .flatten()
         .map(|entry| entry.path());
-    for pack in files.filter(|path| path.extension().is_some_and(|extension| extension == "pack")) {
+    files
+        .filter(|path| path.extension().is_some_and(|extension| extension == "pack"))
+        .collect()
+}
+
+fn cut_packs(repository: &Path) {
+    for pack in packs(repository) {
         // Packs are read-only.
         std::fs::remove_file(&pack).unwrap();
         std::fs::write(&pack, "PACK").unwrap();
+    }
+}
+
+#[actix_rt::test]
+async fn a_damaged_repository_costs_a_class_nothing() {
+    let (forge, webots) = (Forge::with_arm(), reader());
+    forge.commit_noise("lab/arm", 4 << 20);
+    let server = simulation_server(&webots.path(), forge.path(), 30).start().await;
+    assert!(outcome(&server, &arm()).await.contains("opened"));
+    for pack in packs(&cached(&server)[0]) {
+        std::fs::set_permissions(&pack, std::fs::Permissions::from_mode(0o644)).unwrap();
+        let file = File::options().write(true).open(&pack).unwrap();
+        let middle = file.metadata().unwrap().len() / 2;
+        file.write_all_at(&[0xff; 1000], middle).unwrap();
+    }
+    let world = arm();
+    let class = join_all((0..30).map(|_| outcome(&server, &world))).await;
+    let failed: Vec<_> = class.iter().filter(|told| !told.contains("opened")).collect();
+    assert!(failed.is_empty(), "{} of 30: {failed:#?}", failed.len());
+    assert_eq!(cached(&server).len(), 1, "what was damaged is gone");
+}
+
+#[actix_rt::test]
+async fn a_lock_that_a_killed_git_has_left_does_not_stop_packing() {
+    let (forge, webots, folder) = (Forge::with_arm(), reader(), tempfile::tempdir().unwrap());
+    let settings = folder.path().join("gitconfig");
+    std::fs::write(&settings, "[gc]\n\tautoPackLimit = 2\n").unwrap();
+    let builder = simulation_server(&webots.path(), forge.path(), 1);
+    let server = builder.set("gitConfig", settings.to_str().unwrap()).start().await;
+    assert!(outcome(&server, &arm()).await.contains("opened"));
+    let repository = &cached(&server)[0];
+    for lock in ["packed-refs.lock", "gc.pid.lock"] {
+        std::fs::write(repository.join(lock), "").unwrap();
+        for _ in 0..4 {
+            forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text(lock))]);
+            assert!(outcome(&server, &arm()).await.contains(&format!("opened [{lock}]")));
+        }
+        until("it is packed", async || packs(repository).len() <= 2).await;
     }
 }
 

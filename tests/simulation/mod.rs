@@ -5,6 +5,7 @@ mod checkout;
 mod commits;
 pub mod ends;
 mod fetching;
+mod hostile;
 mod https;
 mod idleness;
 mod large_files;

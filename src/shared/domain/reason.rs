@@ -128,14 +128,20 @@ reasons! {
         ProjectTooLarge = "project-too-large", Project, No;
         /// The checkout has taken longer than it may (`timing.checkout`).
         CheckoutTimeout = "checkout-timeout", Project, Later;
-        /// The Git host does not answer, or answers with an error.
+        /// The Git host answers with an error, or breaks off.
         RemoteFailed = "remote-failed", Project, Later;
+        /// The Git host can't be reached from this server: its name, the network, or the certificate.
+        RemoteUnreachable = "remote-unreachable", Server, Elsewhere;
         /// The project's `webots.yml` or another of its files can't be used.
         InvalidProject = "invalid-project", Project, No;
         /// The image of the project could not be built.
         BuildFailed = "build-failed", Project, No;
         /// The build of the project's image has taken longer than it may (`timing.build`).
         BuildTimeout = "build-timeout", Project, No;
+        /// There is no image for the world's version of Webots.
+        ImageNotFound = "image-not-found", Project, No;
+        /// Images of other projects were being built for as long as a build may take (`timing.build`).
+        BuildersBusy = "builders-busy", Fleet, Later;
         /// The image of the project is larger than it may be, or its build has filled the disk.
         ImageTooLarge = "image-too-large", Project, No;
         /// Webots has listened, and has ended before its world was ready.

@@ -11,14 +11,14 @@ use tokio::runtime::Handle;
 use tokio::sync::Semaphore;
 use tokio_util::task::AbortOnDropHandle;
 
-use super::checkout_error::{Cause, CheckoutError, refused};
 use super::commit_resolver::CommitResolver;
-use super::git::Git;
+use super::git::{Git, timed_out};
 use super::project::Project;
+use super::repository::{CheckoutError, Unreadable, failed};
 use super::repository_cache::{CacheDir, RepositoryCache};
 use super::single_flight::SharedProgress;
 use super::{file_restore, redirect, steps, work_tree};
-use crate::shared::domain::{AdmissionRules, ProjectUrl};
+use crate::shared::domain::{AdmissionRules, Failure, ProjectUrl, Reason};
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::process::{InstanceDir, on_own_thread};
 
@@ -45,7 +45,8 @@ impl CheckoutService {
         let git = Arc::new(Git::new(run, Arc::clone(&config)));
         let cache = Arc::new(RepositoryCache::open(dir, git)?);
         let resolver = Arc::new(CommitResolver::new(Arc::clone(&cache), Arc::clone(&config), rules));
-        let (runtime, copies) = (Handle::current(), Semaphore::new(COPIES));
+        let runtime = Handle::current();
+        let copies = Semaphore::new(COPIES);
         let keeper = AbortOnDropHandle::new(runtime.spawn(cache.keep_within_budget()));
         Ok(Self {
             resolver,
@@ -62,12 +63,13 @@ impl CheckoutService {
         world: ProjectUrl,
         instance: InstanceDir,
         progress: SharedProgress,
-    ) -> AbortOnDropHandle<Result<Project, CheckoutError>> {
+    ) -> AbortOnDropHandle<Result<Project, Failure>> {
         let this = Arc::clone(self);
         let job = async move {
-            let (mut world, limit) = (world, this.config.timing.checkout);
+            let mut world = world;
+            let limit = this.config.timing.checkout;
             let done = actix_rt::time::timeout(limit, this.check_out(&mut world, instance, &progress)).await;
-            let done = done.unwrap_or_else(|_| Err(CheckoutError::new(Cause::Slow(limit), "")));
+            let done = done.unwrap_or_else(|_| Err(CheckoutError::OfRepository(timed_out(limit))));
             done.map_err(|error| error.about(&world))
         };
         AbortOnDropHandle::new(self.runtime.spawn(job))
@@ -81,16 +83,16 @@ impl CheckoutService {
         progress: &SharedProgress,
     ) -> Result<Project, CheckoutError> {
         let instance = Arc::new(instance);
-        let (mut redirects, mut is_mended) = (0, false);
+        let mut redirects = 0;
+        let mut mended = None;
         let project = loop {
             match self.attempt(world, &instance, progress).await {
-                Err(error) if error.cause == Cause::Moved && redirects < redirect::MAX_REDIRECTS => {
+                Err(CheckoutError::Moved(location)) if redirects < redirect::MAX_REDIRECTS => {
                     redirects += 1;
-                    *world = self.resolver.moved(world).await?;
+                    *world = self.resolver.moved(world, location.as_deref())?;
                 }
-                Err(error) if error.cause == Cause::Damaged && !is_mended => {
-                    is_mended = true;
-                    self.resolver.discard(world, &error).await?;
+                Err(CheckoutError::Unreadable(unreadable)) if is_worth_another(&unreadable, mended) => {
+                    mended = Some(discard(&unreadable).await?);
                 }
                 done => break done?,
             }
@@ -109,8 +111,11 @@ impl CheckoutService {
         let found = self.resolver.resolve(world, &**progress).await?;
         // The semaphore is never closed.
         let _turn = self.copies.acquire().await.ok();
-        let (wanted, instance, progress) = (world.clone(), Arc::clone(instance), Arc::clone(progress));
-        let (limit, name) = (self.config.project_size, found.revision.name.clone());
+        let wanted = world.clone();
+        let instance = Arc::clone(instance);
+        let progress = Arc::clone(progress);
+        let limit = self.config.project_size;
+        let name = found.revision.name.clone();
         let copy = async move || {
             progress(steps::checking_out(&name, ""));
             let on_line = |line: &str| {
@@ -127,23 +132,45 @@ impl CheckoutService {
     ///
     /// # Errors
     /// When the checkout has no such file, or git fails.
-    pub async fn restore_controller(&self, project: &Project, file: &str) -> Result<(), CheckoutError> {
+    pub async fn restore_controller(&self, project: &Project, file: &str) -> Result<(), Failure> {
         let mut restored = self.restore(project, file).await;
-        if let Err(error) = &restored
-            && error.cause == Cause::Damaged
-        {
-            self.resolver.discard(&project.url, error).await?;
-            restored = self.restore(project, file).await;
+        if let Err(CheckoutError::Unreadable(unreadable)) = &restored {
+            restored = match discard(unreadable).await {
+                Ok(_) => self.restore(project, file).await,
+                Err(error) => Err(error.into()),
+            };
         }
         restored.map_err(|error| error.about(&project.url))
     }
 
     async fn restore(&self, project: &Project, file: &str) -> Result<(), CheckoutError> {
         let Project { url, revision, .. } = project;
-        let none = || refused(format!("{file:?} is no file below the project's controllers folder"));
+        let none = || {
+            let message = format!("{file:?} is no file below the project's controllers folder");
+            failed(Reason::NothingToReset, message)
+        };
         let path = file_restore::controller(revision, file).ok_or_else(none)?;
-        let repository = self.resolver.file(url, revision, &path).await?.ok_or_else(none)?;
-        let is_there = file_restore::restore(&repository, project, &path).await?;
+        let found = self.resolver.file(url, revision, &path).await?;
+        let (repository, generation) = found.ok_or_else(none)?;
+        let is_there = file_restore::restore(&repository, generation, project, &path).await?;
         is_there.then_some(()).ok_or_else(none)
     }
+}
+
+/// Whether another attempt can succeed: nobody has fetched this repository anew since it was read, or this client has
+/// not, as `mended`, its last new generation, shows. What can't be read in a new generation is the project's own content.
+fn is_worth_another(unreadable: &Unreadable, mended: Option<u64>) -> bool {
+    mended.is_none_or(|mended| unreadable.generation < mended)
+}
+
+/// Discards the generation of a repository that can't be read. Returns the generation that is in use then.
+async fn discard(unreadable: &Unreadable) -> io::Result<u64> {
+    let Unreadable {
+        repository,
+        generation,
+        failure,
+    } = unreadable;
+    let output = failure.output.as_deref().unwrap_or_default();
+    log::warn!("{repository:?} {failure}: {output}. It is fetched anew");
+    repository.discard(*generation).await
 }

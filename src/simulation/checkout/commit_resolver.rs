@@ -6,13 +6,13 @@ use std::sync::Arc;
 use parking_lot::Mutex;
 use tokio::sync::watch;
 
-use super::checkout_error::{Cause, CheckoutError, refused};
-use super::repository::Repository;
+use super::git::GitError;
+use super::repository::{CheckoutError, Repository, failed};
 use super::repository_cache::{COMMITS, HISTORY, RepositoryCache};
 use super::revision::{self, Revision, TrustSource};
 use super::single_flight::{OnProgress, SingleFlight};
 use super::{redirect, steps};
-use crate::shared::domain::{AdmissionRules, ProjectUrl};
+use crate::shared::domain::{AdmissionRules, ProjectUrl, Reason};
 use crate::simulation::config::{Remote, SimulationConfig};
 
 /// Resolves commits; one for the whole server.
@@ -30,6 +30,8 @@ pub struct CommitResolver {
 pub struct ResolvedCommit {
     /// The repository that contains it.
     pub repository: Arc<Repository>,
+    /// The generation of the repository that contains it.
+    pub generation: u64,
     /// The commit and the project's directory in it.
     pub revision: Revision,
     /// The files of the directories above the project's, each path ended by a zero byte: worlds may refer to them.
@@ -77,9 +79,9 @@ impl CommitResolver {
     ///
     /// # Errors
     /// When the redirect may not be followed.
-    pub async fn moved(&self, world: &ProjectUrl) -> Result<ProjectUrl, CheckoutError> {
-        let repository = self.repository(world, COMMITS).await?;
-        let (moved, remote) = redirect::follow(&repository, (&self.config.git_mirrors, &self.rules), world).await?;
+    pub fn moved(&self, world: &ProjectUrl, location: Option<&str>) -> Result<ProjectUrl, CheckoutError> {
+        let (moved, remote) = redirect::follow(location, (&self.config.git_mirrors, &self.rules), world)
+            .map_err(CheckoutError::Failed)?;
         self.redirected.lock().insert(remote.key(), remote);
         Ok(moved)
     }
@@ -103,19 +105,23 @@ impl CommitResolver {
             repository: &repository,
             progress: &progress,
         };
-        let mut missing = CheckoutError::new(Cause::NoCommit, "");
+        let mut missing = CheckoutError::NoCommit;
         for revision in revisions {
             let path = revision.path_of(&format!("worlds/{}", world.world()));
             match search.read(&revision, &path).await {
-                Ok(Some(above)) => {
+                Ok(Some((generation, above))) => {
                     return Ok(ResolvedCommit {
                         repository,
+                        generation,
                         revision,
                         above,
                     });
                 }
-                Ok(None) => missing = refused(format!("{path} in {} does not exist", revision.name)),
-                Err(error) if error.cause == Cause::NoCommit => {}
+                Ok(None) => {
+                    let message = format!("{path} in {} does not exist", revision.name);
+                    missing = failed(Reason::WorldNotFound, message);
+                }
+                Err(CheckoutError::NoCommit) => {}
                 Err(error) => return Err(error),
             }
         }
@@ -125,18 +131,19 @@ impl CommitResolver {
     /// The cached repository of a world with this content.
     async fn repository(&self, world: &ProjectUrl, content: &str) -> Result<Arc<Repository>, CheckoutError> {
         let remote = self.config.git_mirrors.remote(world).ok_or_else(|| {
-            refused(format!(
+            let message = format!(
                 "This simulation server takes worlds from github.com and from the mirrors that it is configured with, \
                  not from {}",
                 world.host()
-            ))
+            );
+            failed(Reason::RepositoryNotAllowed, message)
         })?;
         let remote = self.redirected.lock().get(&remote.key()).cloned().unwrap_or(remote);
         Ok(self.cache.repository(&remote, content).await?)
     }
 
     /// Checks that a file exists at a path of a commit that was found before. The commit is fetched again if it was
-    /// evicted from the cache. Returns the repository if the file exists.
+    /// evicted from the cache. Returns the repository and its generation if the file exists.
     ///
     /// # Errors
     /// When the commit can't be read.
@@ -145,7 +152,7 @@ impl CommitResolver {
         world: &ProjectUrl,
         revision: &Revision,
         path: &str,
-    ) -> Result<Option<Arc<Repository>>, CheckoutError> {
+    ) -> Result<Option<(Arc<Repository>, u64)>, CheckoutError> {
         let repository = self.repository(world, COMMITS).await?;
         let search = Search {
             resolver: self,
@@ -153,28 +160,19 @@ impl CommitResolver {
             repository: &repository,
             progress: &drop,
         };
-        Ok(search.read(revision, path).await?.map(|_| repository))
-    }
-
-    /// Discards the cached repositories of a world, one of which is corrupt.
-    ///
-    /// # Errors
-    /// When one can't be removed.
-    pub async fn discard(&self, world: &ProjectUrl, failure: &CheckoutError) -> Result<(), CheckoutError> {
-        log::warn!("{world}: {failure}. The cached repository is broken: it is fetched anew");
-        for content in [COMMITS, HISTORY] {
-            self.repository(world, content).await?.discard().await?;
-        }
-        Ok(())
+        let found = search.read(revision, path).await?;
+        Ok(found.map(|(generation, _)| (repository, generation)))
     }
 }
 
 impl Search<'_> {
-    /// Fetches a commit unless it is cached. If it has a file at `path`, returns the files of the directories above the
-    /// project's, each path ended by a zero byte.
-    async fn read(self, revision: &Revision, path: &str) -> Result<Option<Vec<u8>>, CheckoutError> {
-        let (repository, reference) = (self.repository, revision.reference());
+    /// Fetches a commit unless it is cached. If it has a file at `path`, returns the generation of the repository that
+    /// contains it, and the files of the directories above the project's, each path ended by a zero byte.
+    async fn read(self, revision: &Revision, path: &str) -> Result<Option<(u64, Vec<u8>)>, CheckoutError> {
+        let repository = self.repository;
+        let reference = revision.reference();
         let arguments = revision.list_arguments(path);
+        let mut generation = repository.generation();
         let mut listed = repository.read(&arguments).await;
         if listed.is_err()
             && repository
@@ -183,16 +181,19 @@ impl Search<'_> {
                 .is_err()
         {
             self.fetch_commit(revision).await?;
+            generation = repository.generation();
             listed = repository.read(&arguments).await;
         }
         match listed {
-            Ok(answer) => Ok(revision.files_above(&answer, path)),
-            Err(error) if matches!(error.cause, Cause::Machine | Cause::Slow(_) | Cause::TooLarge) => Err(error),
+            Ok(answer) => Ok(revision.files_above(&answer, path).map(|above| (generation, above))),
+            Err(error @ GitError::NotRun(_)) => Err(repository.unreadable(generation, error).await),
             Err(error) => {
                 let kind = repository.read(&["cat-file", "-t", &format!("{reference}^{{}}")]).await;
-                let is_file = kind.is_ok_and(|kind| kind.starts_with(b"blob"));
-                let cause = if is_file { Cause::NoCommit } else { Cause::Damaged };
-                Err(CheckoutError::new(cause, error.to_string()))
+                if kind.is_ok_and(|kind| kind.starts_with(b"blob")) {
+                    Err(CheckoutError::NoCommit)
+                } else {
+                    Err(repository.unreadable(generation, error).await)
+                }
             }
         }
     }
@@ -201,13 +202,19 @@ impl Search<'_> {
     async fn fetch_commit(self, revision: &Revision) -> Result<(), CheckoutError> {
         let name = self.world.repository();
         if revision.trust == TrustSource::Url && !self.is_accepted(&revision.commit).await? {
-            return Err(refused(format!(
+            let message = format!(
                 "{} is in no branch or tag of {name}. Git hosts also hand out commits that a repository's owner never \
                  accepted; this simulation server runs them only if its administrator sets anyCommit",
                 revision.name
-            )));
+            );
+            return Err(failed(Reason::CommitNotFound, message));
         }
-        self.fetch(self.repository, revision.fetch_arguments(), &name).await
+        let fetched = self.fetch(self.repository, revision.fetch_arguments(), &name).await;
+        match fetched {
+            // The remote has reported the tip of a branch itself, but only the URL names this commit.
+            Err(CheckoutError::NotServed(_)) if revision.trust != TrustSource::Tip => Err(CheckoutError::NoCommit),
+            fetched => fetched,
+        }
     }
 
     /// Whether a commit that is named by its hash is in a branch or tag. The history is fetched unless it is cached.
@@ -233,20 +240,13 @@ impl Search<'_> {
     /// Fetches into a repository. `name` is for the client.
     async fn fetch(self, into: &Arc<Repository>, arguments: Vec<String>, name: &str) -> Result<(), CheckoutError> {
         let on_line = |line: String| (self.progress)(steps::fetching(name, &line));
-        into.fetch(arguments, &on_line)
-            .await
-            .map_err(|error| match error.cause {
-                Cause::TooLarge => refused(format!(
-                    "{name} is larger than {} MiB",
-                    self.resolver.config.project_size
-                )),
-                _ => error,
-            })
+        into.fetch(arguments, &on_line).await
     }
 }
 
 /// Whether a commit is part of a branch or tag of a history.
-async fn is_reachable(history: &Repository, commit: &str) -> Result<bool, CheckoutError> {
+async fn is_reachable(history: &Arc<Repository>, commit: &str) -> Result<bool, CheckoutError> {
+    let generation = history.generation();
     if history.read(&["cat-file", "-e", commit]).await.is_err() {
         return Ok(false);
     }
@@ -258,5 +258,8 @@ async fn is_reachable(history: &Repository, commit: &str) -> Result<bool, Checko
         "refs/heads",
         "refs/tags",
     ];
-    Ok(!history.read(&branches).await?.is_empty())
+    match history.read(&branches).await {
+        Ok(names) => Ok(!names.is_empty()),
+        Err(error) => Err(history.unreadable(generation, error).await),
+    }
 }

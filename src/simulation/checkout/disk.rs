@@ -9,6 +9,9 @@ use crate::simulation::process::disk_usage::{self, DiskUsage};
 /// Interval between two checks of the written size.
 const CHECK_INTERVAL: Duration = Duration::from_millis(500);
 
+/// Locks that a killed git leaves. With the first two every later fetch fails, with the others every packing.
+const LOCKS: [&str; 4] = ["shallow.lock", "config.lock", "packed-refs.lock", "gc.pid.lock"];
+
 /// Runs blocking file I/O on the blocking thread pool.
 ///
 /// # Errors
@@ -17,20 +20,27 @@ pub async fn blocking<T: Send + 'static>(work: impl FnOnce() -> io::Result<T> + 
     actix_rt::task::spawn_blocking(work).await?
 }
 
-/// Removes what a killed git has left: locks that would make every later fetch fail, and incomplete packs.
+/// Whether a pack in the repository is incomplete and at least this large, in bytes.
+pub fn has_unfinished_pack(repository: &Path, size: u64) -> bool {
+    unfinished_packs(repository).any(|pack| pack.metadata().is_ok_and(|about| about.len() >= size))
+}
+
+/// Removes what a killed git has left: locks, and incomplete packs. No other git changes the repository meanwhile.
 pub fn remove_leftovers(repository: &Path) {
-    let is_unfinished = |name: &[u8]| name.starts_with(b"tmp_") || name.starts_with(b".tmp-");
-    let packs = fs::read_dir(repository.join("objects/pack"))
-        .into_iter()
-        .flatten()
-        .flatten();
-    let unfinished = packs
-        .filter(|pack| is_unfinished(pack.file_name().as_encoded_bytes()))
-        .map(|pack| pack.path());
-    for path in unfinished.chain(["shallow.lock", "config.lock"].map(|name| repository.join(name))) {
+    let locks = LOCKS.map(|name| repository.join(name));
+    for path in unfinished_packs(repository).chain(locks) {
         // If one can't be removed, the fetch fails.
         fs::remove_file(path).ok();
     }
+}
+
+fn unfinished_packs(repository: &Path) -> impl Iterator<Item = PathBuf> {
+    let is_unfinished = |name: &[u8]| name.starts_with(b"tmp_") || name.starts_with(b".tmp-");
+    let packs = fs::read_dir(repository.join("objects/pack")).into_iter().flatten();
+    packs
+        .flatten()
+        .filter(move |pack| is_unfinished(pack.file_name().as_encoded_bytes()))
+        .map(|pack| pack.path())
 }
 
 /// Waits until one of the directories exceeds its limit, in bytes, or contains a directory that can't be read.

@@ -6,12 +6,12 @@
 //! resolves without symlinks.
 
 use std::fs::File;
+use std::sync::Arc;
 
 use nix::fcntl::{AT_FDCWD, OFlag, OpenHow, ResolveFlag, openat2, renameat};
 
-use super::checkout_error::CheckoutError;
 use super::project::Project;
-use super::repository::Repository;
+use super::repository::{CheckoutError, Repository};
 use super::revision::Revision;
 use super::work_tree::checkout_command;
 
@@ -26,7 +26,12 @@ pub fn controller(revision: &Revision, file: &str) -> Option<String> {
 ///
 /// # Errors
 /// When git or the disk fails.
-pub async fn restore(repository: &Repository, project: &Project, path: &str) -> Result<bool, CheckoutError> {
+pub async fn restore(
+    repository: &Arc<Repository>,
+    generation: u64,
+    project: &Project,
+    path: &str,
+) -> Result<bool, CheckoutError> {
     let scratch = tempfile::Builder::new()
         .prefix("restored-")
         .tempdir_in(project.instance.path())?;
@@ -34,7 +39,9 @@ pub async fn restore(repository: &Repository, project: &Project, path: &str) -> 
     std::fs::create_dir(&files)?;
     let paths = [path.as_bytes(), b"\0"].concat();
     let call = checkout_command(repository, &project.revision, &paths, (scratch.path(), &files), &[])?;
-    repository.git.run(call, |_| ()).await?;
+    if let Err(error) = repository.git.run(call, |_| ()).await {
+        return Err(repository.unreadable(generation, error).await);
+    }
     let (above, name) = path.rsplit_once('/').unwrap_or((".", path));
     let how = OpenHow::new().flags(OFlag::O_PATH | OFlag::O_DIRECTORY | OFlag::O_CLOEXEC);
     let how = how.resolve(ResolveFlag::RESOLVE_BENEATH | ResolveFlag::RESOLVE_NO_SYMLINKS);

@@ -7,10 +7,12 @@ use std::time::Duration;
 
 use rustix::process::Resource;
 
-use super::checkout_error::{Cause, CheckoutError};
+use super::disk::blocking;
+use super::http_trace::traced;
 use crate::shared::config::ExpandedPath;
+use crate::shared::domain::{Failure, Reason};
 use crate::simulation::config::SimulationConfig;
-use crate::simulation::process::{ExitReason, Ran, Run};
+use crate::simulation::process::{ExitReason, Ran, Run, RunError, disk_fault, own_call_failed, start_fault};
 
 /// Runs git with this server's settings.
 pub struct Git {
@@ -19,6 +21,41 @@ pub struct Git {
     mark: PathBuf,
     /// The configuration.
     pub config: Arc<SimulationConfig>,
+}
+
+/// Why a git command has failed. The name of its repository comes before the messages.
+#[derive(Debug)]
+pub enum GitError {
+    /// It was not run to its end, for this reason.
+    NotRun(Failure),
+    /// It has ended with another exit code than 0, or by a signal. git's exit codes do not depend on the cause.
+    Ended(GitExit),
+}
+
+/// The end of a git command that has failed.
+#[derive(Debug)]
+pub struct GitExit {
+    command: String,
+    ending: ExitReason,
+    /// The line about the cause.
+    output: String,
+}
+
+impl GitExit {
+    /// Whether a signal has ended it.
+    pub fn is_signal(&self) -> bool {
+        matches!(self.ending, ExitReason::Signal(_))
+    }
+
+    /// It as a failure for this reason.
+    pub fn failure(self, reason: Reason) -> Failure {
+        let Self {
+            command,
+            ending,
+            output,
+        } = self;
+        Failure::new(reason, format!("can't be checked out: git {command} {ending}")).with_output(output)
+    }
 }
 
 /// git reads this instead of the settings of the server's user, because a world's program could have written those. The
@@ -30,6 +67,8 @@ const SETTINGS: &str = include_str!("gitconfig");
 
 /// The last option before the command.
 const GIT_DIR: &str = "--git-dir=";
+/// The name of a directory that does not exist.
+const NO_REPOSITORY: &str = "none";
 /// Memory limit of a query of a remote (enough for a million branches) or a checkout, in bytes, without mapped files.
 pub const LITTLE_MEMORY: u64 = 512 << 20;
 /// Largest memory limit of a git process, in bytes.
@@ -109,7 +148,7 @@ impl Git {
     ///
     /// # Errors
     /// When git can't be started, fails, or takes too long.
-    pub async fn run(&self, mut run: Run, mut progress: impl FnMut(&str)) -> Result<Vec<u8>, CheckoutError> {
+    pub async fn run(&self, mut run: Run, mut progress: impl FnMut(&str)) -> Result<Vec<u8>, GitError> {
         let words = run.spec.command.iter().map(|word| word.to_string_lossy());
         let command = words
             .skip_while(|word| !word.starts_with(GIT_DIR))
@@ -117,12 +156,13 @@ impl Git {
             .unwrap_or_default()
             .into_owned();
         run.niceness = if HEAVY.contains(&command.as_str()) { NICENESS } else { 0 };
-        self.write_settings()?;
-        let mut cause = String::new();
+        self.write_settings()
+            .map_err(|error| GitError::NotRun(not_started(&error.kind().to_string())))?;
+        let mut output = String::new();
         let on_line = |line: String| {
             progress(&line);
-            if weight(&line) > weight(&cause) || weight(&cause) == 0 {
-                cause = line;
+            if traced(&line).is_none() && (weight(&line) > weight(&output) || weight(&output) == 0) {
+                output = line;
             }
         };
         match run.run(on_line).await {
@@ -130,14 +170,62 @@ impl Git {
                 ending: ExitReason::Code(0),
                 answer,
             }) => Ok(answer),
-            Ok(Ran {
-                ending: ExitReason::NotStarted,
-                ..
-            }) => Err(CheckoutError::new(Cause::Machine, cause)),
-            Ok(Ran { ending, .. }) => Err(CheckoutError::ended(&command, ending, &cause)),
-            Err(error) => Err(CheckoutError::not_ended(&command, &error)),
+            Ok(Ran { ending, .. }) if ending != ExitReason::NotStarted => Err(GitError::Ended(GitExit {
+                command,
+                ending,
+                output,
+            })),
+            Ok(_) => Err(GitError::NotRun(not_started("it is not there"))),
+            Err(error) => Err(GitError::NotRun(not_run(&command, &error))),
         }
     }
+
+    /// Why this server's git, or its disk, does not work at this moment; `None` if both do.
+    pub async fn machine_fault(&self) -> Option<Failure> {
+        let folder = self.mark.clone();
+        let reserve = self.config.disk_reserve;
+        let look = move || Ok(disk_fault(&folder, reserve).or_else(|| start_fault("git")));
+        blocking(look)
+            .await
+            .unwrap_or_else(|error| Some(own_call_failed(&error)))
+    }
+
+    /// A command that only queries a remote. It has no repository, so that it works if the cached one is damaged.
+    pub fn query(&self, protocol: &str, settings: &[String], arguments: &[impl AsRef<OsStr>]) -> Run {
+        self.command((&self.mark.join(NO_REPOSITORY), protocol), settings, arguments)
+    }
+
+    /// An empty directory beside the cache, for a repository.
+    ///
+    /// # Errors
+    /// When it can't be created.
+    pub fn scratch(&self) -> std::io::Result<tempfile::TempDir> {
+        std::fs::create_dir_all(&self.mark)?;
+        tempfile::Builder::new().prefix("repository-").tempdir_in(&self.mark)
+    }
+}
+
+/// Why a command has not ended by itself.
+fn not_run(command: &str, error: &RunError) -> Failure {
+    match error {
+        RunError::NotStarted(error) => not_started(&error.kind().to_string()),
+        RunError::Slow(limit) => timed_out(*limit),
+        RunError::TooLong => Failure::new(
+            Reason::ProjectTooLarge,
+            format!("can't be checked out: git {command} has answered too much"),
+        ),
+    }
+}
+
+fn not_started(why: &str) -> Failure {
+    let message = format!("can't be checked out: this simulation server can't start git: {why}");
+    Failure::new(Reason::ServerFault, message)
+}
+
+/// A checkout, or a command of one, took longer than this. `Fetching` and the name of the repository come before.
+pub fn timed_out(limit: Duration) -> Failure {
+    let message = format!("took longer than {} seconds", limit.as_secs());
+    Failure::new(Reason::CheckoutTimeout, message)
 }
 
 /// Timeout of a remote that sends nothing, and of packing a cached repository, for which the next fetch waits.

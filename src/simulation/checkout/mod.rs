@@ -2,12 +2,12 @@
 //!
 //! For git's settings see [`git`].
 
-mod checkout_error;
 mod checkout_service;
 mod commit_resolver;
 mod disk;
 mod file_restore;
 mod git;
+mod http_trace;
 mod project;
 mod redirect;
 mod repository;
@@ -17,7 +17,6 @@ mod single_flight;
 mod steps;
 mod work_tree;
 
-pub use checkout_error::CheckoutError;
 pub use checkout_service::CheckoutService;
 pub use disk::outgrown;
 pub use project::Project;

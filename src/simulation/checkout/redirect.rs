@@ -1,14 +1,12 @@
 //! Repositories that have moved: redirects are followed within their Git host, and only to repositories that the lists
 //! allow.
 //!
-//! Redirects are off in git. On a redirect, a traced `git ls-remote` yields the `Location` header, and the world is
-//! resolved there, so that the lists, and git's settings for proxies, certificates and passwords, apply to each step.
+//! Redirects are off in git. On a redirect, git's trace has the `Location` header, and the world is resolved there, so that
+//! the lists, and git's settings for proxies, certificates and passwords, apply to each step. Pure.
 
 use url::Url;
 
-use super::checkout_error::{CheckoutError, refused};
-use super::repository::{REMOTE, Repository};
-use crate::shared::domain::{AdmissionRules, Load, ProjectUrl};
+use crate::shared::domain::{AdmissionRules, Failure, Load, ProjectUrl, Reason};
 use crate::simulation::config::{Mirrors, Remote};
 
 /// Limit of redirects for a world.
@@ -18,38 +16,21 @@ pub const MAX_REDIRECTS: usize = 5;
 ///
 /// # Errors
 /// When the redirect may not be followed.
-pub async fn follow(
-    repository: &Repository,
+pub fn follow(
+    location: Option<&str>,
     (mirrors, rules): (&Mirrors, &AdmissionRules),
     world: &ProjectUrl,
-) -> Result<(ProjectUrl, Remote), CheckoutError> {
-    let target = match location(repository).await {
-        Some(location) => target(mirrors, rules, world, &location),
+) -> Result<(ProjectUrl, Remote), Failure> {
+    let target = match location {
+        Some(location) => target(mirrors, rules, world, location),
         None => Err("to where its Git host does not say".to_owned()),
     };
-    let target = target.map_err(|why| refused(format!("{} has moved {why}", world.repository())))?;
+    let target = target.map_err(|why| {
+        let message = format!("{} has moved {why}", world.repository());
+        Failure::new(Reason::RepositoryMoved, message)
+    })?;
     log::info!("{} is at {}", world.repository(), target.1.location);
     Ok(target)
-}
-
-/// The `Location` to which a Git host redirects requests for a repository.
-async fn location(repository: &Repository) -> Option<String> {
-    let mut location = None;
-    let on_line = |line: &str| {
-        let header = line
-            .split_once("Recv header: ")
-            .and_then(|(_, header)| header.split_once(": "));
-        let header = header.filter(|(name, _)| name.eq_ignore_ascii_case("location"));
-        location = header.map(|(_, value)| value.to_owned()).or(location.take());
-    };
-    let mut call = repository.call(&["ls-remote", "--quiet", "--", REMOTE, "HEAD"]);
-    let trace = ["GIT_TRACE_CURL", "GIT_TRACE_CURL_NO_DATA"];
-    call.spec
-        .environment
-        .extend(trace.map(|name| (name.into(), "1".into())));
-    // It fails again, because redirects are off.
-    repository.git.run(call, on_line).await.ok();
-    location
 }
 
 /// The world in the repository at this location, or why the redirect is not followed, as text for the client.

@@ -9,14 +9,13 @@ use std::sync::atomic::Ordering::Relaxed;
 use rustix::process::Resource;
 use which::which;
 
-use super::checkout_error::{CheckoutError, refused};
 use super::commit_resolver::ResolvedCommit;
 use super::disk;
 use super::git::LITTLE_MEMORY;
 use super::project::{Project, WorldFile};
-use super::repository::{REMOTE, Repository};
+use super::repository::{CheckoutError, REMOTE, Repository, failed};
 use super::revision::Revision;
-use crate::shared::domain::ProjectUrl;
+use crate::shared::domain::{ProjectUrl, Reason};
 use crate::simulation::config::Remote;
 use crate::simulation::process::{InstanceDir, Run};
 
@@ -69,6 +68,7 @@ pub async fn write(
 ) -> Result<Project, CheckoutError> {
     let ResolvedCommit {
         repository,
+        generation,
         revision,
         above,
     } = found;
@@ -78,7 +78,8 @@ pub async fn write(
         &revision.folder
     };
     let paths = [folder.as_bytes(), b"\0", above].concat();
-    let (root, most) = (instance.project(), limit << 20);
+    let root = instance.project();
+    let most = limit << 20;
     let settings = if which("git-lfs").is_ok() {
         lfs_settings(&repository.remote.lock())
     } else {
@@ -94,23 +95,27 @@ pub async fn write(
         (kept.clone(), before.saturating_add(most.saturating_mul(2))),
     ];
     let written = tokio::select! {
-        written = repository.git.run(call, on_line) => written.map(|_| true),
-        () = disk::outgrown(growing) => Ok(false),
+        written = repository.git.run(call, on_line) => match written {
+            Ok(_) => true,
+            Err(error) => return Err(repository.unreadable(*generation, error).await),
+        },
+        () = disk::outgrown(growing) => false,
     };
     if disk::room_of(&kept) > before {
         repository.has_grown.store(true, Relaxed);
     }
     let size = disk::room_of(&root);
     // git's attributes may make it larger than the commit, and a Git host may send more than it should.
-    if !written? || size > most {
-        return Err(refused(format!("The project is larger than {limit} MiB")));
+    if !written || size > most {
+        let message = format!("The project is larger than {limit} MiB");
+        return Err(failed(Reason::ProjectTooLarge, message));
     }
     Ok(Project {
         world: WorldFile::open(
             &root,
             &root.join(revision.path_of(&format!("worlds/{}", world.world()))),
         )
-        .map_err(refused)?,
+        .map_err(|why| failed(Reason::WorldNotFound, why))?,
         size,
         url: world.clone(),
         revision: revision.clone(),

@@ -264,10 +264,7 @@ impl Session {
             match restored {
                 Ok(file) => this.text(protocol::reset_controller(&file)),
                 // This error does not end the simulation.
-                Err(error) => {
-                    let failure = Failure::new(Reason::NothingToReset, error.to_string());
-                    this.texts(protocol::failure(&failure));
-                }
+                Err(failure) => this.texts(protocol::failure(&failure)),
             }
         });
         restored.spawn(ctx);

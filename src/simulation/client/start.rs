@@ -73,7 +73,7 @@ impl Session {
         job.into_actor(self)
             .map(|result, this, ctx| match result {
                 Ok(Ok(project)) => this.launch(project, ctx),
-                Ok(Err(error)) => this.fail(error.into(), ctx),
+                Ok(Err(error)) => this.fail(error, ctx),
                 Err(error) => {
                     let message = format!("The checkout broke off: {error}");
                     this.fail(Failure::new(Reason::ServerFault, message), ctx);

@@ -7,11 +7,13 @@ use std::path::{Path, PathBuf};
 
 use nix::fcntl::OFlag;
 
-use super::docker::StartError;
 use super::dockerfile::Dockerfile;
+use super::failures::of_project;
 use super::webots_yml::{ProjectKind, WebotsYml, text_of};
+use crate::shared::domain::Failure;
 use crate::shared::text::one_line;
 use crate::simulation::checkout::Project;
+use crate::simulation::process::own_call_failed;
 
 /// The path of a project in its container, as existing Dockerfiles expect.
 pub const PROJECT_PATH: &str = "/usr/local/webots-project";
@@ -67,7 +69,7 @@ impl BuildPlan {
     ///
     /// # Errors
     /// The problem of the project.
-    pub fn read(project: &Path, owner: &str) -> Result<Self, StartError> {
+    pub fn read(project: &Path, owner: &str) -> Result<Self, String> {
         let yml = WebotsYml::read(project);
         let has_makefile = project.join("Makefile").is_file();
         let dockerfile = text_of(&project.join("Dockerfile"))?.or_else(|| has_makefile.then(|| DOCKERFILE.to_owned()));
@@ -100,13 +102,16 @@ impl ProjectPaths {
     /// Finds the parts. Makes the participant of a competition an external controller.
     ///
     /// # Errors
-    /// When one does not exist or can't be mounted, as text for the client.
-    pub fn of(yml: &WebotsYml, project: &Project) -> Result<Self, StartError> {
-        let root = project.folder.canonicalize().map_err(|error| error.to_string())?;
-        let world = world_in(&root, project)?;
+    /// When one does not exist or can't be mounted.
+    pub fn of(yml: &WebotsYml, project: &Project) -> Result<Self, Failure> {
+        let root = project
+            .folder
+            .canonicalize()
+            .map_err(|error| of_project(error.kind().to_string()))?;
+        let world = world_in(&root, project).map_err(of_project)?;
         let edited = match yml.kind {
             ProjectKind::Default => root.clone(),
-            ProjectKind::Editor => inside(&root, &yml.folder_in_project())?,
+            ProjectKind::Editor => inside(&root, &yml.folder_in_project()).map_err(of_project)?,
             ProjectKind::Competition => {
                 open_participant(&root.join(&world))?;
                 participant_folder(project)
@@ -114,8 +119,8 @@ impl ProjectPaths {
         };
         Ok(Self {
             world,
-            project: mountable(root)?,
-            edited: mountable(edited)?,
+            project: mountable(root).map_err(of_project)?,
+            edited: mountable(edited).map_err(of_project)?,
         })
     }
 }
@@ -155,7 +160,7 @@ pub fn inside(project: &Path, folder: &Path) -> Result<PathBuf, String> {
 ///
 /// # Errors
 /// When the file can't be read or written. The project is the cause if it is not a text, or its image denies access.
-fn open_participant(world: &Path) -> Result<(), StartError> {
+fn open_participant(world: &Path) -> Result<(), Failure> {
     let open = || {
         let text = std::fs::read_to_string(world)?.replace("controller \"participant\"", "controller \"<extern>\"");
         let flags = OFlag::O_NOFOLLOW.bits();
@@ -168,9 +173,9 @@ fn open_participant(world: &Path) -> Result<(), StartError> {
     };
     open().map_err(|error| match error.kind() {
         ErrorKind::InvalidData | ErrorKind::PermissionDenied => {
-            StartError::Project(format!("The world can't be changed: {error}"))
+            of_project(format!("The world can't be changed: {error}"))
         }
-        _ => error.into(),
+        _ => own_call_failed(&error),
     })
 }
 
@@ -236,7 +241,7 @@ mod tests {
         assert_eq!(image_of("mine", "R2025a"), "mine");
     }
 
-    fn read(project: &Path) -> Result<BuildPlan, StartError> {
+    fn read(project: &Path) -> Result<BuildPlan, String> {
         BuildPlan::read(project, "x")
     }
 
@@ -275,10 +280,7 @@ mod tests {
         std::fs::remove_file(&file).unwrap();
         nix::unistd::mkfifo(&file, nix::sys::stat::Mode::S_IRWXU).unwrap();
         let wrong = read(project.path()).unwrap_err();
-        assert_eq!(
-            wrong.to_string(),
-            "Dockerfile of the project is no plain file of at most 256 KiB"
-        );
+        assert_eq!(wrong, "Dockerfile of the project is no plain file of at most 256 KiB");
     }
 
     #[test]

@@ -8,16 +8,18 @@
 use std::path::Path;
 use std::time::Duration;
 
-use actix_rt::task::spawn_blocking;
 use serde::Deserialize;
 use serde_json::Value;
 
-use super::docker::{Docker, DockerError, SHORT_TIMEOUT, StartError, blame};
+use super::docker::{Docker, SHORT_TIMEOUT};
 use super::dockerfile::NO_VOLUME;
+use super::failures::{of_project, on_thread};
 use super::owned_resources::REMOVE;
+use crate::shared::domain::{Failure, Reason};
 use crate::shared::text::one_line;
 use crate::simulation::checkout::{Project, outgrown};
-use crate::simulation::process::remove_tree;
+use crate::simulation::config::SimulationConfig;
+use crate::simulation::process::{disk_fault, own_call_failed, remove_tree};
 
 /// An image: its name, and the configuration of its programs, as Docker reports it.
 #[derive(Debug, Default, Deserialize)]
@@ -91,49 +93,56 @@ impl BuiltImage {
 
 /// Copies a directory of an image to `to`, where containers can change it: the build may have created files in it. `to` is
 /// created or replaced, through a temporary directory of the project's instance. `name` is the compose project, from
-/// which the name of the temporary container derives; `size` is the limit in MiB.
+/// which the name of the temporary container derives.
 ///
 /// # Errors
-/// Why not, as text for the client.
+/// Why not.
 pub async fn export(
     image: &BuiltImage,
-    docker: &Docker,
+    (docker, config): (&Docker, &SimulationConfig),
     name: &str,
     from: &Path,
     project: &Project,
-    (to, size): (&Path, u64),
-) -> Result<(), StartError> {
+    to: &Path,
+) -> Result<(), Failure> {
     let name = format!("{name}-{:08x}", rand::random::<u32>());
+    let reserve = config.disk_reserve;
     let create = ["create", "--name", &name, "--network", "none", &image.name, "true"];
-    docker
-        .run(&create, SHORT_TIMEOUT)
-        .await
-        .map_err(|error| blame(true, error))?;
+    if let Err(error) = docker.run(&create, SHORT_TIMEOUT).await {
+        let otherwise = of_project("Docker can't create a container of the image of this project");
+        return Err(docker.explain(error, reserve, otherwise).await);
+    }
     let through = project.instance.path().join("copied");
     let source = format!("{name}:{}/.", from.display());
     let words = ["cp", &source, &through.to_string_lossy()].map(str::to_owned);
-    tokio::select! {
-        copied = docker.run(&words, COPY_TIMEOUT) => drop(copied.map_err(|error| not_copied(error, from))?),
+    let size = config.project_size;
+    let copied = tokio::select! {
+        copied = docker.run(&words, COPY_TIMEOUT) => copied,
         () = outgrown(vec![(through.clone(), size << 20)]) => {
-            return Err(format!("The project in its image is larger than {size} MiB (projectSize)").into());
+            let message = format!("The project in its image is larger than {size} MiB (projectSize)");
+            return Err(Failure::new(Reason::ProjectTooLarge, message));
         }
+    };
+    if let Err(error) = copied {
+        let instance = project.instance.path().to_owned();
+        let full = on_thread(move || Ok(disk_fault(&instance, reserve))).await?;
+        let otherwise = of_project(format!(
+            "{} can't be copied out of the image of this project: its Dockerfile has to COPY the project there",
+            from.display()
+        ));
+        return Err(match full {
+            Some(failure) => failure,
+            None => docker.explain(error, reserve, otherwise).await,
+        });
     }
     docker.run(&[&REMOVE[..], &[&name]].concat(), SHORT_TIMEOUT).await?;
     let to = to.to_owned();
-    Ok(spawn_blocking(move || remove_tree(&to).and_then(|()| std::fs::rename(&through, &to))).await??)
-}
-
-fn not_copied(error: DockerError, from: &Path) -> StartError {
-    let from = from.display();
-    match error {
-        DockerError::Failed { message, .. }
-            if message.contains("ould not find") || message.contains("o such container:path") =>
-        {
-            format!("The image of this project has no folder {from}: its Dockerfile has to COPY the project there")
-                .into()
-        }
-        error => blame(true, error),
-    }
+    on_thread(move || {
+        remove_tree(&to)
+            .and_then(|()| std::fs::rename(&through, &to))
+            .map_err(|error| own_call_failed(&error))
+    })
+    .await
 }
 
 #[cfg(test)]

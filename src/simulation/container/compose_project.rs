@@ -10,11 +10,12 @@ use which::which;
 
 use super::build_plan::{PROJECT_PATH, ProjectPaths};
 use super::built_image::BuiltImage;
-use super::docker::StartError;
 use super::webots_yml::{ProjectKind, WebotsYml};
+use crate::shared::domain::Failure;
 use crate::simulation::checkout::Project;
 use crate::simulation::config::{ContainerDisplay, EDITOR_PORT, SimulationConfig};
 use crate::simulation::machine::sensors::Gpu;
+use crate::simulation::process::own_call_failed;
 
 /// A simulation that will run in containers.
 #[derive(Debug)]
@@ -78,15 +79,16 @@ impl ComposeProject {
     ///
     /// # Errors
     /// When a path of the project can't be used, or a file can't be written.
-    pub fn write(&self) -> Result<(Vec<String>, Vec<&'static str>), StartError> {
+    pub fn write(&self) -> Result<(Vec<String>, Vec<&'static str>), Failure> {
         let paths = ProjectPaths::of(&self.yml, &self.request.project)?;
-        std::fs::create_dir_all(self.exchange())?;
+        std::fs::create_dir_all(self.exchange()).map_err(|error| own_call_failed(&error))?;
         let services = self.services(&paths);
         let network = json!({ "default": { "external": true, "name": self.config.container.network.name() } });
         let project = json!({ "services": services, "networks": network });
         let file = self.request.project.instance.path().join("compose.json");
         // Without this, compose would expand variables.
-        std::fs::write(&file, project.to_string().replace('$', "$$"))?;
+        let text = project.to_string().replace('$', "$$");
+        std::fs::write(&file, text).map_err(|error| own_call_failed(&error))?;
         let options = ["--project-name", &self.name, "--file", &file.to_string_lossy()].map(str::to_owned);
         Ok((options.into(), services.into_keys().collect()))
     }

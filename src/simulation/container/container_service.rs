@@ -4,7 +4,6 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
-use actix_rt::task::spawn_blocking;
 use tokio::runtime::Handle;
 use tokio::sync::Semaphore;
 use tokio_util::task::AbortOnDropHandle;
@@ -12,12 +11,15 @@ use tokio_util::task::AbortOnDropHandle;
 use super::build_plan::{BuildPlan, ImageBuild, PROJECT_PATH, participant_folder};
 use super::built_image::export;
 use super::compose_project::{ComposeProject, ContainerRequest};
-use super::docker::{Docker, DockerError, SHORT_TIMEOUT, StartError, blame, daemon_fault};
+use super::docker::{Docker, daemon_fault};
+use super::failures::{of_project, on_thread};
 use super::image::Images;
+use super::network;
 use super::owned_resources::{ProjectGuard, ResourceOwner, sweep_all};
 use super::packet_filter;
 use super::simulation_containers::SimulationContainers;
 use super::webots_yml::ProjectKind;
+use crate::shared::domain::{Failure, Reason};
 use crate::simulation::checkout::OnProgress;
 use crate::simulation::config::SimulationConfig;
 
@@ -37,8 +39,6 @@ pub struct ContainerService {
     _removes_old_images: AbortOnDropHandle<()>,
 }
 
-/// The option by which containers in a network can't reach each other.
-const ALONE: &str = "com.docker.network.bridge.enable_icc=false";
 /// Timeout of the creation of a simulation's containers: the disk of Docker may be busy with images of others.
 const CREATE_TIMEOUT: Duration = Duration::from_mins(2);
 
@@ -75,28 +75,31 @@ impl ContainerService {
     /// Dropping the future discards everything that was created.
     ///
     /// # Errors
-    /// Why they can't be created, and whether the project or this server is the cause.
+    /// Why they can't be created.
     pub async fn prepare(
         &self,
         request: ContainerRequest,
         progress: OnProgress<'_>,
-    ) -> Result<SimulationContainers, StartError> {
-        let (project, docker, size) = (&request.project, &self.docker, self.config.project_size);
-        let (folder, owner) = (project.folder.clone(), self.images.owner.clone());
-        let BuildPlan { yml, image, controller } = spawn_blocking(move || BuildPlan::read(&folder, &owner.0)).await??;
+    ) -> Result<SimulationContainers, Failure> {
+        let project = &request.project;
+        let docker = &self.docker;
+        let folder = project.folder.clone();
+        let owner = self.images.owner.clone();
+        let plan = on_thread(move || BuildPlan::read(&folder, &owner.0).map_err(of_project)).await?;
+        let BuildPlan { yml, image, controller } = plan;
         let guard = ProjectGuard {
             name: self.run.project(request.port),
             runtime: self.runtime.clone(),
         };
-        join_network(docker, self.config.container.network.name()).await?;
+        network::join(docker, self.config.container.network.name()).await?;
         let is_projects = image.folder.is_some() || controller.is_some();
         let made = async |build: ImageBuild, from: &Path, to: &Path| {
             let has_project = build.folder.is_some();
             let image = self.images.build(project, build, progress).await?;
             if has_project {
-                export(&image, docker, &guard.name, from, project, (to, size)).await?;
+                export(&image, (docker, &self.config), &guard.name, from, project, to).await?;
             }
-            Ok::<_, StartError>(image)
+            Ok::<_, Failure>(image)
         };
         let image = made(image, Path::new(PROJECT_PATH), &project.folder).await?;
         let controller = match controller {
@@ -110,17 +113,16 @@ impl ContainerService {
         if has_editor {
             self.images.pull(&self.config.container.editor_image, progress).await?;
         }
-        let (name, config) = (guard.name.clone(), Arc::clone(&self.config));
         let compose = ComposeProject {
-            name,
+            name: guard.name.clone(),
             request,
             yml,
             image,
             controller,
-            config,
+            config: Arc::clone(&self.config),
         };
-        let (written, ComposeProject { yml, .. }) = spawn_blocking(move || (compose.write(), compose)).await?;
-        let (options, services) = written?;
+        let written = on_thread(move || compose.write().map(|written| (written, compose.yml))).await?;
+        let ((options, services), yml) = written;
         // More concurrent runs would only be slower. The semaphore is never closed.
         let turn = self.turns.acquire().await.ok();
         progress("Creating network and containers".to_owned());
@@ -136,19 +138,22 @@ impl ContainerService {
             .docker
             .follow(words.map(Into::into).collect(), CREATE_TIMEOUT, |_| ())
             .await;
-        created.map_err(|error| blame(is_projects, error))?;
+        if let Err(error) = created {
+            let otherwise = refused_by_docker(is_projects);
+            return Err(docker.explain(error, self.config.disk_reserve, otherwise).await);
+        }
         drop(turn);
         // An editor has a port of its own, which the relay of streams does not reach.
         let ide = (has_editor && self.config.ports_are_public()).then(|| "ide: enable".to_owned());
         let texts = ide.into_iter().chain(yml.project_type).collect();
-        let (docker, warnings) = (self.docker.clone(), yml.warnings);
         Ok(SimulationContainers {
-            docker,
+            docker: self.docker.clone(),
+            reserve: self.config.disk_reserve,
             guard,
             services,
             is_projects,
             texts,
-            warnings,
+            warnings: yml.warnings,
             restart: None,
         })
     }
@@ -160,28 +165,22 @@ impl ContainerService {
 /// What is missing, as text for an administrator.
 pub fn check(config: &SimulationConfig) -> Result<String, String> {
     Docker::find(Path::new("/"))?;
-    daemon_fault().or_else(packet_filter::missing).map_or(Ok(()), Err)?;
+    daemon_fault().map_or(Ok(()), Err)?;
+    network::check(config.container.network.name())?;
+    packet_filter::missing().map_or(Ok(()), Err)?;
     Ok(format!(
         "it answers; worlds run in {}, or the image of their project's Dockerfile",
         config.container.image
     ))
 }
 
-/// Creates the network of all containers, unless it exists. Its name is also that of its interface, which the packet filter
-/// matches.
-async fn join_network(docker: &Docker, name: &str) -> Result<(), DockerError> {
-    // One network for all, because Docker's address pools allow only some thirty.
-    let interface = format!("com.docker.network.bridge.name={name}");
-    let create = [
-        "network", "create", "--driver", "bridge", "--opt", &interface, "--opt", ALONE, name,
-    ];
-    match docker.run(&create, SHORT_TIMEOUT).await {
-        // Of two concurrent creations Docker refuses the second, because both name the same interface.
-        Err(DockerError::Failed { message, .. })
-            if message.contains("already exists") || message.contains("have same bridge name") =>
-        {
-            Ok(())
-        }
-        created => created.map(drop),
-    }
+/// Docker refuses the containers of a simulation, although it works. `is_projects`: whether the project has defined one of
+/// their images, which is the cause then.
+pub fn refused_by_docker(is_projects: bool) -> Failure {
+    let reason = if is_projects {
+        Reason::InvalidProject
+    } else {
+        Reason::LaunchFailed
+    };
+    Failure::new(reason, "Docker can't start the containers of this simulation")
 }

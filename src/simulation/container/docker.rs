@@ -1,15 +1,15 @@
 //! Runs the programs `docker` and `docker compose`: without a shell, with a timeout. Dropping the future ends them.
 
 use std::ffi::{OsStr, OsString};
-use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 use std::time::Duration;
 
-use tokio::task::JoinError;
+use actix_rt::task::spawn_blocking;
 use which::which;
 
-use crate::simulation::process::{ExitReason, Ran, Run, RunError, SpawnSpec};
+use crate::shared::domain::{Failure, Reason};
+use crate::simulation::process::{DiskRoom, ExitReason, Ran, Run, RunError, SpawnSpec};
 
 /// The commands of Docker on this machine.
 #[derive(Debug, Clone)]
@@ -20,12 +20,12 @@ pub struct Docker {
     mark: PathBuf,
 }
 
-/// Why a Docker command failed. The messages are for the client.
+/// Why a Docker command failed.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum DockerError {
-    /// Docker is not installed, its daemon does not answer, or the system can start no more processes.
-    #[error("{0}")]
-    Unavailable(String),
+    /// Docker is not installed, or the system can start no more processes.
+    #[error("Docker can't be started: {0}")]
+    NotStarted(String),
     /// It exceeded its timeout.
     #[error("Docker did not end `{command}` within {} seconds", limit.as_secs())]
     Slow {
@@ -34,25 +34,14 @@ pub enum DockerError {
         /// The timeout.
         limit: Duration,
     },
-    /// It failed.
-    #[error("`{command}` failed: {message}")]
+    /// It failed. The exit codes of `docker` do not depend on the cause: see [`Docker::explain`].
+    #[error("`{command}` failed: {output}")]
     Failed {
         /// The command.
         command: String,
-        /// The line with the reason.
-        message: String,
+        /// The last line that it has printed. It may be a text of the project.
+        output: String,
     },
-}
-
-/// Why the containers of a simulation could not be started, as text for the client.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum StartError {
-    /// The project is the cause: no other server could start it.
-    #[error("{0}")]
-    Project(String),
-    /// This server is the cause, its Docker or its disk: another one may accept the client.
-    #[error("{0}")]
-    Server(String),
 }
 
 /// Timeout of queries and of other short commands.
@@ -61,14 +50,6 @@ pub const SHORT_TIMEOUT: Duration = Duration::from_secs(30);
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 /// Prefixes of the lines after the reason: which containers were not started, and where to find help.
 const AFTER_REASON: [&str; 3] = ["Error: failed to start containers", "See 'docker", "Run 'docker"];
-/// Parts of messages, in lower case, which say that the daemon can't be reached.
-const NO_DAEMON: [&str; 4] = [
-    "cannot connect to the docker daemon",
-    "couldn't connect to docker daemon",
-    "error during connect",
-    "permission denied while trying to connect",
-];
-
 impl Docker {
     /// Determines the commands of Docker. Blocks for some seconds at most.
     ///
@@ -125,6 +106,23 @@ impl Docker {
         .map(drop)
     }
 
+    /// The failure of a command: Docker does not answer at this moment, its disk has less than `reserve` MiB left, or else
+    /// `otherwise`, with what the command has printed. What is printed decides nothing: a Dockerfile may print the message
+    /// of a daemon that is not there.
+    pub async fn explain(&self, error: DockerError, reserve: u64, otherwise: Failure) -> Failure {
+        let output = match error {
+            DockerError::NotStarted(_) => return error.into(),
+            DockerError::Slow { .. } => String::new(),
+            DockerError::Failed { output, .. } => output,
+        };
+        let fault = spawn_blocking(move || daemon_fault().map(unavailable).or_else(|| docker_disk_fault(reserve)));
+        fault
+            .await
+            .ok()
+            .flatten()
+            .unwrap_or_else(|| otherwise.with_output(output))
+    }
+
     /// The specification of a client program of the daemon. Dropping its process group ends only that program.
     pub fn spec(&self, command: Vec<OsString>, grace: Duration) -> SpawnSpec {
         // The classic builder prints its steps, and can build on the server's own network; BuildKit can't.
@@ -161,11 +159,26 @@ pub fn blocking(arguments: &[&str], limit: Duration) -> Result<String, DockerErr
     result(name, ran, reason)
 }
 
-/// Why the daemon can't be used now, as text for clients and administrators. Blocks for five seconds at most.
+/// Why the daemon can't be used now, as text for clients and administrators. It is asked twice, because a busy one may
+/// answer once too late. Blocks for ten seconds at most.
 pub fn daemon_fault() -> Option<String> {
-    blocking(&["version", "--format", "{{.Server.Version}}"], ANSWER_TIMEOUT)
-        .err()
-        .map(|error| error.to_string())
+    let ask = || blocking(&["version", "--format", "{{.Server.Version}}"], ANSWER_TIMEOUT);
+    let error = ask().or_else(|_| ask()).err()?;
+    Some(match error {
+        DockerError::Failed { output, .. } => format!("Docker does not answer on this simulation server: {output}"),
+        error => error.to_string(),
+    })
+}
+
+/// Why Docker can store nothing more: its disk has less than `reserve` MiB left. Blocks.
+pub fn docker_disk_fault(reserve: u64) -> Option<Failure> {
+    let left = DiskRoom::of(&data_folder()?).ok()?.shortage(reserve)?;
+    let message = format!("This simulation server's disk of Docker is full: less than {left}");
+    Some(Failure::new(Reason::DiskFull, message))
+}
+
+fn unavailable(why: String) -> Failure {
+    Failure::new(Reason::DockerUnavailable, why)
 }
 
 /// The directory in which Docker keeps images and containers; `None` if it does not run on this machine. Cached after
@@ -193,21 +206,15 @@ fn name_of(command: &[OsString]) -> String {
     words.map(|word| word.to_string_lossy()).collect::<Vec<_>>().join(" ")
 }
 
-/// Keeps a printed line if it may be the reason of a failure: the last one, or the first one about a missing daemon.
+/// Keeps a printed line if it may be the reason of a failure: the last one.
 fn note(reason: &mut String, line: &str) {
     let line = line.trim();
-    if !line.is_empty() && !AFTER_REASON.iter().any(|begin| line.starts_with(begin)) && !has_no_daemon(reason) {
+    if !line.is_empty() && !AFTER_REASON.iter().any(|begin| line.starts_with(begin)) {
         line.clone_into(reason);
     }
 }
 
-fn has_no_daemon(reason: &str) -> bool {
-    let reason = reason.to_lowercase();
-    NO_DAEMON.iter().any(|words| reason.contains(words))
-}
-
-fn result(command: String, ran: Result<Ran, RunError>, reason: String) -> Result<String, DockerError> {
-    let not_started = |why: String| DockerError::Unavailable(format!("Docker can't be started: {why}"));
+fn result(command: String, ran: Result<Ran, RunError>, output: String) -> Result<String, DockerError> {
     match ran {
         Ok(Ran {
             ending: ExitReason::Code(0),
@@ -216,60 +223,26 @@ fn result(command: String, ran: Result<Ran, RunError>, reason: String) -> Result
         Ok(Ran {
             ending: ExitReason::NotStarted,
             ..
-        }) => Err(not_started(format!("there is no {command}"))),
-        Ok(_) if has_no_daemon(&reason) => Err(DockerError::Unavailable(format!(
-            "Docker does not answer on this simulation server: {reason}"
-        ))),
-        Ok(_) => Err(DockerError::Failed {
-            command,
-            message: reason,
-        }),
+        }) => Err(DockerError::NotStarted(format!("there is no {command}"))),
+        Ok(_) => Err(DockerError::Failed { command, output }),
         Err(RunError::Slow(limit)) => Err(DockerError::Slow { command, limit }),
         Err(error @ RunError::TooLong) => Err(DockerError::Failed {
             command,
-            message: error.to_string(),
+            output: error.to_string(),
         }),
-        Err(error) => Err(not_started(error.to_string())),
+        Err(error) => Err(DockerError::NotStarted(error.to_string())),
     }
 }
 
-/// The cause if Docker fails with the containers of a simulation. `is_projects`: whether the project has defined
-/// one of their images: then the project is the cause, unless the disk is full.
-pub fn blame(is_projects: bool, error: DockerError) -> StartError {
-    match &error {
-        DockerError::Failed { message, .. } if is_projects && !is_disk_full(message) => {
-            StartError::Project(error.to_string())
-        }
-        _ => error.into(),
-    }
-}
-
-/// Whether Docker reports a full disk. Only the end of the message counts, because it may contain names of the project.
-pub fn is_disk_full(message: &str) -> bool {
-    message.ends_with("no space left on device")
-}
-
-impl From<String> for StartError {
-    fn from(why: String) -> Self {
-        Self::Project(why)
-    }
-}
-
-impl From<DockerError> for StartError {
+/// The failure of a command that does not depend on a project.
+impl From<DockerError> for Failure {
     fn from(error: DockerError) -> Self {
-        Self::Server(error.to_string())
-    }
-}
-
-impl From<io::Error> for StartError {
-    fn from(error: io::Error) -> Self {
-        Self::Server(format!("This simulation server can't write in its cache: {error}"))
-    }
-}
-
-impl From<JoinError> for StartError {
-    fn from(error: JoinError) -> Self {
-        Self::Server(error.to_string())
+        match error {
+            DockerError::Failed { command, output } => {
+                Self::new(Reason::DockerUnavailable, format!("`{command}` failed")).with_output(output)
+            }
+            error => unavailable(error.to_string()),
+        }
     }
 }
 
@@ -278,7 +251,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_daemon_that_is_not_there_is_told_apart() {
+    fn the_line_with_the_reason_is_kept() {
         let failure = |command: &str, printed: &str| {
             let mut reason = String::new();
             printed.lines().for_each(|line| note(&mut reason, line));
@@ -286,33 +259,13 @@ mod tests {
                 ending: ExitReason::Code(1),
                 answer: Vec::new(),
             };
-            result(command.to_owned(), Ok(ran), reason).unwrap_err()
+            result(command.to_owned(), Ok(ran), reason).unwrap_err().to_string()
         };
-        let words = "Couldn't connect to Docker daemon at unix:///x - is it running?\n\nIf it's elsewhere, say so.\n";
-        assert!(matches!(failure("docker ps", words), DockerError::Unavailable(_)));
-        let error = failure("docker build", "Step 1/2\nno space left on device\n");
-        assert_eq!(error.to_string(), "`docker build` failed: no space left on device");
         let words =
             "Error response from daemon: port is already allocated\nError: failed to start containers: one, two\n";
-        let error = failure("docker start one", words);
-        assert!(
-            error
-                .to_string()
-                .ends_with("failed: Error response from daemon: port is already allocated"),
-            "{error}"
+        assert_eq!(
+            failure("docker start one", words),
+            "`docker start one` failed: Error response from daemon: port is already allocated"
         );
-    }
-
-    #[test]
-    fn a_failure_of_a_projects_image_is_the_projects_fault() {
-        let failed = |message: &str| DockerError::Failed {
-            command: "docker cp".to_owned(),
-            message: message.to_owned(),
-        };
-        let is_own = |error| matches!(blame(true, error), StartError::Server(_));
-        assert!(!is_own(failed("mknod /x: operation not permitted")));
-        assert!(!is_own(failed("no space left on device: no such file")));
-        assert!(is_own(failed("write /x: no space left on device")));
-        assert!(is_own(DockerError::Unavailable("refused".to_owned())));
     }
 }

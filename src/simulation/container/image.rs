@@ -11,12 +11,15 @@ use tokio::sync::{Semaphore, SemaphorePermit, watch};
 use super::build_plan::{self, ImageBuild};
 use super::built_image::BuiltImage;
 use super::compose_project::DEFAULT_MEMORY;
-use super::docker::{Docker, DockerError, SHORT_TIMEOUT, StartError, data_folder, is_disk_full};
-use super::dockerfile::LABEL;
+use super::docker::{Docker, DockerError, SHORT_TIMEOUT, data_folder, docker_disk_fault};
+use super::dockerfile::{Dockerfile, LABEL};
+use super::engine;
+use super::failures::{of_project, on_thread};
 use super::owned_resources::{ResourceOwner, digest};
+use crate::shared::domain::{Failure, Reason};
 use crate::simulation::checkout::{OnProgress, Project, SingleFlight};
 use crate::simulation::config::SimulationConfig;
-use crate::simulation::process::DiskRoom;
+use crate::simulation::process::{DiskRoom, own_call_failed};
 
 /// The images of this server.
 pub struct Images {
@@ -26,7 +29,7 @@ pub struct Images {
     config: Arc<SimulationConfig>,
     /// Limits concurrent builds.
     builds: Semaphore,
-    jobs: SingleFlight<String, Result<(), StartError>>,
+    jobs: SingleFlight<String, Result<(), Failure>>,
 }
 
 /// How a Dockerfile names the image of the world's version of Webots.
@@ -35,13 +38,17 @@ const DEFAULT_BASE: [&str; 2] = ["$WEBOTS_DEFAULT_IMAGE", "${WEBOTS_DEFAULT_IMAG
 /// configuration of the image's programs.
 const ID: &str = "{{.Id}}";
 const CONFIG: &str = "{{json .Config}}";
+/// The longest version of a world that has an image.
+const MAX_VERSION: usize = 50;
 /// The largest number of steps that Webots' page understands: each number has one digit.
 const STEPS: u64 = 9;
 /// Interval between two prunings, and after a failed one: Docker runs one at a time, also of other servers.
 const PRUNE_INTERVAL: Duration = Duration::from_mins(5);
 const RETRY_INTERVAL: Duration = Duration::from_secs(5);
-/// Minimum age of an image that is removed because the disk is full, in hours: a newly built one has no container yet.
-const MIN_AGE: u64 = 1;
+/// Minimum age of an image that is removed because the disk is full, in minutes: a newly built one has no container yet.
+const MIN_AGE: u64 = 5;
+/// Interval between two looks at the disk of Docker during a build.
+const LOOK_INTERVAL: Duration = Duration::from_secs(1);
 
 impl Images {
     /// The images of this owner.
@@ -60,15 +67,18 @@ impl Images {
     /// name.
     ///
     /// # Errors
-    /// Why it can't be pulled, as text for the client.
-    pub async fn pull(self: &Arc<Self>, image: &str, progress: OnProgress<'_>) -> Result<String, StartError> {
+    /// Why it can't be pulled.
+    pub async fn pull(self: &Arc<Self>, image: &str, progress: OnProgress<'_>) -> Result<String, Failure> {
         let (this, name) = (Arc::clone(self), image.to_owned());
         let pull = move |sender: watch::Sender<String>| async move {
             let _permit = this.permit(&sender).await?;
             let on_line = |line: &str| drop(sender.send(format!("Step 1/{STEPS} : fetching {name}: {line}")));
             let command = ["docker", "pull", &name].map(OsString::from).to_vec();
             let pulled = this.docker.follow(command, this.config.timing.build, on_line).await;
-            pulled.map_err(|error| not_pulled(&name, error))
+            match pulled {
+                Ok(()) => Ok(()),
+                Err(error) => Err(this.not_pulled(&name, error).await),
+            }
         };
         self.made(image, ID, progress, pull).await
     }
@@ -76,14 +86,18 @@ impl Images {
     /// Builds an image of a project unless it exists.
     ///
     /// # Errors
-    /// Why it can't be built or used, as text for the client.
+    /// Why it can't be built or used.
     pub async fn build(
         self: &Arc<Self>,
         project: &Arc<Project>,
         mut build: ImageBuild,
         progress: OnProgress<'_>,
-    ) -> Result<BuiltImage, StartError> {
-        let webots = build_plan::image_of(&self.config.container.image, &project.world.version);
+    ) -> Result<BuiltImage, Failure> {
+        let version = &project.world.version;
+        let webots = build_plan::image_of(&self.config.container.image, version);
+        if !is_version(version) {
+            return Err(no_image(&webots));
+        }
         build.arguments.push(format!("WEBOTS_DEFAULT_IMAGE={webots}"));
         let mut parts = [vec![build.dockerfile.text.clone()], build.arguments.clone()].concat();
         parts.extend(
@@ -106,23 +120,23 @@ impl Images {
         let (this, project, tag) = (Arc::clone(self), Arc::clone(project), name.clone());
         let job = |sender| async move { this.build_now(&tag, &project, build, sender).await };
         let config = self.made(&name, CONFIG, progress, job).await?;
-        Ok(BuiltImage::read(name, &config)?)
+        BuiltImage::read(name, &config).map_err(of_project)
     }
 
     /// Makes an image by this job unless it exists. Returns what Docker reports about it in this format.
-    async fn made<F: Future<Output = Result<(), StartError>> + Send + 'static>(
+    async fn made<F: Future<Output = Result<(), Failure>> + Send + 'static>(
         &self,
         name: &str,
         format: &str,
         progress: OnProgress<'_>,
         job: impl FnOnce(watch::Sender<String>) -> F,
-    ) -> Result<String, StartError> {
+    ) -> Result<String, Failure> {
         if let Some(found) = self.inspect(name, format).await? {
             return Ok(found);
         }
         self.jobs.join(name.to_owned(), progress, job).await?;
         // The settings that a project's Dockerfile makes may be too large to be read.
-        let unreadable = || StartError::Project(format!("The settings of the image {name} can't be read"));
+        let unreadable = || of_project(format!("The settings of the image {name} can't be read"));
         self.inspect(name, format).await?.ok_or_else(unreadable)
     }
 
@@ -132,7 +146,7 @@ impl Images {
         project: &Project,
         build: ImageBuild,
         sender: watch::Sender<String>,
-    ) -> Result<(), StartError> {
+    ) -> Result<(), Failure> {
         // A build without steps of a project takes seconds.
         let _permit = if build.folder.is_some() {
             Some(self.permit(&sender).await?)
@@ -144,17 +158,20 @@ impl Images {
             folder,
             arguments,
         } = build;
-        let (instance, root) = (project.instance.path().to_owned(), project.folder.clone());
+        let Dockerfile { text, bases } = dockerfile;
+        let instance = project.instance.path().to_owned();
+        let root = project.folder.clone();
         let prepare = move || {
             let file = instance.join(format!("Dockerfile{}", folder.unwrap_or_default()));
-            std::fs::write(&file, dockerfile.text)?;
             let empty = instance.join("empty");
-            std::fs::create_dir_all(&empty)?;
+            std::fs::write(&file, text)
+                .and_then(|()| std::fs::create_dir_all(&empty))
+                .map_err(|error| own_call_failed(&error))?;
             // A copy out of an image may have replaced it by a symlink to any path.
-            let context = folder.map_or(Ok(empty), |folder| build_plan::inside(&root, Path::new(folder)))?;
-            Ok::<_, StartError>((file, context))
+            let context = folder.map_or(Ok(empty), |folder| build_plan::inside(&root, Path::new(folder)));
+            Ok((file, context.map_err(of_project)?))
         };
-        let (file, context) = spawn_blocking(prepare).await??;
+        let (file, context) = on_thread(prepare).await?;
         let memory = format!("{}m", self.config.limits.memory.unwrap_or(DEFAULT_MEMORY));
         let network = self.config.container.network.name();
         let limited = [
@@ -183,15 +200,90 @@ impl Images {
                 sender.send(text).ok();
             }
         };
-        let done = self
-            .docker
-            .follow(words.collect(), self.config.timing.build, on_line)
-            .await;
-        done.map_err(|error| not_built(&step, error))
+        let follow = self.docker.follow(words.collect(), self.config.timing.build, on_line);
+        let done = tokio::select! {
+            done = follow => done,
+            () = self.until_disk_full() => return Err(self.has_filled_disk()),
+        };
+        match done {
+            Ok(()) => Ok(()),
+            Err(error) => Err(self.not_built(&bases, &step, error).await),
+        }
+    }
+
+    /// Waits until the disk of Docker has less than `diskReserve` left.
+    async fn until_disk_full(&self) {
+        let reserve = self.config.disk_reserve;
+        loop {
+            actix_rt::time::sleep(LOOK_INTERVAL).await;
+            if matches!(spawn_blocking(move || docker_disk_fault(reserve)).await, Ok(Some(_))) {
+                return;
+            }
+        }
+    }
+
+    /// The failure of a build during which the disk of Docker has become full: the server takes no clients with a full
+    /// disk, so builds have filled it. Of several builds none is known to be the cause.
+    fn has_filled_disk(&self) -> Failure {
+        if self.config.container.builds - self.builds.available_permits() > 1 {
+            let message = "The builds of several projects have filled the disk of Docker (diskReserve), and were ended";
+            return Failure::new(Reason::BuildersBusy, message);
+        }
+        let message = "The image of this project can't be built: it has filled the disk of Docker (diskReserve)";
+        Failure::new(Reason::ImageTooLarge, message)
+    }
+
+    /// Why a configured image can't be pulled: the world's version has none, or this server can't get it. Nothing here is
+    /// a project's: the image is the configuration's, and its registry answers.
+    async fn not_pulled(&self, image: &str, error: DockerError) -> Failure {
+        if engine::is_unknown(image).await {
+            return no_image(image);
+        }
+        let message = format!("This simulation server can't fetch the image {image}");
+        let otherwise = Failure::new(Reason::ServerFault, message);
+        self.docker.explain(error, self.config.disk_reserve, otherwise).await
+    }
+
+    /// Why an image with these bases was not built, in this step.
+    async fn not_built(&self, bases: &[String], step: &str, error: DockerError) -> Failure {
+        if let DockerError::Slow { limit, .. } = error {
+            let message = format!(
+                "Its image was not ready within {} seconds (timing.build)",
+                limit.as_secs()
+            );
+            return Failure::new(Reason::BuildTimeout, message);
+        }
+        // A build fetches each base that is not there, except an earlier stage or one that a variable names.
+        let mut missing = None;
+        for base in bases.iter().filter(|base| !base.contains('$')) {
+            if missing.is_none() && matches!(self.inspect(base, ID).await, Ok(None)) {
+                missing = Some(base);
+            }
+        }
+        let message = match missing {
+            Some(base) if step.contains(" : FROM ") => format!(
+                "The image of this project can't be built: this simulation server can't fetch the image {base}, with \
+                 which it begins"
+            ),
+            _ => "The image of this project can't be built".to_owned(),
+        };
+        let failed = Failure::new(Reason::BuildFailed, message);
+        let explained = self.docker.explain(error, self.config.disk_reserve, failed).await;
+        match (explained.reason, explained.output) {
+            (Reason::DiskFull, _) => self.has_filled_disk(),
+            (Reason::BuildFailed, Some(output)) => {
+                Failure::new(Reason::BuildFailed, explained.message).with_output(format!("{output} ({step})"))
+            }
+            (reason, output) => Failure {
+                reason,
+                message: explained.message,
+                output,
+            },
+        }
     }
 
     /// Waits until another image may be built or pulled.
-    async fn permit(&self, sender: &watch::Sender<String>) -> Result<SemaphorePermit<'_>, StartError> {
+    async fn permit(&self, sender: &watch::Sender<String>) -> Result<SemaphorePermit<'_>, Failure> {
         if let Ok(permit) = self.builds.try_acquire() {
             return Ok(permit);
         }
@@ -207,11 +299,11 @@ impl Images {
             .await
             .ok()
             .and_then(Result::ok);
-        permit.ok_or_else(|| StartError::Server(why()))
+        permit.ok_or_else(|| Failure::new(Reason::BuildersBusy, why()))
     }
 
     /// What Docker reports about an image in this format; `None` if it does not exist.
-    async fn inspect(&self, image: &str, format: &str) -> Result<Option<String>, StartError> {
+    async fn inspect(&self, image: &str, format: &str) -> Result<Option<String>, Failure> {
         match self
             .docker
             .run(&["image", "inspect", "--format", format, image], SHORT_TIMEOUT)
@@ -231,17 +323,19 @@ impl Images {
             let room = || data_folder().and_then(|folder| DiskRoom::of(&folder).ok());
             let room = spawn_blocking(room).await.ok().flatten();
             let is_full = room.is_some_and(|room| room.shortage(reserve).is_some());
-            let hours = if is_full {
+            let minutes = if is_full {
                 MIN_AGE
             } else {
-                24 * self.config.container.images_age
+                24 * 60 * self.config.container.images_age
             };
-            let (mine, old) = (format!("label={LABEL}={}", self.owner.0), format!("until={hours}h"));
+            let mine = format!("label={LABEL}={}", self.owner.0);
+            let old = format!("until={minutes}m");
             let prune = [
                 "image", "prune", "--all", "--force", "--filter", &mine, "--filter", &old,
             ];
             let pruned = self.docker.run(&prune, SHORT_TIMEOUT).await;
-            actix_rt::time::sleep(if pruned.is_ok() { PRUNE_INTERVAL } else { RETRY_INTERVAL }).await;
+            let is_done = pruned.is_ok() && !is_full;
+            actix_rt::time::sleep(if is_done { PRUNE_INTERVAL } else { RETRY_INTERVAL }).await;
         }
     }
 }
@@ -259,96 +353,35 @@ fn scaled(line: &str) -> Option<String> {
     Some(format!("Step {step}/{} : {instruction}", of.min(STEPS)))
 }
 
-/// Why a configured image can't be pulled: the world's version has none, or this server can't get it.
-fn not_pulled(image: &str, error: DockerError) -> StartError {
-    match error {
-        DockerError::Failed { message, .. } if is_unknown(&message) => no_image(image),
-        error => error.into(),
-    }
-}
-
-/// Why an image was not built in this step. Only a `FROM` step can fail because of a missing image.
-fn not_built(step: &str, error: DockerError) -> StartError {
-    let base = step
-        .split_once(" : FROM ")
-        .and_then(|(_, image)| image.split(' ').next());
-    match (base, error) {
-        (Some(image), DockerError::Failed { message, .. }) if is_unknown(&message) => no_image(image),
-        (_, DockerError::Failed { message, .. }) if !is_disk_full(&message) => {
-            StartError::Project(format!("The image of this project can't be built: {message} ({step})"))
-        }
-        (_, DockerError::Slow { limit, .. }) => StartError::Project(format!(
-            "Its image was not ready within {} seconds (timing.build)",
-            limit.as_secs()
-        )),
-        (_, error) => error.into(),
-    }
-}
-
-fn no_image(image: &str) -> StartError {
-    StartError::Project(format!(
+fn no_image(image: &str) -> Failure {
+    let message = format!(
         "There is no image {image} for this version of Webots where this simulation server looks for images. Another \
          version of the world, or a Dockerfile in its project that begins with an image that there is, helps"
-    ))
+    );
+    Failure::new(Reason::ImageNotFound, message)
 }
 
-/// Whether a registry reports that there is no such image, or Docker that its name is invalid.
-fn is_unknown(message: &str) -> bool {
-    let words = [
-        "not found",
-        "pull access denied",
-        "manifest unknown",
-        "repository does not exist",
-        "invalid reference",
-    ];
-    words.iter().any(|words| message.contains(words))
+/// Whether a world's version can be part of the name of an image.
+fn is_version(version: &str) -> bool {
+    let is_plain = |letter: u8| letter.is_ascii_alphanumeric() || b"._-".contains(&letter);
+    version.len() <= MAX_VERSION && version.bytes().all(is_plain)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn failed(message: &str) -> DockerError {
-        DockerError::Failed {
-            command: "docker build".to_owned(),
-            message: message.to_owned(),
+    #[test]
+    fn a_version_is_a_part_of_a_name() {
+        for (version, is_one) in [
+            ("R2025a", true),
+            ("R2023b-rev.1", true),
+            ("a/b", false),
+            ("R2025a@x", false),
+        ] {
+            assert_eq!(is_version(version), is_one, "{version}");
         }
-    }
-
-    #[test]
-    fn a_missing_image_is_reported_only_where_a_stage_begins() {
-        let told = not_built(
-            "Step 1/4 : FROM cyberbotics/webots.cloud:R1-ubuntu22.04 AS a",
-            failed("manifest unknown"),
-        );
-        let told = told.to_string();
-        assert!(
-            told.starts_with("There is no image cyberbotics/webots.cloud:R1-ubuntu22.04 for this version"),
-            "{told}"
-        );
-        let told = not_built("Step 2/4 : RUN make", failed("make: not found"));
-        let words = "The image of this project can't be built: make: not found (Step 2/4 : RUN make)";
-        assert_eq!(told, StartError::Project(words.to_owned()));
-        let gone = not_built("Step 2/4 : RUN make", DockerError::Unavailable("refused".to_owned()));
-        assert!(matches!(gone, StartError::Server(_)), "{gone:?}");
-        let full = not_built("Step 3/4 : COPY . /x", failed("write /x: no space left on device"));
-        assert!(matches!(full, StartError::Server(_)), "{full:?}");
-    }
-
-    #[test]
-    fn a_failing_registry_is_blamed_on_whoever_named_it() {
-        let limited = || failed("toomanyrequests: You have reached your pull rate limit");
-        assert!(matches!(not_pulled("a", limited()), StartError::Server(_)));
-        assert!(matches!(
-            not_built("Step 1/4 : FROM a", limited()),
-            StartError::Project(_)
-        ));
-        assert!(matches!(
-            not_pulled("a", failed("invalid reference format")),
-            StartError::Project(_)
-        ));
-        let full = failed("failed to register layer: write /x: no space left on device");
-        assert!(matches!(not_built("Step 1/4 : FROM a", full), StartError::Server(_)));
+        assert!(!is_version(&"R".repeat(100)));
     }
 
     #[test]

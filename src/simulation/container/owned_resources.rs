@@ -28,11 +28,13 @@ pub struct ProjectGuard {
 
 /// The arguments that remove containers, running or not.
 pub const REMOVE: [&str; 3] = ["rm", "--force", "--volumes"];
-/// Attempts to remove the containers of a project before they are left to the next start; how many must succeed,
-/// because Docker may still be creating one; and the pause before each.
-const TRIES: usize = 60;
+/// Number of removals of a project's containers that must succeed, because Docker may still be creating one.
 const LOOKS: usize = 3;
+/// The pause before the first attempts, and after them the pause between two: Docker may be away for long.
 const PAUSE: Duration = Duration::from_secs(2);
+const LONG_PAUSE: Duration = Duration::from_secs(15);
+/// Number of attempts that have failed after which the long pause applies.
+const SHORT_PAUSES: usize = 60;
 
 impl ResourceOwner {
     /// The server with this cache directory, which only one server uses.
@@ -75,16 +77,26 @@ impl Drop for ProjectGuard {
     fn drop(&mut self) {
         let name = std::mem::take(&mut self.name);
         self.runtime.spawn(async move {
-            let mut looks = LOOKS;
-            for _ in 0..TRIES {
-                actix_rt::time::sleep(PAUSE).await;
+            let mut failures = 0;
+            let mut looks = 0;
+            while looks < LOOKS {
+                actix_rt::time::sleep(if failures < SHORT_PAUSES { PAUSE } else { LONG_PAUSE }).await;
                 let project = name.clone();
-                looks -= usize::from(matches!(spawn_blocking(move || sweep(&project)).await, Ok(Ok(()))));
-                if looks == 0 {
-                    return;
+                match spawn_blocking(move || sweep(&project)).await {
+                    Ok(Ok(())) => looks += 1,
+                    Ok(Err(_)) => {
+                        failures += 1;
+                        if failures == SHORT_PAUSES {
+                            log::warn!("the containers of {name} can't be removed until Docker answers again");
+                        }
+                    }
+                    // The server is ending.
+                    Err(_) => return,
                 }
             }
-            log::warn!("the containers of {name} are left to the next start");
+            if failures > 0 {
+                log::info!("Docker answers again: the containers of {name} are removed");
+            }
         });
     }
 }

@@ -3,12 +3,15 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use actix_rt::task::spawn_blocking;
 use tokio::sync::Notify;
 use tokio_util::task::AbortOnDropHandle;
 
 use super::compose_project::{CONTROLLER, WEBOTS, container_of};
-use super::docker::{Docker, DockerError, SHORT_TIMEOUT, StartError, blame};
+use super::container_service::refused_by_docker;
+use super::docker::{Docker, DockerError, SHORT_TIMEOUT, daemon_fault};
 use super::owned_resources::ProjectGuard;
+use crate::shared::domain::{Failure, Reason};
 use crate::simulation::process::{ExitReason, SpawnSpec};
 
 /// The containers of one simulation.
@@ -16,6 +19,8 @@ use crate::simulation::process::{ExitReason, SpawnSpec};
 pub struct SimulationContainers {
     /// Runs Docker.
     pub(super) docker: Docker,
+    /// `diskReserve`, in MiB.
+    pub(super) reserve: u64,
     /// The name of its compose project.
     pub(super) guard: ProjectGuard,
     /// Its services, each with a container.
@@ -45,9 +50,13 @@ pub enum Cause {
 const RESTART_INTERVAL: Duration = Duration::from_secs(1);
 
 impl Cause {
-    /// Whether this server is the cause, so that another one may accept the client.
-    pub fn is_own(self) -> bool {
-        self != Self::OutOfMemory
+    /// The reason of the end.
+    pub fn reason(self) -> Reason {
+        match self {
+            Self::OutOfMemory => Reason::MemoryLimit,
+            Self::Docker => Reason::DockerUnavailable,
+            Self::NotStarted => Reason::LaunchFailed,
+        }
     }
 }
 
@@ -67,23 +76,24 @@ impl SimulationContainers {
     /// can redirect their mounts.
     ///
     /// # Errors
-    /// When Docker fails, with the project or this server as the cause.
-    pub async fn start_others(&mut self) -> Result<(), StartError> {
+    /// When Docker fails.
+    pub async fn start_others(&mut self) -> Result<(), Failure> {
         let others = self
             .services
             .iter()
             .filter(|service| **service != WEBOTS)
             .map(|service| self.container(service));
         let words: Vec<String> = std::iter::once("start".to_owned()).chain(others).collect();
-        if words.len() > 1 {
-            self.docker
-                .run(&words, SHORT_TIMEOUT)
-                .await
-                .map_err(|error| blame(self.is_projects, error))?;
+        if words.len() > 1
+            && let Err(error) = self.docker.run(&words, SHORT_TIMEOUT).await
+        {
+            let otherwise = refused_by_docker(self.is_projects);
+            return Err(self.docker.explain(error, self.reserve, otherwise).await);
         }
         if self.services.contains(&CONTROLLER) {
-            let (docker, controller, request) =
-                (self.docker.clone(), self.container(CONTROLLER), Arc::new(Notify::new()));
+            let docker = self.docker.clone();
+            let controller = self.container(CONTROLLER);
+            let request = Arc::new(Notify::new());
             let requested = Arc::clone(&request);
             let restarts = async move {
                 loop {
@@ -118,7 +128,10 @@ impl SimulationContainers {
             .await
         {
             Ok(state) => state,
-            Err(DockerError::Failed { .. }) => return None,
+            Err(DockerError::Failed { .. }) => {
+                let fault = spawn_blocking(daemon_fault).await;
+                return fault.ok().flatten().map(|_| Cause::Docker);
+            }
             Err(_) => return Some(Cause::Docker),
         };
         match state.split_whitespace().collect::<Vec<_>>().as_slice() {

@@ -1,10 +1,12 @@
 //! The free room of a disk, and the room that the files below a directory take, even while programs change them.
 
 use std::collections::HashSet;
+use std::ffi::OsString;
 use std::fs::Metadata;
 use std::io::ErrorKind;
 use std::os::unix::fs::MetadataExt;
-use std::path::{Path, PathBuf};
+use std::path::Path;
+use std::rc::Rc;
 use std::time::Instant;
 
 use nix::sys::statvfs::statvfs;
@@ -87,12 +89,19 @@ impl DiskUsage {
     /// Adds everything below a directory until the time is up. Symlinks are not followed. Returns false if a directory
     /// can't be read: it is closed to this server, or nested too deep for a path.
     pub fn add_folder(&mut self, folder: &Path) -> bool {
-        let mut open: Vec<PathBuf> = vec![folder.to_owned()];
+        // The directories that are left: the path of the one above, and their name. At any moment these are the siblings of
+        // one path, so their paths, which may be long, are only as many as that path is deep.
+        let mut open: Vec<(Rc<Path>, OsString)> = vec![(Rc::from(folder), OsString::new())];
         let mut is_shown = true;
-        while let Some(folder) = open.pop() {
+        while let Some((above, name)) = open.pop() {
             if self.until.is_some_and(|until| Instant::now() >= until) {
                 return is_shown;
             }
+            let folder: Rc<Path> = if name.is_empty() {
+                above
+            } else {
+                above.join(name).into()
+            };
             let entries = match std::fs::read_dir(&folder) {
                 Ok(entries) => entries,
                 Err(error) => {
@@ -111,7 +120,7 @@ impl DiskUsage {
                     return is_shown;
                 }
                 if about.is_dir() {
-                    open.push(entry.path());
+                    open.push((Rc::clone(&folder), entry.file_name()));
                 }
             }
         }
@@ -154,6 +163,32 @@ mod tests {
         let bytes = size(folder.path(), room);
         assert!((100_000 + 4 * SMALLEST..200_000).contains(&bytes), "{bytes}");
         assert_eq!(size(folder.path(), length), 100_000 + (1 << 40) + 1);
+    }
+
+    /// The largest memory that this process has had since it was last asked, in KiB.
+    fn peak() -> u64 {
+        let status = std::fs::read_to_string("/proc/self/status").unwrap();
+        let line = status.lines().find(|line| line.starts_with("VmHWM:")).unwrap();
+        let peak = line.split_whitespace().nth(1).unwrap().parse().unwrap();
+        std::fs::write("/proc/self/clear_refs", "5").unwrap();
+        peak
+    }
+
+    #[test]
+    fn many_folders_below_a_long_path_take_little_memory() {
+        const FOLDERS: u64 = 40_000;
+        let place = tempfile::tempdir().unwrap();
+        let long = std::iter::repeat_n("x".repeat(250), 15).fold(place.path().to_owned(), |path, name| path.join(name));
+        std::fs::create_dir_all(&long).unwrap();
+        for number in 0..FOLDERS {
+            std::fs::create_dir(long.join(number.to_string())).unwrap();
+        }
+        peak();
+        let before = peak();
+        assert!(size(place.path(), room) >= FOLDERS * SMALLEST);
+        let more = peak().saturating_sub(before);
+        // With a path for each it would be 150 MB.
+        assert!(more < 60_000, "{more} KiB");
     }
 
     #[test]

@@ -18,7 +18,7 @@ use super::output::{OutputEvent, Tail};
 use super::startup::StartupEvent;
 use crate::shared::domain::{Blame, Failure, Reason};
 use crate::shared::run::seconds_since_1970;
-use crate::simulation::container::{SimulationContainers, StartError};
+use crate::simulation::container::SimulationContainers;
 use crate::simulation::ends::{End, StopReason, lost};
 use crate::simulation::process::ProcessGroup;
 use crate::simulation::snapshot::Stage;
@@ -131,7 +131,7 @@ impl Webots {
         };
         let job = wrap_future::<_, Self>(prepared).map(|prepared, this, ctx| match prepared {
             Ok(containers) => this.launch(containers, ctx),
-            Err(error) => this.end(not_prepared(error).into(), ctx),
+            Err(failure) => this.end(failure.into(), ctx),
         });
         Self {
             spec,
@@ -455,13 +455,5 @@ impl Handler<Stop> for Webots {
 
     fn handle(&mut self, Stop(reason): Stop, ctx: &mut Self::Context) {
         self.stop(reason.into(), ctx);
-    }
-}
-
-/// Why containers could not be prepared.
-fn not_prepared(error: StartError) -> Failure {
-    match error {
-        StartError::Project(why) => Failure::new(Reason::InvalidProject, why),
-        StartError::Server(why) => Failure::new(Reason::DockerUnavailable, why),
     }
 }
