@@ -4,7 +4,7 @@ use super::daemon::{
     alone, as_ordinary, ask, check, docker, dockerfile, of_service, refused, running, server, server_built,
 };
 use super::image::NAME;
-use crate::support::{Client, arm, arm_at, is_told};
+use crate::support::{Client, arm, arm_at, is_told, until};
 
 #[actix_rt::test]
 async fn a_link_in_an_image_leads_no_build_to_files_of_the_machine() {
@@ -110,6 +110,9 @@ async fn a_network_that_the_packet_filter_does_not_match_is_refused() {
     let Some(_docker) = alone().await else { return };
     let remove = || ask(&["network", "rm", "webots-fleet"]);
     if ask(&["network", "ls", "--format", "{{.Name}}"]).contains("webots-fleet") {
+        // Those of other tests end with their servers.
+        let users = ["ps", "--quiet", "--filter", "network=webots-fleet"];
+        until("no container uses it", async || ask(&users).is_empty()).await;
         remove();
     }
     ask(&["network", "create", "webots-fleet"]);
