@@ -31,8 +31,9 @@ use support::program::{Server, session_server, simulation_server};
 use support::webots::Webots;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use webots_fleet::session::fleet::{
-    Answer, FleetStatus, Intake, LineStatus, ServerRecord, ServerState, ServerStatus, StateChange, StateName,
+    Answer, FleetStatus, Intake, ServerRecord, ServerState, ServerStatus, StateChange, StateName,
 };
+use webots_fleet::session::line::LineStatus;
 use webots_fleet::session::web::pages::{self, Monitor};
 use webots_fleet::shared::domain::ClientUrls;
 

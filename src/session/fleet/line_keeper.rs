@@ -10,7 +10,7 @@ use prometheus::Histogram;
 use super::server_record::ServerRecord;
 use super::server_table::{ServerTable, accepts};
 use super::slot_link::{LinkChange, LinkEvent};
-use crate::session::line::{Dispatcher, Entered, Entry, Moment, Place, Progress, Served, Ticket, Turn, WaitingFor};
+use crate::session::line::{Dispatcher, Entered, Entry, LineStatus, Moment, Place, Progress, Served, Ticket, Turn};
 use crate::shared::domain::{Failure, ProjectUrl, PublicAddress, Reason};
 
 /// Asks for a slot, and waits for it in the line. The answer is the place, unless it is the client's turn already.
@@ -53,22 +53,6 @@ pub enum LineEvent {
     Turn(Turn<PublicAddress>),
     /// Another connection has its place.
     TakenOver,
-}
-
-/// What is known of the line.
-#[derive(Debug, Clone, Default)]
-pub struct LineStatus {
-    /// Number of clients that wait.
-    pub waiting: usize,
-    /// What they wait for, those that have waited longest first.
-    pub worlds: Vec<WaitingFor>,
-}
-
-impl LineStatus {
-    /// How long the first client has waited.
-    pub fn longest(&self) -> Duration {
-        self.worlds.first().map_or(Duration::ZERO, |first| first.longest)
-    }
 }
 
 /// The line, and how long clients have waited in it.

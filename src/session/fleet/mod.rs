@@ -11,7 +11,7 @@ mod server_table;
 mod slot_link;
 mod state_history;
 
-pub use line_keeper::{LineEvent, LineStatus, StopWaiting, Wait};
+pub use line_keeper::{LineEvent, StopWaiting, Wait};
 pub use registry::{GetStatus, Pick, Reconfigure, Registry};
 pub use server_record::{
     Answer, FleetStatus, Intake, NameStatus, ServerRecord, ServerState, ServerStatus, StateChange, StateName,

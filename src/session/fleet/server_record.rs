@@ -7,7 +7,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use serde::{Serialize, Serializer};
 
-use super::line_keeper::LineStatus;
+use crate::session::line::LineStatus;
 use crate::session::mail::{Notice, NoticeKind};
 use crate::shared::domain::{Failure, PublicAddress, ServerReport};
 use crate::shared::run::timestamp;

@@ -76,6 +76,22 @@ pub struct WaitingFor {
     pub longest: Duration,
 }
 
+/// What is known of the line.
+#[derive(Debug, Clone, Default)]
+pub struct LineStatus {
+    /// Number of clients that wait.
+    pub waiting: usize,
+    /// What they wait for, those that have waited longest first.
+    pub worlds: Vec<WaitingFor>,
+}
+
+impl LineStatus {
+    /// How long the first client has waited.
+    pub fn longest(&self) -> Duration {
+        self.worlds.first().map_or(Duration::ZERO, |first| first.longest)
+    }
+}
+
 /// The line, and the servers whose slots it gets.
 #[derive(Debug)]
 pub struct Dispatcher<Server, Client> {

@@ -14,6 +14,6 @@ mod rate;
 mod ticket;
 mod waiting_line;
 
-pub use dispatcher::{Dispatcher, Entered, Moment, Served, Turn, WaitingFor};
+pub use dispatcher::{Dispatcher, Entered, LineStatus, Moment, Served, Turn, WaitingFor};
 pub use ticket::Ticket;
 pub use waiting_line::{Entry, Place, Progress};

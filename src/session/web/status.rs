@@ -4,7 +4,8 @@ use std::time::Duration;
 
 use serde_json::{Value, json};
 
-use crate::session::fleet::{FleetStatus, LineStatus, ServerStatus};
+use crate::session::fleet::{FleetStatus, ServerStatus};
+use crate::session::line::LineStatus;
 use crate::session::line::WaitingFor;
 use crate::session::state::AppState;
 use crate::shared::domain::{ClientUrls, Failure};

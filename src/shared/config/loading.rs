@@ -3,12 +3,12 @@
 //! An error is one line with the file, the key, what was found and what is expected. An unknown key does not prevent a
 //! start, because files of the original may have such keys; `--check` fails.
 
+use std::io;
 use std::path::Path;
 
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use super::secret::read_file;
 use crate::shared::text::one_line;
 
 /// A server's configuration.
@@ -81,6 +81,17 @@ pub fn load<C: Configuration>(file: &Path) -> Result<LoadedConfig<C>, String> {
         warnings: parsed.warnings.into_iter().map(of_file).collect(),
         unknown: parsed.unknown.into_iter().map(of_file).collect(),
     })
+}
+
+/// Reads a regular file. A FIFO would block until another process writes to it, and a device may never end.
+///
+/// # Errors
+/// When it can't be read, or is not a regular file.
+pub fn read_file(file: &Path) -> io::Result<String> {
+    if !std::fs::metadata(file)?.is_file() {
+        return Err(io::Error::other("it is not a regular file"));
+    }
+    std::fs::read_to_string(file)
 }
 
 fn parse<C: Configuration>(file: &Path) -> Result<Parsed<C>, String> {

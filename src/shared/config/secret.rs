@@ -1,23 +1,12 @@
-//! Secrets of a configuration, and the files that may contain them.
+//! Secrets of a configuration. It contains them, or names their files.
 
+use std::fmt;
 use std::path::{Path, PathBuf};
-use std::{fmt, io};
 
 use serde::{Deserialize, Serialize, Serializer};
 
-use super::loading::require;
+use super::loading::{read_file, require};
 use super::value::ExpandedPath;
-
-/// Reads a regular file. A FIFO would block until another process writes to it, and a device may never end.
-///
-/// # Errors
-/// When it can't be read, or is not a regular file.
-pub fn read_file(file: &Path) -> io::Result<String> {
-    if !std::fs::metadata(file)?.is_file() {
-        return Err(io::Error::other("it is not a regular file"));
-    }
-    std::fs::read_to_string(file)
-}
 
 /// A text that is never printed or logged; output shows `********`. The configuration contains it, or names its file.
 #[derive(Clone, Deserialize)]
