@@ -15,7 +15,7 @@
 //! | `ide: enable` | the project has an editor, on Webots' port + 500 |
 //! | `type:TYPE` | the project's type in its `webots.yml` |
 //! | `loading: TEXT` | progress |
-//! | `reason: {"code": CODE, "blame": WHO, "retry": WHERE, "output": TEXT}` | the same for programs, before the next |
+//! | `reason: {"code": CODE, "blame": WHO, "retry": WHERE, "message": TEXT, "output": TEXT}` | the same for programs, before the next |
 //! | `loading: Error: TEXT` | why the simulation failed; the connection is closed, except after `reset controller` |
 //! | `shutdownTimeout: SECONDS` | Webots was launched, and will be ended after this many seconds |
 //! | `kind: w3d` or `kind: x3d` | the 3D scene that this Webots streams: the message with which a viewer requests it |
@@ -129,6 +129,8 @@ struct ReasonText {
     code: Reason,
     blame: Blame,
     retry: Retry,
+    /// The sentence without the output and the advice that are for pages which read no reasons.
+    message: String,
     #[serde(skip_serializing_if = "Option::is_none")]
     output: Option<String>,
 }
@@ -158,6 +160,7 @@ pub fn failure(failure: &Failure) -> [String; 2] {
         code: *reason,
         blame: reason.blame(),
         retry: reason.retry(),
+        message: client_text(&without_paths(message)),
         output: output.as_deref().map(|output| client_text(&without_paths(output))),
     };
     let mut sentence = message.clone();

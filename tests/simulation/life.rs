@@ -173,6 +173,10 @@ async fn a_client_is_told_how_webots_ended() {
             assert!(told.starts_with(words), "{told}");
             let output = end.contains("licence").then_some("no licence");
             assert_eq!(client.reason()["output"].as_str(), output, "{told}");
+            let message = client.reason()["message"].as_str().unwrap().to_owned();
+            let sentence = words.trim_start_matches("loading: ").trim_start_matches("Error: ");
+            assert!(message.starts_with(sentence), "{message}");
+            assert!(!message.contains("licence"), "{message}");
             assert_eq!(
                 told.contains(". Its last output: no licence"),
                 output.is_some(),
