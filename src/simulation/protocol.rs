@@ -91,6 +91,16 @@ pub enum SceneKind {
     W3d,
 }
 
+impl SceneKind {
+    /// The message with which a viewer requests it.
+    pub fn request(self) -> &'static str {
+        match self {
+            Self::X3d => "x3d",
+            Self::W3d => "w3d",
+        }
+    }
+}
+
 /// Why a message is invalid. The message is for the client.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
@@ -273,11 +283,8 @@ pub fn taken_over() -> Failure {
 }
 
 /// The scene that viewers request from this Webots.
-pub fn kind(kind: SceneKind) -> &'static str {
-    match kind {
-        SceneKind::X3d => "kind: x3d",
-        SceneKind::W3d => "kind: w3d",
-    }
+pub fn kind(kind: SceneKind) -> String {
+    format!("kind: {}", kind.request())
 }
 
 /// The URL of Webots, which is ready.

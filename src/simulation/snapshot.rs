@@ -7,6 +7,7 @@ use serde::Serialize;
 use crate::shared::domain::{Instances, ProjectUrl};
 use crate::shared::run::seconds_since_1970;
 use crate::simulation::client_identity::ClientIdentity;
+use crate::simulation::protocol::SceneKind;
 use crate::simulation::simulation_id::SimulationId;
 
 /// The states of a simulation, as pages and programs see them.
@@ -68,6 +69,9 @@ pub struct Simulation {
     pub away_until: Option<u64>,
     /// The version of Webots that the world was made for.
     pub version: Option<String>,
+    /// The 3D scene that its Webots streams, once that is known; none for a video.
+    #[serde(skip)]
+    pub scene: Option<SceneKind>,
     /// The file that its output is kept in.
     pub log: Option<PathBuf>,
 }
@@ -88,6 +92,7 @@ impl Simulation {
             gpu: None,
             away_until: None,
             version: None,
+            scene: None,
             log: None,
         }
     }

@@ -59,6 +59,18 @@ class BrowserTest(unittest.TestCase):
             self.assertEqual(page.complaints, [], "the console")
         self.assertEqual(page.hosts(), {self.host}, "who was asked")
 
+    def sent_over_streams(self, page):
+        """What the page sends to simulators from now on."""
+        sent = []
+
+        def record(socket):
+            if "/client" not in socket.url and "/session" not in socket.url:
+                # Playwright takes no methods of builtin types.
+                socket.on("framesent", lambda text: sent.extend([text]))
+
+        page.tab.on("websocket", record)
+        return sent
+
     def start_world(self, name="Playground", **options):
         """The viewer page with a simulation that is ready, and its simulation server."""
         page = self.open(self.fleet.session.url("viewer"), **options)

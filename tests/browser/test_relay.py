@@ -27,7 +27,9 @@ class Relayed(BrowserTest):
         link = row.get_by_role("link", name="Watch")
         address = link.get_attribute("href")
         self.assertRegex(address, r"^watch\?id=[0-9T-]+$")
-        teacher = self.open(server.url(address), http_credentials={"username": "admin", "password": "secret"})
+        teacher = self.open("about:blank", http_credentials={"username": "admin", "password": "secret"})
+        sent = self.sent_over_streams(teacher)
+        teacher.tab.goto(server.url(address))
         expect(teacher.tab.locator("#state")).to_have_text("Watching")
         expect(student.tab.locator("#watched")).to_have_text("Your teacher is watching.")
         expect(teacher.tab.get_by_role("button", name="Home view")).to_be_visible()
@@ -39,6 +41,9 @@ class Relayed(BrowserTest):
         shown = picture(teacher)
         until("the teacher sees it move", lambda: picture(teacher) != shown)
         expect(student.tab.locator("#mode")).to_have_text("real time")
+        # The world is one of R2025a. A request for another kind would be an error in the student's console.
+        self.assertEqual(sent, ["w3d;broadcast"])
+        expect(student.tab.locator("#stage details")).to_be_hidden()
         teacher.close()
         expect(student.tab.locator("#watched")).to_be_hidden()
 

@@ -74,14 +74,7 @@ class Viewing(BrowserTest):
 
     def test_the_scene_is_requested_once_by_the_kind_that_the_server_tells(self):
         page = self.open(self.fleet.session.url("viewer"))
-        sent = []
-
-        def record(socket):
-            if "/client" not in socket.url and "/session" not in socket.url:
-                # Playwright takes no methods of builtin types.
-                socket.on("framesent", lambda text: sent.extend([text]))
-
-        page.tab.on("websocket", record)
+        sent = self.sent_over_streams(page)
         expect(page.tab.locator("#availability")).to_contain_text("Available")
         page.tab.get_by_role("button", name="Playground").click()
         page.tab.get_by_role("button", name="Connect", exact=True).click()

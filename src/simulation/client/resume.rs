@@ -56,7 +56,7 @@ impl Session {
             return;
         };
         if let Some(scene) = launched.scene {
-            self.text(protocol::kind(scene).to_owned());
+            self.text(protocol::kind(scene));
         }
         self.text(protocol::webots(url));
         if let Some(token) = token {

@@ -99,9 +99,12 @@ impl Session {
             project.world.version
         );
         let version = project.world.version.clone();
-        slot.lease.update(|simulation| simulation.version = Some(version));
         let release = Release::of_simulation(&program, &project.world.version);
         let scene = (self.mode != Mode::Mjpeg).then(|| SceneKind::of(release));
+        slot.lease.update(|simulation| {
+            simulation.version = Some(version);
+            simulation.scene = scene;
+        });
         self.text(protocol::loading("webots is starting"));
         let gpu = self.take_gpu(&slot.lease);
         let project = Arc::new(project);
