@@ -34,6 +34,17 @@ const MOTION: &str = r#"{
     "FPS": 50,
     "robots": {"mover": {"id": 6, "start": [1, 2, 0], "heading": 0, "radius": 0.4, "speed": 0.25}}
 }"#;
+/// What Webots exports of a world, in the form of its releases until R2023b.
+const EXPORT: &str =
+    "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n<!DOCTYPE X3D>\n<X3D>\n  <Scene>\n  </Scene>\n</X3D>\n";
+/// Its animation: frames that are 50 ms apart, with their own order of fields, and one without a change.
+const FRAMES: [&str; 5] = [
+    r#"{"time":0,"updates":[{"id":301,"translation":"0 0 0","rotation":"0 0 1 3.1416","scale":"1 1 1"}]}"#,
+    r#"{"time":50,"updates":[{"id":301,"translation":"-0.002 0 0","rotation":"0.0012 0 1 3.1416"}]}"#,
+    r#"{"time":100,"updates":[{"id":301,"translation":"-0.0059 0 0"}],"labels":[{"id":0,"text":"a label","x":0}]}"#,
+    r#"{"time":150}"#,
+    r#"{"time":200,"updates":[{"id":301,"translation":"-0.0099 0 0"}]}"#,
+];
 /// The robot's initial position.
 const START: &str = r#"application/json:{"time":0,"updates":[{"id":6,"translation":"1 2 0","rotation":"0 0 1 0"}]}"#;
 
@@ -190,6 +201,60 @@ async fn a_viewer_hears_the_whole_scene_first() {
         );
         assert_eq!(rest, [START, "scene load completed", "pause: 0"]);
     }
+}
+
+#[actix_rt::test]
+async fn an_export_is_streamed_as_it_stands_in_its_files_at_the_pace_of_its_animation() {
+    let simulator = Simulator::start();
+    let preview = simulator.project.path().join("preview");
+    std::fs::create_dir(&preview).unwrap();
+    std::fs::write(preview.join("scene.x3d"), EXPORT).unwrap();
+    let animation = FRAMES.join(",\n");
+    std::fs::write(
+        preview.join("animation.json"),
+        format!("{{\n \"basicTimeStep\":50,\n \"labelsIds\":\"0\",\n \"frames\":[\n{animation}\n ]\n}}\n"),
+    )
+    .unwrap();
+    // only then is the first world shown by it
+    std::fs::remove_file(simulator.project.path().join("worlds/a.x3d")).unwrap();
+
+    let mut viewer = simulator.connect().await;
+    viewer.send("reload").await;
+    let model = viewer.until("model:").await;
+    if model.contains("mover") {
+        assert_eq!(viewer.until("model:").await, format!("model:{EXPORT}"));
+    } else {
+        assert_eq!(model, format!("model:{EXPORT}"));
+    }
+    viewer.until("scene load completed").await;
+    for frame in &FRAMES[1..] {
+        viewer.send("step").await;
+        assert_eq!(
+            viewer.until("application/json:").await,
+            format!("application/json:{frame}")
+        );
+    }
+    let mut late = simulator.connect().await;
+    late.send("w3d;broadcast").await;
+    let state = r#"{"time":200,"updates":[{"id":301,"rotation":"0.0012 0 1 3.1416","scale":"1 1 1","translation":"-0.0099 0 0"}],"labels":[{"id":0,"text":"a label","x":0}]}"#;
+    assert_eq!(
+        late.until("application/json:").await,
+        format!("application/json:{state}")
+    );
+
+    viewer.send("reset").await;
+    viewer.until("reset finished").await;
+    let begin = Instant::now();
+    viewer.send("real-time:-1").await;
+    let frames = 12;
+    viewer.heard.clear();
+    viewer
+        .until(&format!("application/json:{{\"time\":{}", 50 * frames))
+        .await;
+    let passed = begin.elapsed();
+    assert!(passed > Duration::from_millis(50 * (frames - 2)), "{passed:?}");
+    let updates = viewer.heard.iter().filter(|text| text.starts_with("application/json:"));
+    assert!(updates.count() > 3, "{:?}", viewer.heard);
 }
 
 #[actix_rt::test]

@@ -80,11 +80,16 @@ impl Clients {
         self.send_where(&text.into(), |_, _| true);
     }
 
-    /// Sends an update to all clients that read fast enough.
-    pub(crate) fn broadcast_update(&mut self, text: impl Into<ByteString>) {
+    /// Sends an update to all clients that read fast enough. Those that missed one before get the whole `state`.
+    pub(crate) fn broadcast_update(&mut self, text: impl Into<ByteString>, state: impl Fn() -> String) {
         let text = text.into();
         for client in self.connected.values_mut() {
-            client.missed_update = !client.handle.send_update(text.clone());
+            let text = if client.missed_update {
+                state().into()
+            } else {
+                text.clone()
+            };
+            client.missed_update = !client.handle.send_update(text);
         }
     }
 

@@ -2,14 +2,15 @@
 //! a fleet can be tried, tested and measured on a machine without Webots. The servers contain no code for it; a
 //! configuration names it as the Webots to start.
 //!
-//! It does not read world files beyond their first lines: the scene and the motion come from two files beside the world
-//! (`scene`), or from a small built-in scene. It simulates no physics, runs no controllers and renders no pictures.
+//! It does not read world files beyond their first lines: the scene and the motion come from two files beside the world,
+//! from an export of Webots in its project, or from a small built-in scene (`scene`). It simulates no physics, runs no controllers and renders no pictures.
 //! `docs/webots.md` compares it with Webots.
 //!
 //! `main` reads the command line, opens the port, and only then loads the world, as Webots does. One thread does
 //! everything, as the event loop of Webots: an actor, the `simulation`, and a task for each connection (`http`), which
 //! of a WebSocket is a `client`. While that thread is blocked, nothing is answered.
 
+mod animation;
 mod args;
 mod client;
 mod clients;

@@ -6,7 +6,15 @@
 //! | `NAME.x3d` | the model, as it is sent to clients |
 //! | `NAME.motion.json` | the step, the frame rate, and the motion of the model's robots |
 //!
-//! A world without a model is shown as a small built-in scene, with the file's name as its title.
+//! A world without a model is shown as what Webots has exported of it, if its project has that, as the competitions of
+//! webots.cloud do:
+//!
+//! | file of the project | |
+//! |---|---|
+//! | `preview/scene.w3d`, or else `preview/scene.x3d` | the model, which is sent as it is |
+//! | `preview/animation.json` | the motion, see `animation` |
+//!
+//! Otherwise it is shown as a small built-in scene, with the file's name as its title.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -17,6 +25,7 @@ use askama::Template;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+use crate::animation::{Animation, AnimationError};
 use crate::motion::{Pose, Robot};
 
 /// Size limit of a file, in bytes.
@@ -31,19 +40,30 @@ pub(crate) enum SceneError {
     Unreadable { path: PathBuf, source: io::Error },
     #[error("the motion of the robots: {0}")]
     Motion(#[from] serde_json::Error),
+    #[error("animation.json: {0}")]
+    Animation(#[from] AnimationError),
+    #[error("there is no '{}'", .0.display())]
+    Missing(PathBuf),
 }
 
 /// The scene that clients see.
 #[derive(Debug)]
 pub(crate) struct Scene {
-    /// The model, as XML on one line.
+    /// The model, as XML.
     pub(crate) model: String,
     motion: Motion,
 }
 
+#[derive(Debug)]
+enum Motion {
+    Circles(Circles),
+    Recorded(Animation),
+}
+
+/// The motion of robots that drive in circles.
 #[derive(Debug, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-struct Motion {
+struct Circles {
     /// Length of a step, in milliseconds.
     #[serde(rename = "basicTimeStep")]
     basic_time_step: f64,
@@ -67,7 +87,7 @@ struct Update {
     updates: Vec<Pose>,
 }
 
-impl Default for Motion {
+impl Default for Circles {
     fn default() -> Self {
         Self {
             basic_time_step: 32.0,
@@ -78,19 +98,43 @@ impl Default for Motion {
 }
 
 impl Scene {
-    /// Reads the scene beside a world. Blocks.
-    pub(crate) fn load(world: &Path) -> Result<Self, SceneError> {
-        let Some(model) = read(&world.with_extension("x3d"))? else {
-            return Self::built_in(world);
-        };
-        let motion = match read(&world.with_extension("motion.json"))? {
+    /// Reads the scene of a world of `project`. Blocks.
+    pub(crate) fn load(world: &Path, project: &Path) -> Result<Self, SceneError> {
+        if let Some(model) = read(&world.with_extension("x3d"))? {
+            return Self::prepared(world, &model);
+        }
+        match Self::exported(&project.join("preview"))? {
+            Some(scene) => Ok(scene),
+            None => Self::built_in(world),
+        }
+    }
+
+    fn prepared(world: &Path, model: &str) -> Result<Self, SceneError> {
+        let circles = match read(&world.with_extension("motion.json"))? {
             Some(text) => serde_json::from_str(&text)?,
-            None => Motion::default(),
+            None => Circles::default(),
         };
         Ok(Self {
-            model: on_one_line(&model),
-            motion,
+            model: on_one_line(model),
+            motion: Motion::Circles(circles),
         })
+    }
+
+    /// What Webots has exported to `folder`; `None` if that has no scene.
+    fn exported(folder: &Path) -> Result<Option<Self>, SceneError> {
+        let model = match read(&folder.join("scene.w3d"))? {
+            None => read(&folder.join("scene.x3d"))?,
+            model => model,
+        };
+        let Some(model) = model else { return Ok(None) };
+        let path = folder.join("animation.json");
+        let Some(animation) = read(&path)? else {
+            return Err(SceneError::Missing(path));
+        };
+        Ok(Some(Self {
+            model,
+            motion: Motion::Recorded(Animation::parse(&animation)?),
+        }))
     }
 
     fn built_in(world: &Path) -> Result<Self, SceneError> {
@@ -102,7 +146,7 @@ impl Scene {
         let model = DefaultModel { title: &title }.to_string();
         Ok(Self {
             model: on_one_line(&model),
-            motion: serde_json::from_str(DEFAULT_MOTION)?,
+            motion: Motion::Circles(serde_json::from_str(DEFAULT_MOTION)?),
         })
     }
 
@@ -110,25 +154,49 @@ impl Scene {
     pub(crate) fn empty() -> Self {
         Self {
             model: on_one_line(EMPTY_MODEL),
-            motion: Motion::default(),
+            motion: Motion::Circles(Circles::default()),
         }
     }
 
     /// Length of a step, in milliseconds.
     pub(crate) fn step(&self) -> f64 {
-        self.motion.basic_time_step.clamp(0.1, 10_000.0)
+        match &self.motion {
+            Motion::Circles(circles) => circles.basic_time_step.clamp(0.1, 10_000.0),
+            Motion::Recorded(animation) => animation.step,
+        }
     }
 
     /// Updates per second of wall time, at most.
     pub(crate) fn fps(&self) -> f64 {
-        self.motion.fps.clamp(1.0, 240.0)
+        let fps = match &self.motion {
+            Motion::Circles(circles) => circles.fps,
+            Motion::Recorded(animation) => animation.fps(),
+        };
+        fps.clamp(1.0, 240.0)
     }
 
-    /// Returns, as JSON, the poses of the robots at `time`, in milliseconds.
-    pub(crate) fn update(&self, time: f64) -> String {
+    /// Returns, as JSON, the state at `time`, in milliseconds.
+    pub(crate) fn state(&self, time: f64) -> String {
+        match &self.motion {
+            Motion::Circles(circles) => circles.state(time),
+            Motion::Recorded(animation) => animation.state(time),
+        }
+    }
+
+    /// Returns, as JSON, what is sent of the time after `from` up to `to`, in milliseconds.
+    pub(crate) fn updates(&self, from: f64, to: f64) -> Vec<String> {
+        match &self.motion {
+            Motion::Circles(circles) => vec![circles.state(to)],
+            Motion::Recorded(animation) => animation.updates(from, to),
+        }
+    }
+}
+
+impl Circles {
+    fn state(&self, time: f64) -> String {
         // via text, so that a whole number of milliseconds has no decimal point, as in Webots
         let number = time.to_string().parse().unwrap_or_else(|_| 0.into());
-        let updates = self.motion.robots.values().map(|robot| robot.pose(time)).collect();
+        let updates = self.robots.values().map(|robot| robot.pose(time)).collect();
         serde_json::to_string(&Update { time: number, updates }).unwrap_or_default()
     }
 }

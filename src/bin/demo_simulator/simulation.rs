@@ -50,6 +50,8 @@ pub(crate) struct Simulation {
     /// `None` while the world's assets are downloaded. While it is read, nothing runs.
     scene: Option<Scene>,
     clock: Clock,
+    /// Simulation time of the last update, in milliseconds.
+    updated: f64,
     clients: Clients,
     console: Console,
     /// Whether clients are served at all.
@@ -75,6 +77,7 @@ impl Simulation {
             names: WorldNames::default(),
             release: Release::default(),
             clock: Clock::new(mode, Scene::empty().step()),
+            updated: 0.0,
             scene: None,
             clients: Clients::default(),
             console,
@@ -200,8 +203,9 @@ impl Simulation {
     fn reset(&mut self) {
         console::status("reset");
         self.clock.reset();
+        self.updated = 0.0;
         if let Some(scene) = &self.scene {
-            self.clients.broadcast(protocol::update(&scene.update(0.0)));
+            self.clients.broadcast(protocol::update(&scene.state(0.0)));
             self.clients.broadcast(protocol::RESET_FINISHED);
         }
     }
@@ -230,7 +234,7 @@ impl Simulation {
         Some(vec![
             protocol::world(&self.names),
             protocol::model(&scene.model),
-            protocol::update(&scene.update(self.clock.now())),
+            protocol::update(&scene.state(self.clock.now())),
             protocol::SCENE_COMPLETED.to_owned(),
         ])
     }
@@ -306,6 +310,7 @@ impl Simulation {
     /// Sends the scene to all clients: from time 0, in the same mode.
     fn loaded(&mut self, scene: Scene, phases: Phases, ctx: &mut Context<Self>) {
         self.clock.restart(scene.step());
+        self.updated = 0.0;
         self.names = self.file.names();
         self.scene = Some(scene);
         for status in ["Parsing world", "Finalizing nodes"] {
@@ -330,7 +335,7 @@ impl Simulation {
         let frame = Duration::from_secs_f64(1.0 / scene.fps());
         let period = match mode {
             Mode::Pause => {
-                let update = protocol::update(&scene.update(self.clock.now()));
+                let update = protocol::update(&scene.state(self.clock.now()));
                 return self.clients.send_missed_update(update);
             }
             Mode::RealTime => frame.max(Duration::from_secs_f64(scene.step() / 1000.0)),
@@ -362,10 +367,13 @@ impl Simulation {
     }
 
     fn send_update(&mut self) {
-        if let Some(scene) = &self.scene {
+        let Some(scene) = &self.scene else { return };
+        let now = self.clock.now();
+        for update in scene.updates(self.updated, now) {
             self.clients
-                .broadcast_update(protocol::update(&scene.update(self.clock.now())));
+                .broadcast_update(protocol::update(&update), || protocol::update(&scene.state(now)));
         }
+        self.updated = now;
     }
 }
 

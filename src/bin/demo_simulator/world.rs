@@ -140,7 +140,7 @@ impl WorldFile {
 
     /// Loads the world's scene. Blocks.
     pub(crate) fn load(&self) -> Result<Scene, WorldError> {
-        Ok(Scene::load(&self.path)?)
+        Ok(Scene::load(&self.path, &self.project)?)
     }
 
     fn name(&self, path: &Path) -> String {
