@@ -11,9 +11,10 @@ use tokio::sync::watch;
 use super::config::SimulationConfig;
 use super::ends::Ends;
 use super::slots::SlotPool;
+use super::snapshot::Snapshot;
 use super::state::AppState;
 use super::{announcer, readiness};
-use crate::shared::domain::{AdmissionRules, Reason};
+use crate::shared::domain::{AdmissionRules, FleetKey, Reason, ServerRun};
 use crate::shared::http::server::{self, HttpServerOptions};
 use crate::shared::http::{
     AddressQuota, BasicAuth, ConnectionLimiter, LiveUpdates, Metrics, STREAMS_PER_CLIENT, SharedPage, TCP_PER_CLIENT,
@@ -213,6 +214,7 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
         config.waiting_line,
         config.max_places_per_address,
         config.max_places_per_user,
+        config.timing.pass,
         ends.clone(),
     );
     let csv = config
@@ -241,6 +243,8 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
     );
     Ok(AppState {
         rules,
+        fleet_key: config.fleet_key.as_ref().map(|key| FleetKey::new(key.reveal())),
+        server_run: ServerRun(rand::random()),
         problem,
         failed_starts,
         ends,
@@ -282,9 +286,10 @@ async fn drained(server: &AppState) {
     empty(server).await;
 }
 
-/// Waits until there is no simulation, and the queue is empty.
+/// Waits until there is no simulation, no slot is reserved, and the queue is empty.
 async fn empty(server: &AppState) {
-    while !server.slots.snapshot().simulations.is_empty() {
+    let is_empty = |all: &Snapshot| all.simulations.is_empty() && all.instances.reserved == 0;
+    while !is_empty(&server.slots.snapshot()) {
         actix_rt::time::sleep(POLL_INTERVAL).await;
     }
 }

@@ -2,7 +2,7 @@
 //!
 //! | from the client (JSON) | |
 //! |---|---|
-//! | `{"start": {"url": WORLD, "mode": "x3d" \| "w3d" \| "mjpeg", "resumable": true, "name": NAME}}` | start a simulation; `resumable`: its client may resume it; `name`: what the client calls itself |
+//! | `{"start": {"url": WORLD, "mode": "x3d" \| "w3d" \| "mjpeg", "resumable": true, "name": NAME, "pass": PASS}}` | start a simulation; `resumable`: its client may resume it; `name`: what the client calls itself; `pass`: for a slot that is reserved for it |
 //! | `{"resume": TOKEN}` | resume a simulation |
 //! | `{"keep": true}` | keep a paused simulation: its idle timeout begins again |
 //! | `{"reset controller": "NAME/FILE"}` | restore a file below `controllers/` |
@@ -67,6 +67,8 @@ pub struct Start {
     pub resumable: Option<bool>,
     /// What its client calls itself.
     pub name: Option<String>,
+    /// Its pass to a reserved slot, from the line of a session server.
+    pub pass: Option<String>,
 }
 
 /// How a simulation is shown.
@@ -314,6 +316,7 @@ mod tests {
                 mode,
                 resumable,
                 name: name.map(str::to_owned),
+                pass: None,
             };
             ClientRequest {
                 start: Some(start),

@@ -61,6 +61,9 @@ pub struct Simulation {
     pub pid: Option<i32>,
     /// The streaming port, once there is one.
     pub port: Option<u16>,
+    /// Seconds for which its client has waited for the slot, once it has one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub waited: Option<f64>,
     /// The number of its GPU, if simulations are spread over several.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gpu: Option<u32>,
@@ -89,6 +92,7 @@ impl Simulation {
             launched: None,
             pid: None,
             port: None,
+            waited: None,
             gpu: None,
             away_until: None,
             version: None,

@@ -11,7 +11,9 @@ use super::ends::Ends;
 use super::readiness::FailedStarts;
 use super::sessions::Sessions;
 use super::slots::SlotPool;
-use crate::shared::domain::{AdmissionRules, Failure, Load, ProjectUrl, Reason};
+use crate::shared::domain::{
+    AdmissionRules, Failure, FleetKey, Load, Pass, ProjectUrl, Reason, ReservationId, ServerRun,
+};
 use crate::shared::http::{AddressQuota, BasicAuth, ConnectionLimiter, LiveUpdates, Metrics, SharedPage};
 use crate::shared::run::Phase;
 use crate::simulation::checkout::CheckoutService;
@@ -28,6 +30,10 @@ pub const WEBOTS_THREADS: usize = 4;
 pub struct AppState {
     /// The effective configuration.
     pub config: Arc<SimulationConfig>,
+    /// The key of the fleet, if there is one.
+    pub fleet_key: Option<FleetKey>,
+    /// This run of the server, for which passes are valid.
+    pub server_run: ServerRun,
     /// Which worlds may run.
     pub rules: AdmissionRules,
     /// Leases slots.
@@ -131,13 +137,16 @@ impl AppState {
         *self.phase.borrow() != Phase::Open
     }
 
-    /// Checks whether a world may run here now: its URL, the rules, and that the server accepts clients.
+    /// Checks whether a world may run here now: its URL, the rules, and that the server accepts clients. Returns the
+    /// slot that is reserved for a client with this pass.
     ///
     /// # Errors
     /// Why it may not.
-    pub fn admit(&self, url: &str) -> Result<ProjectUrl, Failure> {
+    pub fn admit(&self, url: &str, pass: Option<&str>) -> Result<(ProjectUrl, Option<ReservationId>), Failure> {
         let world = ProjectUrl::parse(url).map_err(|wrong| Failure::new(Reason::InvalidWorld, wrong.to_string()))?;
-        if self.is_draining() {
+        let reservation = self.reservation(&world, pass)?;
+        // A slot that was reserved before is given.
+        if self.is_draining() && reservation.is_none() {
             let message = "This simulation server is about to end, and takes no new clients";
             return Err(Failure::new(Reason::Draining, message));
         }
@@ -145,7 +154,20 @@ impl AppState {
             return Err(Failure::new(Reason::NotReady, problem));
         }
         self.rules.admit(&world, self.load())?;
-        Ok(world)
+        Ok((world, reservation))
+    }
+
+    /// What a pass for this world is for. A server without the fleet's key reserves no slots, and ignores passes.
+    fn reservation(&self, world: &ProjectUrl, pass: Option<&str>) -> Result<Option<ReservationId>, Failure> {
+        let Some((key, pass)) = self.fleet_key.as_ref().zip(pass) else {
+            return Ok(None);
+        };
+        let pass = Pass::read(pass, key, world).filter(|pass| pass.server == self.server_run);
+        let pass = pass.ok_or_else(|| {
+            let message = "This pass is not valid for this world on this simulation server";
+            Failure::new(Reason::InvalidPass, message)
+        })?;
+        Ok(Some(pass.reservation))
     }
 
     /// Returns why this server can't start simulations; `None` if it can.

@@ -5,6 +5,7 @@ mod stand_in;
 mod announcing;
 mod discovery;
 mod door;
+mod fleet_line;
 mod mail;
 mod memory;
 mod placement;

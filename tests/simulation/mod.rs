@@ -13,6 +13,7 @@ mod life;
 mod limits;
 mod opened;
 mod own_failures;
+mod passes;
 mod places;
 mod protocol;
 mod readiness;

@@ -1,6 +1,6 @@
 //! The line of the fleet: passes what happens to it between clients, monitors and the dispatcher. Part of the registry.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::net::IpAddr;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -59,6 +59,10 @@ pub enum LineEvent {
 pub(super) struct LineKeeper {
     dispatcher: Dispatcher<PublicAddress, Recipient<LineEvent>>,
     waited: Histogram,
+    /// Whether this server has a key, for which others reserve slots.
+    has_key: bool,
+    /// The servers that have another key.
+    refused_by: HashSet<PublicAddress>,
     /// When the clients were last told how they stand.
     told: Instant,
 }
@@ -70,11 +74,13 @@ type Records = HashMap<PublicAddress, ServerRecord>;
 const NEWS: Duration = Duration::from_secs(1);
 
 impl LineKeeper {
-    /// Nobody waits. Observes in `waited` how long each client has waited, in seconds.
-    pub(super) fn new(waited: Histogram) -> Self {
+    /// Nobody waits. `has_key` is whether this server can ask for reservations. Observes in `waited` how long each client has waited, in seconds.
+    pub(super) fn new(waited: Histogram, has_key: bool) -> Self {
         Self {
             dispatcher: Dispatcher::default(),
             waited,
+            has_key,
+            refused_by: HashSet::new(),
             told: Instant::now(),
         }
     }
@@ -134,8 +140,15 @@ impl LineKeeper {
             return;
         }
         match change {
-            LinkChange::Up(hello) => self.dispatcher.link(server.clone(), &hello),
+            LinkChange::Up(hello) => {
+                self.refused_by.remove(&server);
+                self.dispatcher.link(server.clone(), &hello);
+            }
             LinkChange::Down => self.dispatcher.unlink(&server),
+            LinkChange::Refused => {
+                self.dispatcher.unlink(&server);
+                self.refused_by.insert(server.clone());
+            }
             LinkChange::Offers(offers) => {
                 let turns = self.dispatcher.offered(&server, &offers, &mut servers.fleet, moment());
                 self.give(turns);
@@ -191,7 +204,15 @@ impl LineKeeper {
     /// Gives turns, and tells servers who waits: this one, or all.
     fn serve(&mut self, servers: &mut ServerTable, only: Option<&PublicAddress>) {
         let ServerTable { records, fleet, .. } = servers;
-        let Served { turns, wishes } = self.dispatcher.serve(fleet, accepts(records), only, moment());
+        // Until it can be asked for reservations, a server that makes some gets nobody: its slot might be another's.
+        let will_reserve = |server: &PublicAddress| {
+            let report = records.get(server).and_then(|record| record.state.report());
+            self.has_key && !self.refused_by.contains(server) && report.is_some_and(|report| report.reserves)
+        };
+        let served = self
+            .dispatcher
+            .serve(fleet, accepts(records), will_reserve, only, moment());
+        let Served { turns, wishes } = served;
         self.give(turns);
         for (server, wishes) in wishes {
             servers.ask(&server, wishes);

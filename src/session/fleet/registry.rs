@@ -76,9 +76,9 @@ impl Registry {
                 // A large class behind one address may reserve room at once.
                 quota: AddressQuota::new(200, 12),
                 changes: StateHistory::new(&config),
+                line: LineKeeper::new(waited, config.fleet_key.is_some()),
                 config,
                 servers,
-                line: LineKeeper::new(waited),
                 available,
             }
         })

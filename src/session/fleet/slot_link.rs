@@ -36,8 +36,10 @@ pub enum LinkChange {
     Up(Hello),
     /// It has reserved slots, or answers wishes.
     Offers(Offers),
-    /// It reserves no more slots.
+    /// It reserves no more slots, but may again.
     Down,
+    /// It has another key, and reserves none for this session server.
+    Refused,
 }
 
 /// What a link needs.
@@ -84,7 +86,12 @@ impl SlotLink {
             let Err(error) = self.open(&mut wishes).await else {
                 return;
             };
-            self.tell(LinkChange::Down);
+            let is_refused = matches!(error, LinkError::WrongKey);
+            self.tell(if is_refused {
+                LinkChange::Refused
+            } else {
+                LinkChange::Down
+            });
             log::debug!("{}: no slots are reserved: {error}", self.server);
             let pause = match error {
                 LinkError::Broken(_) => PAUSE,

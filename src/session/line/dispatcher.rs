@@ -235,12 +235,13 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
         turns
     }
 
-    /// Gives turns on servers that only report, and says what the others must be told: of these, only one if only its
+    /// Gives turns on servers that only report, and will not reserve slots soon, and says what the others must be told: of these, only one if only its
     /// state has changed.
     pub fn serve(
         &mut self,
         fleet: &mut LoadBalancer<Server>,
         accepts: impl Fn(&Server, &ProjectUrl) -> bool,
+        will_reserve: impl Fn(&Server) -> bool,
         only: Option<&Server>,
         now: Moment,
     ) -> Served<Server, Client> {
@@ -249,7 +250,7 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
             mut assigned,
             starved,
             plain,
-        } = self.share(fleet, &accepts, now);
+        } = self.share(fleet, &accepts, &will_reserve, now);
         let mut turns = Vec::new();
         for (place, server) in plain {
             turns.extend(self.turn(place, &server, None, now));
@@ -295,6 +296,7 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
         &self,
         fleet: &mut LoadBalancer<Server>,
         accepts: &impl Fn(&Server, &ProjectUrl) -> bool,
+        will_reserve: &impl Fn(&Server) -> bool,
         now: Moment,
     ) -> Shares<Server> {
         let mut shares = Shares {
@@ -322,7 +324,10 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
             if pending.contains(place) || starved.contains(&Arc::as_ptr(&waiting.group)) {
                 continue;
             }
-            match fleet.pick(now.instant, true, |server| accepts(server, &waiting.group.world)) {
+            let may_take = |server: &Server| {
+                accepts(server, &waiting.group.world) && (self.links.contains_key(server) || !will_reserve(server))
+            };
+            match fleet.pick(now.instant, true, may_take) {
                 None => {
                     starved.insert(Arc::as_ptr(&waiting.group));
                     shares.starved.push(Arc::clone(&waiting.group));
@@ -675,7 +680,9 @@ mod tests {
         fn serve(&mut self) {
             loop {
                 let accepts = accepts(&self.servers);
-                let Served { turns, wishes } = self.dispatcher.serve(&mut self.balancer, accepts, None, self.now);
+                let Served { turns, wishes } =
+                    self.dispatcher
+                        .serve(&mut self.balancer, accepts, |_| false, None, self.now);
                 if turns.is_empty() && wishes.is_empty() {
                     return;
                 }

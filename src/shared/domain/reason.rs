@@ -98,7 +98,13 @@ reasons! {
         QueueFull = "queue-full", Fleet, Later;
         /// The client's address or user has as many slots and waits for as many as it may.
         ShareUsed = "share-used", User, Later;
-        /// The server takes no new clients, because it is about to end.
+        /// The pass of a client in the line is forged, or for another world or server.
+    InvalidPass = "invalid-pass", User, Later;
+    /// The pass was used already.
+    UsedPass = "used-pass", User, Later;
+    /// The pass was not used in time (`timing.pass`).
+    ExpiredPass = "expired-pass", User, Later;
+    /// The server takes no new clients, because it is about to end.
         Draining = "draining", Server, Elsewhere;
         /// The server can start no simulation: Webots, its display, its disk or its Docker is missing or fails.
         NotReady = "not-ready", Server, Elsewhere;

@@ -39,6 +39,9 @@ pub struct ServerReport {
     /// Whether the server accepts no new clients because it is about to stop.
     #[serde(default)]
     pub draining: bool,
+    /// Whether the server reserves slots for session servers that have its `fleetKey`.
+    #[serde(default)]
+    pub reserves: bool,
     /// Number of consecutive failed starts of which the server is the cause.
     #[serde(default)]
     pub failed_starts: u32,

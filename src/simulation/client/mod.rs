@@ -2,8 +2,10 @@
 
 mod resume;
 mod session;
+mod slot_link;
 mod start;
 mod web_client;
 
 pub use session::Session;
+pub use slot_link::SlotLink;
 pub use web_client::WebClient;

@@ -149,8 +149,8 @@ impl State {
 impl Session {
     /// Opens the session of a client that requests a simulation; or tells it why it gets none.
     pub fn open(server: Arc<AppState>, identity: ClientIdentity, connection: Connection, request: &protocol::Start) {
-        let world = match Self::admit(&server, connection.peer, &request.url) {
-            Ok(world) => world,
+        let (world, reservation) = match Self::admit(&server, connection.peer, request) {
+            Ok(admitted) => admitted,
             Err(failure) => return connection.client.do_send(ToClient::End(failure)),
         };
         let id = SimulationId::next();
@@ -158,7 +158,7 @@ impl Session {
         log::info!("{id}: client {peer}: asks for {world}{identity}");
         Self::create(|ctx| {
             let me = ctx.address().recipient();
-            let state = match SlotLease::acquire(&server.slots, id, me, &world, (peer, identity)) {
+            let state = match SlotLease::acquire(&server.slots, id, me, &world, (peer, identity), reservation) {
                 Ok(lease) => State::Waiting { world, lease },
                 Err(failure) => State::Over { failure, token: None },
             };

@@ -7,24 +7,28 @@ use std::time::Instant;
 use actix::prelude::*;
 
 use super::session::{Launched, Session, State, WebotsHandle};
-use crate::shared::domain::{Blame, Failure, ProjectUrl, Reason};
+use crate::shared::domain::{Blame, Failure, ProjectUrl, Reason, ReservationId};
 use crate::shared::http::Peer;
 use crate::simulation::checkout::Project;
 use crate::simulation::machine::sensors::Gpu;
-use crate::simulation::protocol::{self, Mode, SceneKind};
+use crate::simulation::protocol::{self, Mode, SceneKind, Start};
 use crate::simulation::readiness;
 use crate::simulation::slots::{Slot, SlotLease};
 use crate::simulation::state::AppState;
 use crate::simulation::webots::{LaunchSpec, Release, Webots, WebotsEvent};
 
 impl Session {
-    /// Checks whether a client may request a simulation of this world.
+    /// Checks whether a client may request a simulation. Returns the slot that is reserved for it, if it has a pass.
     ///
     /// # Errors
     /// Why it may not.
-    pub(super) fn admit(server: &AppState, peer: Peer, url: &str) -> Result<ProjectUrl, Failure> {
+    pub(super) fn admit(
+        server: &AppState,
+        peer: Peer,
+        request: &Start,
+    ) -> Result<(ProjectUrl, Option<ReservationId>), Failure> {
         let admitted = if server.start_quota.take(peer.rate_limit_key()) {
-            server.admit(url)
+            server.admit(&request.url, request.pass.as_deref())
         } else {
             let message = "Too many simulations were asked for from your address. Try again in a minute";
             Err(Failure::new(Reason::TooManyRequests, message))

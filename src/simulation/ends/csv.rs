@@ -9,7 +9,7 @@ use crate::shared::run::{RotatedFile, timestamp};
 use crate::shared::text::one_line;
 
 /// The first line.
-const HEADING: &str = "id,begin,end,client,repository,world,port,level,peak memory (bytes),processor time (s),reason,user,label (unverified)\n";
+const HEADING: &str = "id,begin,end,client,repository,world,port,level,peak memory (bytes),processor time (s),reason,user,label (unverified),waited (s)\n";
 /// Size from which the file is rotated, in bytes.
 const MAX_SIZE: u64 = 2_500_000;
 
@@ -42,6 +42,10 @@ fn line(level: &str, ended: &Ended) -> String {
         ended.end.failure.reason.code().to_owned(),
         quoted(simulation.identity.user.as_deref().unwrap_or_default()),
         quoted(simulation.identity.label.as_deref().unwrap_or_default()),
+        simulation
+            .waited
+            .map(|waited| format!("{waited:.1}"))
+            .unwrap_or_default(),
     ];
     fields.join(",") + "\n"
 }

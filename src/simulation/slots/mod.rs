@@ -1,10 +1,12 @@
 //! The slots that clients wait for: leases, the queue, and the limits per address and user; the streams of simulations.
 
+mod reservations;
 mod simulation_record;
 mod slot_lease;
 mod slot_pool;
 mod stream;
 
+pub use reservations::{LinkId, Reserved};
 pub use simulation_record::SlotEvent;
 pub use slot_lease::{Slot, SlotLease};
 pub use slot_pool::SlotPool;

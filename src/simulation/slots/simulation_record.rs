@@ -2,7 +2,7 @@
 
 use std::net::IpAddr;
 use std::sync::{Arc, OnceLock};
-use std::time::SystemTime;
+use std::time::{Instant, SystemTime};
 
 use actix::{Message, Recipient};
 use tokio::sync::Semaphore;
@@ -17,6 +17,8 @@ use crate::simulation::snapshot::{Simulation, Stage};
 
 /// A simulation of this server.
 pub(super) struct SimulationRecord {
+    /// When its client has asked for it, here or in the line of a session server.
+    pub since: Instant,
     /// The number of clients ahead in the queue, as last sent.
     pub sent_position: Option<usize>,
     /// Receives its events.
@@ -88,7 +90,7 @@ pub(super) enum Holder {
 }
 
 /// Clients that share a limit of slots: those of one address, or of one user, whom a trusted reverse proxy names.
-#[derive(PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(super) enum Party {
     Address(IpAddr),
     User(String),
@@ -119,6 +121,7 @@ impl SimulationRecord {
     pub(super) fn new(simulation: Simulation, client: Peer, listener: Recipient<SlotEvent>) -> Self {
         let event = format!("its client asks for {}", simulation.world);
         let mut record = Self {
+            since: Instant::now(),
             sent_position: None,
             listener,
             simulation,
@@ -142,6 +145,7 @@ impl SimulationRecord {
     /// Grants it a port.
     pub(super) fn lend(&mut self, port: u16) {
         self.simulation.port = Some(port);
+        self.simulation.waited = Some(self.since.elapsed().as_secs_f64());
         self.simulation.stage = Stage::CheckingOut;
         self.note(&format!("it is given port {port}, its world is checked out"));
         self.listener.do_send(SlotEvent::Granted(port));

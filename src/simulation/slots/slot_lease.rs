@@ -6,7 +6,7 @@ use actix::Recipient;
 
 use super::simulation_record::{Access, Holder, SimulationRecord, SlotEvent};
 use super::slot_pool::SlotPool;
-use crate::shared::domain::{Failure, ProjectUrl};
+use crate::shared::domain::{Failure, ProjectUrl, ReservationId};
 use crate::shared::http::Peer;
 use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::ends::End;
@@ -29,7 +29,7 @@ pub struct Slot {
 }
 
 impl SlotLease {
-    /// Joins the queue for a slot. `listener` receives the events, `world` is shown, and the client counts for its address and
+    /// Joins the queue for a slot, or takes the one that is reserved for the client. `listener` receives the events, `world` is shown, and the client counts for its address and
     /// its user.
     ///
     /// # Errors
@@ -40,12 +40,10 @@ impl SlotLease {
         listener: Recipient<SlotEvent>,
         world: &ProjectUrl,
         (client, identity): (Peer, ClientIdentity),
+        reservation: Option<ReservationId>,
     ) -> Result<Self, Failure> {
-        slots.acquire(SimulationRecord::new(
-            Simulation::new(id, world, identity),
-            client,
-            listener,
-        ))?;
+        let record = SimulationRecord::new(Simulation::new(id, world, identity), client, listener);
+        slots.acquire(record, reservation)?;
         Ok(Self {
             id,
             slots: Arc::clone(slots),

@@ -9,12 +9,14 @@ use std::io::ErrorKind;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, TcpListener};
 use std::ops::RangeInclusive;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
+use actix::Recipient;
 use parking_lot::Mutex;
 
+use super::reservations::{LinkId, Reservations, Reserved};
 use super::simulation_record::{Party, SimulationRecord, SlotEvent};
-use crate::shared::domain::{Failure, Instances, Reason};
+use crate::shared::domain::{Failure, Instances, Reason, ReservationId, Wish, Wishes};
 use crate::simulation::ends::Ends;
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::snapshot::{Simulation, Snapshot, Stage};
@@ -29,22 +31,29 @@ pub(super) struct Slots {
     per_user: Option<usize>,
     /// Number of leases that were requested, including those of clients that were refused.
     arrivals: u64,
+    /// Number of simulations that have given their slots back.
+    freed: u64,
+    /// The slots that are reserved for clients of session servers' lines.
+    reservations: Reservations,
     /// All simulations in the order in which they were requested. Those without a port are the queue.
     pub(super) records: BTreeMap<SimulationId, SimulationRecord>,
     ends: Ends,
 }
 
+/// Interval between two checks of reservations.
+const EXPIRY: Duration = Duration::from_millis(100);
 /// Interval between two checks of the ports that other programs have used.
 const RECHECK: Duration = Duration::from_secs(1);
 
 impl SlotPool {
     /// Leases these ports; `queue_capacity` clients may wait. `per_address` and `per_user` limit the slots of one
-    /// address and one user, and likewise their waiting clients. Each end is recorded with `ends`.
+    /// address and one user, and likewise their waiting clients. A reservation holds for the time `pass`. Each end is recorded with `ends`.
     pub fn new(
         ports: RangeInclusive<u16>,
         queue_capacity: usize,
         per_address: Option<usize>,
         per_user: Option<usize>,
+        pass: Duration,
         ends: Ends,
     ) -> Arc<Self> {
         Arc::new(Self(Mutex::new(Slots {
@@ -53,40 +62,82 @@ impl SlotPool {
             per_address,
             per_user,
             arrivals: 0,
+            freed: 0,
+            reservations: Reservations::new(pass),
             records: BTreeMap::new(),
             ends,
         })))
     }
 
-    /// Checks every second whether ports that other programs used are free again, and grants them.
+    /// Checks every second whether ports that other programs used are free again, and grants them; and more often
+    /// whether reservations have expired.
     pub async fn recheck(self: Arc<Self>) {
+        let mut checked = Instant::now();
         loop {
-            actix_rt::time::sleep(RECHECK).await;
-            self.0.lock().serve();
+            actix_rt::time::sleep(EXPIRY).await;
+            let mut slots = self.0.lock();
+            let now = Instant::now();
+            if slots.reservations.expire(now) || now.duration_since(checked) >= RECHECK {
+                checked = now;
+                slots.serve();
+            }
         }
+    }
+
+    /// A session server has connected, for whose line slots are reserved.
+    pub fn open_link(&self, id: LinkId, listener: Recipient<Reserved>) {
+        let mut slots = self.0.lock();
+        slots.reservations.open(id, listener);
+        slots.serve();
+    }
+
+    /// A session server has left.
+    pub fn close_link(&self, id: LinkId) {
+        let mut slots = self.0.lock();
+        slots.reservations.close(id);
+        slots.serve();
+    }
+
+    /// These clients of a session server want slots, and no others.
+    pub fn wish(&self, id: LinkId, wishes: &Wishes) {
+        let mut slots = self.0.lock();
+        let limits = (slots.per_address, slots.per_user);
+        let parties = |wish: &Wish| parties(wish.address, wish.user.clone(), limits);
+        slots.reservations.wish(id, wishes, parties);
+        slots.serve();
+    }
+
+    /// No slots are reserved any more for clients of a session server.
+    pub fn clear_wishes(&self, id: LinkId) {
+        self.0.lock().reservations.clear(id);
     }
 
     /// Adds a simulation to the queue, and grants it a slot if it is its turn.
     ///
     /// # Errors
     /// Why it may not wait: the slots and the queue are full, or its address or its user has reached its limit.
-    pub(super) fn acquire(&self, mut record: SimulationRecord) -> Result<(), Failure> {
+    pub(super) fn acquire(
+        &self,
+        mut record: SimulationRecord,
+        reservation: Option<ReservationId>,
+    ) -> Result<(), Failure> {
         let mut slots = self.0.lock();
+        let reservation = reservation.map(|id| slots.reservations.redeem(id)).transpose()?;
         slots.arrivals += 1;
-        let address = record
-            .client
-            .rate_limit_key()
-            .map(Party::Address)
-            .zip(slots.per_address);
-        let user = record
-            .simulation
-            .identity
-            .user
-            .clone()
-            .map(Party::User)
-            .zip(slots.per_user);
-        record.parties = address.into_iter().chain(user).collect();
+        let limits = (slots.per_address, slots.per_user);
+        let user = record.simulation.identity.user.clone();
+        record.parties = parties(record.client.rate_limit_key(), user, limits);
         let id = record.simulation.id;
+        if let Some(reservation) = reservation {
+            record.since = reservation.since;
+            // It may count for somebody else than the session server knew.
+            if record.parties == reservation.parties || may_have(&slots.lent(), &record.parties) {
+                record.lend(reservation.port);
+                slots.records.insert(id, record);
+                slots.serve();
+                return Ok(());
+            }
+        }
         let refusal = slots.refusal(&record);
         slots.records.insert(id, record);
         slots.grant();
@@ -104,6 +155,10 @@ impl SlotPool {
     pub(super) fn release(&self, id: SimulationId) {
         let mut slots = self.0.lock();
         if let Some(record) = slots.records.remove(&id) {
+            if let Some(port) = record.simulation.port {
+                slots.freed += 1;
+                log::info!(target: "simulation", "{id}: the slot of port {port} is free");
+            }
             slots.ends.record(record.ended());
         }
         slots.serve();
@@ -156,23 +211,44 @@ impl Slots {
 
     /// The simulations in the queue whose client's address and user may have another slot.
     fn eligible(&self) -> impl Iterator<Item = &SimulationRecord> {
-        let mut lent: HashMap<&Party, usize> = HashMap::new();
-        for (party, _) in self
+        let lent = self.lent();
+        self.queue().filter(move |waiting| may_have(&lent, &waiting.parties))
+    }
+
+    /// Number of slots that each address and user has whose slots are limited.
+    fn lent(&self) -> HashMap<Party, usize> {
+        let mut lent: HashMap<Party, usize> = HashMap::new();
+        let of_records = self
             .records
             .values()
             .filter(|record| record.simulation.port.is_some())
-            .flat_map(|record| &record.parties)
-        {
-            *lent.entry(party).or_default() += 1;
+            .flat_map(|record| &record.parties);
+        let of_reservations = self.reservations.reserved.values().flat_map(|one| &one.parties);
+        for (party, _) in of_records.chain(of_reservations) {
+            *lent.entry(party.clone()).or_default() += 1;
         }
-        self.queue().filter(move |waiting| {
-            let may_have_one = |(party, most): &(Party, usize)| lent.get(party).is_none_or(|slots| slots < most);
-            waiting.parties.iter().all(may_have_one)
-        })
+        lent
     }
 
-    fn next_in_queue(&self) -> Option<SimulationId> {
-        self.eligible().next().map(|next| next.simulation.id)
+    /// Who gets the next slot: of those in the queue and in the lines of session servers, the one that came first.
+    fn next(&self) -> Option<Next> {
+        let lent = self.lent();
+        let in_line = self.reservations.first(|parties| may_have(&lent, parties));
+        let in_queue = self
+            .queue()
+            .filter(|waiting| may_have(&lent, &waiting.parties))
+            .map(|waiting| {
+                let is_behind = self.reservations.is_behind(waiting.client.rate_limit_key());
+                ((is_behind, waiting.since), waiting.simulation.id)
+            })
+            .min();
+        match (in_line, in_queue) {
+            (Some((link, index, order)), queue) if queue.is_none_or(|(other, _)| order < other) => {
+                Some(Next::InLine(link, index))
+            }
+            (_, Some((_, id))) => Some(Next::InQueue(id)),
+            (_, None) => None,
+        }
     }
 
     /// Why one more simulation may not wait; `None` if it may.
@@ -204,12 +280,16 @@ impl Slots {
     fn serve(&mut self) {
         self.grant();
         self.make_room();
-        for (ahead, waiting) in self
+        let queue: Vec<Instant> = self.queue().map(|waiting| waiting.since).collect();
+        let free = self.ports.len().saturating_sub(self.taken().count());
+        self.reservations.tell(free, &queue);
+        for (before, waiting) in self
             .records
             .values_mut()
             .filter(|record| record.simulation.port.is_none())
             .enumerate()
         {
+            let ahead = before + self.reservations.ahead_of(waiting.since);
             if waiting.sent_position.replace(ahead) != Some(ahead) {
                 waiting.listener.do_send(SlotEvent::Queued(ahead));
             }
@@ -217,11 +297,17 @@ impl Slots {
     }
 
     fn grant(&mut self) {
-        while let Some(next) = self.next_in_queue()
+        while let Some(next) = self.next()
             && let Some(port) = self.free_port()
-            && let Some(first) = self.records.get_mut(&next)
         {
-            first.lend(port);
+            match next {
+                Next::InLine(link, index) => self.reservations.reserve(link, index, port),
+                Next::InQueue(id) => {
+                    if let Some(first) = self.records.get_mut(&id) {
+                        first.lend(port);
+                    }
+                }
+            }
         }
     }
 
@@ -229,7 +315,8 @@ impl Slots {
     /// longest absent first, of addresses for which more than a quarter of the slots waits. So somebody who leaves one
     /// simulation after the other can't keep all slots.
     fn make_room(&mut self) {
-        let waiting = self.eligible().count();
+        let lent = self.lent();
+        let waiting = self.eligible().count() + self.reservations.waiting(|parties| may_have(&lent, parties));
         if waiting == 0 || self.free_port().is_some() {
             return;
         }
@@ -267,13 +354,15 @@ impl Slots {
             .min_by_key(|record| record.simulation.away_until)
     }
 
-    /// The lowest port that is neither leased nor used by another program.
+    /// The ports that are leased or reserved.
+    fn taken(&self) -> impl Iterator<Item = u16> {
+        let leased = self.records.values().filter_map(|record| record.simulation.port);
+        leased.chain(self.reservations.reserved.values().map(|one| one.port))
+    }
+
+    /// The lowest port that is neither leased nor reserved nor used by another program.
     fn free_port(&self) -> Option<u16> {
-        let taken: HashSet<u16> = self
-            .records
-            .values()
-            .filter_map(|record| record.simulation.port)
-            .collect();
+        let taken: HashSet<u16> = self.taken().collect();
         self.ports.clone().find(|port| !taken.contains(port) && is_free(*port))
     }
 
@@ -293,9 +382,35 @@ impl Slots {
             running: count(&[Stage::Running]),
             places: u32::try_from(self.ports.len()).unwrap_or(u32::MAX),
             arrivals: self.arrivals,
-            ..Instances::default()
+            reserved: u32::try_from(self.reservations.reserved.len()).unwrap_or(u32::MAX),
+            freed: self.freed,
         }
     }
+}
+
+/// Who gets the next slot.
+enum Next {
+    /// A simulation in the queue.
+    InQueue(SimulationId),
+    /// A client in the line of a session server.
+    InLine(LinkId, usize),
+}
+
+/// The address and the user of a client, if their slots are limited, each with its limit.
+fn parties(
+    address: Option<IpAddr>,
+    user: Option<String>,
+    (per_address, per_user): (Option<usize>, Option<usize>),
+) -> Vec<(Party, usize)> {
+    let address = address.map(Party::Address).zip(per_address);
+    let user = user.map(Party::User).zip(per_user);
+    address.into_iter().chain(user).collect()
+}
+
+/// Whether these may have another slot.
+fn may_have(lent: &HashMap<Party, usize>, parties: &[(Party, usize)]) -> bool {
+    let is_left = |(party, most): &(Party, usize)| lent.get(party).is_none_or(|slots| slots < most);
+    parties.iter().all(is_left)
 }
 
 /// Whether no program listens on a port, over IPv4 or IPv6; a machine may have only one of them.

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use actix_web::error::ErrorInternalServerError;
+use actix_web::error::{ErrorInternalServerError, ErrorNotFound};
 use actix_web::{HttpRequest, HttpResponse, web};
 
 use super::access::{Visitor, check_origin};
@@ -10,7 +10,7 @@ use super::status::status_page;
 use super::{actions, metrics, page_routes, stream_routes};
 use crate::shared::http::routing::{self, GET, READ, path};
 use crate::shared::http::{CONTENT_TYPE, ConnectionKind, websocket};
-use crate::simulation::client::WebClient;
+use crate::simulation::client::{SlotLink, WebClient};
 use crate::simulation::state::AppState;
 
 /// Adds all routes to an app.
@@ -20,6 +20,7 @@ pub fn configure(app: &mut web::ServiceConfig) {
 
 fn add(app: &mut web::ServiceConfig) {
     app.service(path("/client", GET, client))
+        .service(path("/slots", GET, slots))
         .service(path("/load", READ, load))
         .configure(page_routes::configure)
         .configure(stream_routes::configure)
@@ -47,6 +48,24 @@ async fn client(
         &request,
         stream,
         WebClient::new(server, (peer, user), permit),
+    ))
+}
+
+/// The WebSocket of a session server, in a fleet with a key.
+async fn slots(
+    request: HttpRequest,
+    stream: web::Payload,
+    server: web::Data<AppState>,
+) -> actix_web::Result<HttpResponse> {
+    let key = server.fleet_key.clone();
+    let key = key.ok_or_else(|| ErrorNotFound("Error: no slots are reserved here."))?;
+    let peer = server.config.trusted_proxies.peer(&request);
+    let permit = server.connections.admit(ConnectionKind::Page, peer)?;
+    let server = Arc::clone(&server);
+    Ok(websocket::open(
+        &request,
+        stream,
+        SlotLink::new(server, peer, key, permit),
     ))
 }
 

@@ -34,6 +34,7 @@ pub fn status_page(server: &AppState, snapshot: &Snapshot, names_machine: bool) 
         share_idle_time: rules.share_idle_time,
         docker: Some(rules.docker),
         draining: server.is_draining(),
+        reserves: server.fleet_key.is_some(),
         failed_starts: server.failed_starts.count(),
         problem: server.problem(),
     };

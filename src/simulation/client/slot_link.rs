@@ -1,0 +1,159 @@
+//! Actor: the WebSocket on `/slots` of one session server, for whose line this server reserves slots.
+//!
+//! Created by the route for each connection; ends with it. The session server proves first that it has the fleet's key.
+//! What it wants replaces what it wanted before, and ends with the connection.
+
+use std::sync::Arc;
+
+use actix::prelude::*;
+use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
+use serde::Serialize;
+
+use crate::shared::domain::{FleetKey, Hello, Proof, Wishes};
+use crate::shared::http::liveness::{self, Liveness};
+use crate::shared::http::{ConnectionPermit, Peer};
+use crate::shared::run::{Phase, closing};
+use crate::simulation::slots::{LinkId, Reserved};
+use crate::simulation::state::AppState;
+
+/// The actor.
+pub struct SlotLink {
+    server: Arc<AppState>,
+    peer: Peer,
+    key: FleetKey,
+    state: State,
+    liveness: Liveness,
+    _permit: ConnectionPermit,
+}
+
+/// What is known of the peer.
+enum State {
+    /// It has to answer this.
+    Challenged(Hello),
+    /// It has the key.
+    Trusted(LinkId),
+}
+
+type Context = WebsocketContext<SlotLink>;
+
+impl SlotLink {
+    /// A session server that has just connected; `permit` counts it.
+    pub fn new(server: Arc<AppState>, peer: Peer, key: FleetKey, permit: ConnectionPermit) -> Self {
+        let hello = Hello {
+            challenge: rand::random(),
+            server: server.server_run,
+            pass: server.config.timing.pass.as_secs_f64(),
+        };
+        Self {
+            server,
+            peer,
+            key,
+            state: State::Challenged(hello),
+            liveness: Liveness::default(),
+            _permit: permit,
+        }
+    }
+
+    fn send(message: &impl Serialize, ctx: &mut Context) {
+        // These messages can always be written.
+        if let Ok(text) = serde_json::to_string(message) {
+            ctx.text(text);
+        }
+    }
+
+    fn handle_text(&mut self, text: &str, ctx: &mut Context) {
+        match &self.state {
+            State::Challenged(hello) => {
+                let proof = serde_json::from_str::<Proof>(text);
+                if !proof.is_ok_and(|proof| hello.is_proved(&self.key, &proof)) {
+                    log::warn!("client {}: wants slots, and does not have the fleetKey", self.peer);
+                    return Self::close(CloseCode::Policy, ctx);
+                }
+                log::info!(
+                    "client {}: is a session server, for whose line slots are reserved",
+                    self.peer
+                );
+                let id = LinkId(rand::random());
+                self.state = State::Trusted(id);
+                self.server.slots.open_link(id, ctx.address().recipient());
+            }
+            State::Trusted(id) => match serde_json::from_str::<Wishes>(text) {
+                Ok(wishes) if self.server.takes_nobody() => {
+                    let nothing = Wishes {
+                        first: Vec::new(),
+                        all: 0,
+                        ..wishes
+                    };
+                    self.server.slots.wish(*id, &nothing);
+                }
+                Ok(wishes) => self.server.slots.wish(*id, &wishes),
+                Err(error) => {
+                    log::warn!("client {}: {error}", self.peer);
+                    Self::close(CloseCode::Policy, ctx);
+                }
+            },
+        }
+    }
+
+    fn close(code: CloseCode, ctx: &mut Context) {
+        ctx.close(Some(CloseReason {
+            code,
+            description: None,
+        }));
+        ctx.stop();
+    }
+}
+
+impl Actor for SlotLink {
+    type Context = Context;
+
+    fn started(&mut self, ctx: &mut Self::Context) {
+        let timing = &self.server.config.timing;
+        liveness::watch(ctx, timing.ping, timing.silence, |link| &mut link.liveness);
+        if let State::Challenged(hello) = &self.state {
+            Self::send(hello, ctx);
+        }
+        let mut phase = self.server.phase.subscribe();
+        async move { phase.wait_for(|phase| *phase != Phase::Open).await.is_ok() }
+            .into_actor(self)
+            .map(|_, link, _| {
+                if let State::Trusted(id) = link.state {
+                    link.server.slots.clear_wishes(id);
+                }
+            })
+            .spawn(ctx);
+        closing(self.server.phase.subscribe())
+            .into_actor(self)
+            .map(|(), _, ctx| Self::close(CloseCode::Away, ctx))
+            .spawn(ctx);
+    }
+
+    fn stopped(&mut self, _: &mut Self::Context) {
+        if let State::Trusted(id) = self.state {
+            self.server.slots.close_link(id);
+        }
+    }
+}
+
+impl Handler<Reserved> for SlotLink {
+    type Result = ();
+
+    fn handle(&mut self, Reserved(offers): Reserved, ctx: &mut Self::Context) {
+        Self::send(&offers, ctx);
+    }
+}
+
+impl StreamHandler<Result<Message, ProtocolError>> for SlotLink {
+    fn handle(&mut self, message: Result<Message, ProtocolError>, ctx: &mut Self::Context) {
+        match message {
+            Ok(Message::Text(text)) => self.handle_text(&text, ctx),
+            Ok(Message::Ping(data)) => ctx.pong(&data),
+            Ok(Message::Pong(content)) => self.liveness.pong(&content),
+            Ok(Message::Close(reason)) => {
+                ctx.close(reason);
+                ctx.stop();
+            }
+            _ => Self::close(CloseCode::Policy, ctx),
+        }
+    }
+}

@@ -1,0 +1,311 @@
+//! The line of a whole fleet: real simulation servers, and clients that come, wait, reload, stay and leave.
+
+use std::cell::{Cell, RefCell};
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::{Duration, Instant};
+
+use base64::Engine;
+use base64::engine::general_purpose::URL_SAFE_NO_PAD;
+use nix::sys::signal::Signal;
+use serde_json::json;
+
+use super::until_states;
+use crate::support::client::{Client, Heard};
+use crate::support::git::{Forge, WORLD, world};
+use crate::support::program::{Builder, Server, session_server, simulation_server};
+use crate::support::webots::Webots;
+use crate::support::{SOON, until};
+
+const SECRET: &str = "a secret of this test";
+const SLOTS: u16 = 5;
+/// Tolerance of the clocks of this test: it sees a change later than the server that makes it.
+const SEEN: Duration = Duration::from_millis(300);
+
+/// A client's time in the line, as the client knows it.
+#[derive(Debug, Clone)]
+struct Wait {
+    /// The place in its ticket: the time of its arrival, and its number.
+    place: (u64, u64),
+    owner: &'static str,
+    from: Instant,
+    /// When it was over, and the server, if it was the client's turn.
+    until: Instant,
+    server: Option<String>,
+}
+
+/// What all clients do.
+#[derive(Default)]
+struct Class {
+    waits: RefCell<Vec<Wait>>,
+    /// The addresses of Webots that are in use.
+    held: RefCell<BTreeSet<String>>,
+    /// When clients have left which server.
+    left: RefCell<Vec<(String, Instant)>>,
+    served: Cell<usize>,
+    /// Number of turns that led to no simulation, because the server was gone.
+    lost_turns: Cell<usize>,
+}
+
+/// One client.
+struct Visitor<'class> {
+    class: &'class Class,
+    session: String,
+    owner: &'static str,
+    ticket: String,
+    stay: Duration,
+    /// Whether it reloads its page while it waits.
+    reloads: bool,
+}
+
+fn place(ticket: &str) -> (u64, u64) {
+    let bytes = URL_SAFE_NO_PAD.decode(ticket).unwrap();
+    let number = |at: usize| u64::from_be_bytes(bytes[at..at + 8].try_into().unwrap());
+    (number(0), number(8))
+}
+
+impl Visitor<'_> {
+    fn world(&self) -> String {
+        world(&format!("{}/arm", self.owner), "main", "worlds/a.wbt")
+    }
+
+    async fn visit(mut self) {
+        loop {
+            let Some((server, pass)) = self.turn().await else {
+                actix_rt::time::sleep(Duration::from_millis(100)).await;
+                continue;
+            };
+            if self.simulate(&server, &pass).await {
+                self.class.served.set(self.class.served.get() + 1);
+                return;
+            }
+            self.class.lost_turns.set(self.class.lost_turns.get() + 1);
+            actix_rt::time::sleep(Duration::from_millis(100)).await;
+        }
+    }
+
+    /// Waits for its turn. Returns `None` if the connection ends before.
+    async fn turn(&mut self) -> Option<(String, String)> {
+        let mut line = Client::try_connect(&self.session).await.ok()?;
+        let request = json!({"url": self.world(), "wait": true, "ticket": self.ticket});
+        line.try_send(&request.to_string()).await.ok()?;
+        let (mut from, mut pass, mut position) = (None, String::new(), usize::MAX);
+        let turn = loop {
+            match line.next_within(Duration::from_secs(90)).await.expect("a sign of life") {
+                Heard::Closed(_) => break None,
+                Heard::Text(text) => match text.split_once(": ").unwrap_or((&text, "")) {
+                    ("ticket", ticket) => {
+                        from.get_or_insert_with(Instant::now);
+                        ticket.clone_into(&mut self.ticket);
+                    }
+                    ("queue", ahead) => {
+                        position = ahead.parse().unwrap();
+                        if self.reloads && position < 60 {
+                            self.reloads = false;
+                            break None;
+                        }
+                    }
+                    ("pass", given) => given.clone_into(&mut pass),
+                    ("Error", why) => panic!("{why}"),
+                    _ if text.starts_with("ws://") => break Some((text, pass)),
+                    _ => {}
+                },
+            }
+        };
+        if let Some(from) = from {
+            self.class.waits.borrow_mut().push(Wait {
+                place: place(&self.ticket),
+                owner: self.owner,
+                from,
+                until: Instant::now(),
+                server: turn.as_ref().map(|(server, _)| server.clone()),
+            });
+        }
+        turn
+    }
+
+    /// Runs a simulation; returns whether it ran to its end.
+    async fn simulate(&self, server: &str, pass: &str) -> bool {
+        let Ok(mut client) = Client::try_connect(&format!("{server}/client")).await else {
+            println!("{server}: no connection {:?} {pass}", place(&self.ticket));
+            return false;
+        };
+        assert!(!pass.is_empty(), "{server} reserves slots");
+        let request = json!({"start": {"url": self.world(), "pass": pass}});
+        if client.try_send(&request.to_string()).await.is_err() {
+            return false;
+        }
+        let url = loop {
+            match client.next_within(SOON).await {
+                Some(Heard::Text(text)) if text.starts_with("webots:") => break text,
+                Some(Heard::Text(text)) => assert!(!text.starts_with("queue:"), "{server}: a slot is given twice"),
+                other => {
+                    println!("{server}: {other:?} {:?}", client.heard);
+                    return false;
+                }
+            }
+        };
+        assert!(self.class.held.borrow_mut().insert(url.clone()), "{url} is another's");
+        actix_rt::time::sleep(self.stay).await;
+        self.class.held.borrow_mut().remove(&url);
+        self.class.left.borrow_mut().push((server.to_owned(), Instant::now()));
+        client.leave().await;
+        true
+    }
+}
+
+impl Class {
+    /// The pairs of clients of which the second had its turn before the first, although both waited, the first had come
+    /// earlier, and the server could take both.
+    fn overtakings(&self, takes: &BTreeMap<String, &[&str]>) -> Vec<(Wait, Wait)> {
+        let waits = self.waits.borrow();
+        let mut found = Vec::new();
+        for turn in waits.iter().filter(|wait| wait.server.is_some()) {
+            let takes = takes[turn.server.as_ref().unwrap()];
+            let was_passed_over = |other: &&Wait| {
+                other.place < turn.place
+                    && takes.contains(&other.owner)
+                    && other.from + SEEN < turn.until
+                    && other.until > turn.until + SEEN
+            };
+            found.extend(
+                waits
+                    .iter()
+                    .filter(was_passed_over)
+                    .map(|other| (other.clone(), turn.clone())),
+            );
+        }
+        found
+    }
+
+    /// How long slots were idle after clients had left, while somebody waited who could use them.
+    fn idle(&self, takes: &BTreeMap<String, &[&str]>) -> Vec<Duration> {
+        let waits = self.waits.borrow();
+        let mut idle = Vec::new();
+        for (server, takes) in takes {
+            let mut turns: Vec<Instant> = waits
+                .iter()
+                .filter(|wait| wait.server.as_ref() == Some(server))
+                .map(|wait| wait.until)
+                .collect();
+            turns.sort();
+            let mut turns = turns.into_iter().peekable();
+            for (_, left) in self.left.borrow().iter().filter(|(one, _)| one == server) {
+                while turns.next_if(|turn| turn < left).is_some() {}
+                let Some(turn) = turns.next() else { break };
+                let could_use = |wait: &Wait| takes.contains(&wait.owner) && wait.from < *left && wait.until >= turn;
+                if waits.iter().any(could_use) {
+                    idle.push(turn - *left);
+                }
+            }
+        }
+        idle.sort();
+        idle
+    }
+}
+
+fn server(forge: &Forge, webots: &Webots, owners: &[&str]) -> Builder {
+    let allowed: Vec<_> = owners
+        .iter()
+        .map(|owner| format!("https://github.com/{owner}"))
+        .collect();
+    simulation_server(&webots.path(), forge.path(), SLOTS)
+        .set("allowedRepositories", json!(allowed))
+        .set("isolation", "none")
+        .set("fleetKey", SECRET)
+}
+
+fn fleet(servers: &[&Server]) -> Builder {
+    let addresses: Vec<String> = servers.iter().map(|server| server.address()).collect();
+    session_server(&addresses)
+        .set("fleetKey", SECRET)
+        .set("loadThreshold", 1000)
+}
+
+#[actix_rt::test]
+async fn on_a_quiet_machine_two_hundred_share_twenty_slots_in_order_whatever_happens() {
+    const CLIENTS: usize = 200;
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    forge.commit("school/arm", "main", &[("worlds/a.wbt", WORLD)]);
+    let both: &[&str] = &["lab", "school"];
+    let lab: &[&str] = &["lab"];
+    let mut killed = server(&forge, &webots, both).start().await;
+    let drained = server(&forge, &webots, lab).start().await;
+    let third = server(&forge, &webots, both).start().await;
+    let fourth = server(&forge, &webots, lab).start().await;
+    let mut session = fleet(&[&killed, &drained, &third, &fourth]).start().await;
+    until_states(&session, &["up"; 4]).await;
+    let class = Class::default();
+    let url = session.websocket("/session");
+    let clients = (0..CLIENTS).map(|number| {
+        let visitor = Visitor {
+            class: &class,
+            session: url.clone(),
+            owner: if number % 3 == 0 { "school" } else { "lab" },
+            ticket: String::new(),
+            stay: Duration::from_millis(500 + 10 * (number as u64 * 37 % 100)),
+            reloads: number % 10 == 5,
+        };
+        async move {
+            actix_rt::time::sleep(Duration::from_millis(5 * number as u64)).await;
+            visitor.visit().await;
+        }
+    });
+    let served = async |count: usize| {
+        let begun = Instant::now();
+        while class.served.get() < count {
+            assert!(
+                begun.elapsed() < Duration::from_secs(120),
+                "{} are served",
+                class.served.get()
+            );
+            actix_rt::time::sleep(Duration::from_millis(20)).await;
+        }
+    };
+    let mut takes: BTreeMap<String, &[&str]> = BTreeMap::new();
+    for (server, owners) in [(&killed, both), (&drained, lab), (&third, both), (&fourth, lab)] {
+        takes.insert(format!("ws://{}", server.address()), owners);
+    }
+    let events = async {
+        served(CLIENTS / 5).await;
+        killed.signal(Signal::SIGKILL);
+        killed.ended().await;
+        served(CLIENTS * 2 / 5).await;
+        drained.signal(Signal::SIGUSR1);
+        let added = server(&forge, &webots, both).start().await;
+        takes.insert(format!("ws://{}", added.address()), both);
+        let addresses = [&drained, &third, &fourth, &added].map(|server| server.address());
+        session.reload(json!({"simulationServers": addresses}));
+        served(CLIENTS * 3 / 5).await;
+        session.signal(Signal::SIGKILL);
+        session.ended().await;
+        let again = fleet(&[&third, &fourth, &added]).port(session.port).start().await;
+        served(CLIENTS).await;
+        (added, again)
+    };
+    let (_, (_added, again)) = tokio::join!(futures_util::future::join_all(clients), events);
+    assert_eq!(class.served.get(), CLIENTS);
+    let overtakings = class.overtakings(&takes);
+    let idle = class.idle(&takes);
+    let at = |share: usize| idle[(idle.len() - 1) * share / 100];
+    println!(
+        "{} turns, {} lost with their server, {} overtakings; {} slots were free while somebody waited: median {:?}, 95 % {:?}, \
+         longest {:?}",
+        class.waits.borrow().iter().filter(|wait| wait.server.is_some()).count(),
+        class.lost_turns.get(),
+        overtakings.len(),
+        idle.len(),
+        at(50),
+        at(95),
+        at(100),
+    );
+    assert!(overtakings.is_empty(), "{overtakings:#?}");
+    assert!(
+        idle.len() > CLIENTS / 2 && at(95) < Duration::from_millis(200),
+        "{idle:?}"
+    );
+    until("nobody waits any more", async || {
+        again.status().await["line"]["waiting"] == 0
+    })
+    .await;
+    assert_eq!(again.status().await["line"]["waiting"], 0);
+}

@@ -1,0 +1,267 @@
+//! Passes: slots that are reserved for clients of the line of a session server.
+
+use std::time::Duration;
+
+use serde_json::{Value, json};
+use webots_fleet::shared::domain::{FleetKey, Hello, Offers, Pass, ProjectUrl, ReservationId, ServerRun, Wish, Wishes};
+
+use crate::support::program::{Builder, Server};
+use crate::support::{Client, arm, arm_at, demo_server, until};
+
+const SECRET: &str = "a secret of this test";
+
+/// A server with two slots that reserves them.
+fn reserving() -> Builder {
+    demo_server(2).set("fleetKey", SECRET).set("waitingLine", 4)
+}
+
+/// What a session server does.
+struct Link {
+    socket: Client,
+    hello: Hello,
+    number: u64,
+}
+
+impl Link {
+    async fn open(server: &Server) -> Self {
+        let (mut socket, hello) = Self::challenged(server).await;
+        let proof = hello.prove(&FleetKey::new(SECRET));
+        socket.send(&serde_json::to_string(&proof).unwrap()).await;
+        let mut link = Self {
+            socket,
+            hello,
+            number: 0,
+        };
+        assert_eq!(link.offers().await.offers, []);
+        link
+    }
+
+    async fn challenged(server: &Server) -> (Client, Hello) {
+        let mut socket = Client::connect(&server.websocket("/slots")).await;
+        let hello = socket.until("{").await;
+        (socket, serde_json::from_str(&hello).unwrap())
+    }
+
+    async fn offers(&mut self) -> Offers {
+        serde_json::from_str(&self.socket.until("{").await).unwrap()
+    }
+
+    /// The next offers that are not only an answer.
+    async fn slots(&mut self) -> Vec<(u64, ReservationId)> {
+        loop {
+            let offers = self.offers().await.offers;
+            if !offers.is_empty() {
+                return offers.iter().map(|offer| (offer.ticket, offer.reservation)).collect();
+            }
+        }
+    }
+
+    /// Wants slots for these tickets, each of which has waited for these milliseconds.
+    async fn want(&mut self, tickets: &[(u64, u64)]) {
+        self.number += 1;
+        let wish = |&(ticket, waited): &(u64, u64)| Wish {
+            ticket,
+            waited,
+            address: None,
+            user: None,
+        };
+        let wishes = Wishes {
+            number: self.number,
+            first: tickets.iter().map(wish).collect(),
+            all: u32::try_from(tickets.len()).unwrap(),
+            back: Vec::new(),
+        };
+        self.socket.send(&serde_json::to_string(&wishes).unwrap()).await;
+    }
+
+    fn pass(&self, reservation: ReservationId) -> String {
+        let pass = Pass {
+            server: self.hello.server,
+            reservation,
+        };
+        pass.write(&FleetKey::new(SECRET), &ProjectUrl::parse(&arm()).unwrap())
+    }
+}
+
+async fn start(server: &Server, world: &str, pass: &str) -> Client {
+    let mut client = Client::connect(&server.websocket("/client")).await;
+    client
+        .send(&json!({"start": {"url": world, "pass": pass}}).to_string())
+        .await;
+    client
+}
+
+/// The code of the reason for which a start is refused.
+async fn refused(server: &Server, world: &str, pass: &str) -> String {
+    let mut client = start(server, world, pass).await;
+    let reason = client.until("reason: ").await;
+    let reason: Value = serde_json::from_str(reason.trim_start_matches("reason: ")).unwrap();
+    client.until("loading: Error: ").await;
+    assert_eq!(client.closed().await, Some(1000));
+    reason["code"].as_str().unwrap().to_owned()
+}
+
+#[actix_rt::test]
+async fn a_pass_is_for_one_client_one_world_and_one_server() {
+    let (server, other) = (reserving().start().await, reserving().start().await);
+    let mut link = Link::open(&server).await;
+    link.want(&[(1, 0), (2, 0)]).await;
+    let slots = link.slots().await;
+    assert_eq!(slots.iter().map(|(ticket, _)| *ticket).collect::<Vec<_>>(), [1, 2]);
+    assert_eq!(server.status().await["instances"]["reserved"], 2);
+    // All slots are promised: nobody else gets one.
+    let mut without = Client::start(&server, &arm()).await;
+    assert_eq!(without.until("queue: ").await, "queue: 0");
+    without.until("loading: waiting for a place").await;
+    let pass = link.pass(slots[0].1);
+    let foreign = Pass {
+        server: link.hello.server,
+        reservation: slots[0].1,
+    };
+    let world = ProjectUrl::parse(&arm()).unwrap();
+    for forged in [
+        foreign.write(&FleetKey::new("another secret key"), &world),
+        pass.chars().rev().collect(),
+        String::new(),
+        Pass {
+            server: ServerRun(1),
+            ..foreign
+        }
+        .write(&FleetKey::new(SECRET), &world),
+    ] {
+        assert_eq!(refused(&server, &arm(), &forged).await, "invalid-pass", "{forged}");
+    }
+    assert_eq!(
+        refused(&server, &arm_at("worlds/other.wbt"), &pass).await,
+        "invalid-pass"
+    );
+    assert_eq!(refused(&other, &arm(), &pass).await, "invalid-pass");
+    // Nobody was disturbed by that: both have their slots.
+    let mut first = start(&server, &arm(), &pass).await;
+    first.until("webots:").await;
+    assert_eq!(refused(&server, &arm(), &pass).await, "used-pass");
+    let mut second = start(&server, &arm(), &link.pass(slots[1].1)).await;
+    second.until("webots:").await;
+    assert!(without.is_silent(Duration::from_millis(50)).await);
+    first.leave().await;
+    without.until("webots:").await;
+}
+
+#[actix_rt::test]
+async fn a_reservation_that_is_not_used_in_time_goes_to_the_next() {
+    let server = reserving().set("timing.pass", 0.5).start().await;
+    let mut link = Link::open(&server).await;
+    link.want(&[(1, 9), (2, 8), (3, 7)]).await;
+    let slots = link.slots().await;
+    assert_eq!(slots.len(), 2);
+    let next = link.slots().await;
+    assert_eq!(next[0].0, 3);
+    assert_eq!(refused(&server, &arm(), &link.pass(slots[0].1)).await, "expired-pass");
+    start(&server, &arm(), &link.pass(next[0].1))
+        .await
+        .until("webots:")
+        .await;
+}
+
+#[actix_rt::test]
+async fn the_order_of_arrival_holds_for_its_own_queue_and_all_session_servers() {
+    let server = reserving().start().await;
+    let (mut one, mut two) = (Client::ready(&server).await, Client::ready(&server).await);
+    let (mut link, mut other) = (Link::open(&server).await, Link::open(&server).await);
+    let mut own = Client::start(&server, &arm()).await;
+    assert_eq!(own.until("queue: ").await, "queue: 0");
+    // The first of each line came before it, the second of the other one later.
+    link.want(&[(1, 60_000)]).await;
+    assert_eq!(own.until("queue: ").await, "queue: 1");
+    other.want(&[(2, 90_000), (3, 0)]).await;
+    assert_eq!(own.until("queue: ").await, "queue: 2");
+    one.send("").await;
+    one.leave().await;
+    assert_eq!(other.slots().await[0].0, 2);
+    assert_eq!(own.until("queue: ").await, "queue: 1");
+    two.send("").await;
+    two.leave().await;
+    let slots = link.slots().await;
+    assert_eq!(slots[0].0, 1);
+    assert_eq!(own.until("queue: ").await, "queue: 0");
+    // Its client comes, and leaves: now it is the turn of the own client.
+    let mut first = start(&server, &arm(), &link.pass(slots[0].1)).await;
+    first.until("webots:").await;
+    first.leave().await;
+    own.until("webots:").await;
+    // A session server that is gone wants nothing any more, but what it was promised stays.
+    other.socket.leave().await;
+    until("its reservation stays", async || {
+        server.status().await["instances"]["reserved"] == 1
+    })
+    .await;
+}
+
+#[actix_rt::test]
+async fn only_a_server_with_the_key_gets_slots() {
+    let server = reserving().start().await;
+    let (mut socket, hello) = Link::challenged(&server).await;
+    let proof = hello.prove(&FleetKey::new("another secret key"));
+    socket.send(&serde_json::to_string(&proof).unwrap()).await;
+    assert_eq!(socket.closed().await, Some(1008));
+    // The answer to one challenge is none to another.
+    let (mut socket, other) = Link::challenged(&server).await;
+    assert_ne!(hello, other);
+    let replayed = hello.prove(&FleetKey::new(SECRET));
+    socket.send(&serde_json::to_string(&replayed).unwrap()).await;
+    assert_eq!(socket.closed().await, Some(1008));
+    let (mut socket, _) = Link::challenged(&server).await;
+    socket.send(r#"{"number": 1, "first": [], "all": 0}"#).await;
+    assert_eq!(socket.closed().await, Some(1008));
+    let plain = demo_server(1).start().await;
+    assert_eq!(
+        Client::with_headers(&plain.websocket("/slots"), &[]).await.unwrap_err(),
+        404
+    );
+}
+
+#[actix_rt::test]
+async fn a_draining_server_keeps_its_promises_and_makes_no_others() {
+    let mut server = reserving().start().await;
+    let inside = Client::ready(&server).await;
+    let mut link = Link::open(&server).await;
+    link.want(&[(1, 0), (2, 0)]).await;
+    let slots = link.slots().await;
+    server.signal(nix::sys::signal::Signal::SIGUSR1);
+    until("it drains", async || server.status().await["draining"] == true).await;
+    inside.leave().await;
+    let mut client = start(&server, &arm(), &link.pass(slots[0].1)).await;
+    client.until("webots:").await;
+    link.want(&[(2, 0)]).await;
+    assert_eq!(link.offers().await.offers, []);
+    client.leave().await;
+    assert_eq!(server.ended().await, Some(0));
+}
+
+#[actix_rt::test]
+async fn who_has_its_share_is_passed_over_and_keeps_its_place() {
+    let server = reserving()
+        .set("maxPlacesPerAddress", 1)
+        .set("userHeader", "X-User")
+        .start()
+        .await;
+    let mut greedy = Client::start_from(&server, "203.0.113.9", &arm()).await;
+    greedy.until("webots:").await;
+    let mut link = Link::open(&server).await;
+    let wish = |ticket: u64, waited: u64, address: &str| Wish {
+        ticket,
+        waited,
+        address: Some(address.parse().unwrap()),
+        user: None,
+    };
+    let wishes = Wishes {
+        number: 1,
+        first: vec![wish(1, 90, "203.0.113.9"), wish(2, 80, "203.0.113.10")],
+        all: 2,
+        back: Vec::new(),
+    };
+    link.socket.send(&serde_json::to_string(&wishes).unwrap()).await;
+    assert_eq!(link.slots().await[0].0, 2);
+    greedy.leave().await;
+    assert_eq!(link.slots().await[0].0, 1);
+}
