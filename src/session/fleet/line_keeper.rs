@@ -195,10 +195,7 @@ impl LineKeeper {
 
     /// What is known of the line.
     pub(super) fn status(&self) -> LineStatus {
-        LineStatus {
-            waiting: self.dispatcher.len(),
-            worlds: self.dispatcher.waiting_for(moment().unix),
-        }
+        self.dispatcher.status(moment().unix)
     }
 
     /// Gives turns, and tells servers who waits: this one, or all.

@@ -375,18 +375,13 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
         self.line.groups().any(|(group, _)| accepts(server, &group.world))
     }
 
-    /// Number of clients that wait.
-    pub fn len(&self) -> usize {
-        self.line.len()
-    }
-
     /// Whether nobody waits.
     pub fn is_empty(&self) -> bool {
         self.line.len() == 0
     }
 
-    /// What the clients wait for, those that have waited longest first.
-    pub fn waiting_for(&self, now: u64) -> Vec<WaitingFor> {
+    /// What is known of the line at this time, in milliseconds since 1970.
+    pub fn status(&self, now: u64) -> LineStatus {
         let mut found: Vec<WaitingFor> = Vec::new();
         let mut seen = HashMap::new();
         for (place, waiting) in self.line.iter() {
@@ -403,7 +398,10 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
                 one.waiting += 1;
             }
         }
-        found
+        LineStatus {
+            waiting: self.line.len(),
+            worlds: found,
+        }
     }
 
     /// The clients whose tickets must be sent again.

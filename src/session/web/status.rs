@@ -5,8 +5,7 @@ use std::time::Duration;
 use serde_json::{Value, json};
 
 use crate::session::fleet::{FleetStatus, ServerStatus};
-use crate::session::line::LineStatus;
-use crate::session::line::WaitingFor;
+use crate::session::line::{LineStatus, WaitingFor};
 use crate::session::state::AppState;
 use crate::shared::domain::{ClientUrls, Failure};
 

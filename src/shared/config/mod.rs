@@ -1,12 +1,14 @@
 //! Configuration files: loading, errors, and the types of values.
 
+mod fleet_key;
 pub mod keys;
 mod loading;
 mod secret;
 mod value;
 
+pub use fleet_key::check_fleet_key;
 pub use loading::{Configuration, LoadedConfig, load, require};
-pub use secret::{Secret, check_fleet_key};
+pub use secret::Secret;
 pub use value::{
     ExpandedPath, expand, expanded, is_web_url, minutes, one_or_many, optional_whole, percent, seconds,
     seconds_or_zero, whole,

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize, Serializer};
 
-use super::loading::{read_file, require};
+use super::loading::read_file;
 use super::value::ExpandedPath;
 
 /// A text that is never printed or logged; output shows `********`. The configuration contains it, or names its file.
@@ -53,20 +53,6 @@ impl Secret {
     pub fn file(&self) -> Option<&Path> {
         self.file.as_deref()
     }
-}
-
-/// Fewest letters of `fleetKey`.
-const MIN_FLEET_KEY: usize = 16;
-
-/// Checks the key `fleetKey`: whoever guesses it takes places that are not his.
-///
-/// # Errors
-/// When it is too short.
-pub fn check_fleet_key(key: Option<&Secret>) -> Result<(), String> {
-    let is_long = key.is_none_or(|key| key.reveal().chars().count() >= MIN_FLEET_KEY);
-    require(is_long, "fleetKey", || {
-        format!("it is shorter than {MIN_FLEET_KEY} letters; `openssl rand -hex 32` prints a good one")
-    })
 }
 
 impl fmt::Debug for Secret {
