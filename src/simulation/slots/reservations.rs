@@ -165,8 +165,8 @@ impl Reservations {
             reservation,
         });
         link.has_news = true;
-        let waited = wanted.since.elapsed().as_secs_f64();
-        log::info!("the slot of port {port} is reserved for a client of the line, which has waited {waited:.1} s");
+        let seconds = wanted.since.elapsed().as_secs_f64();
+        log::info!("the slot of port {port} is reserved for a client of the line, which has waited {seconds:.1} s");
         let reserved = Reservation {
             port,
             parties: wanted.parties,
