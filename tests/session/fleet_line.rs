@@ -86,7 +86,8 @@ impl Visitor<'_> {
         let mut line = Client::try_connect(&self.session).await.ok()?;
         let request = json!({"url": self.world(), "wait": true, "ticket": self.ticket});
         line.try_send(&request.to_string()).await.ok()?;
-        let (mut from, mut pass, mut position) = (None, String::new(), usize::MAX);
+        let mut from = None;
+        let mut pass = String::new();
         let turn = loop {
             match line.next_within(Duration::from_secs(90)).await.expect("a sign of life") {
                 Heard::Closed(_) => break None,
@@ -96,7 +97,7 @@ impl Visitor<'_> {
                         ticket.clone_into(&mut self.ticket);
                     }
                     ("queue", ahead) => {
-                        position = ahead.parse().unwrap();
+                        let position: usize = ahead.parse().unwrap();
                         if self.reloads && position < 60 {
                             self.reloads = false;
                             break None;
