@@ -8,7 +8,7 @@ use futures_util::future::join_all;
 use super::deeds::Stage;
 use super::network::levels;
 use crate::simulation::scene::nothing_left;
-use crate::support::{Builder, Client, Server, WORLD, Webots, arm_at, demo_server, http, outcome};
+use crate::support::{Builder, Client, DEMO, Server, WORLD, Webots, arm_at, demo_server, http, outcome};
 
 /// Time between two viewers.
 const STEP: Duration = Duration::from_millis(150);
@@ -151,5 +151,52 @@ async fn the_time_limit_of_a_launch_includes_the_load() {
             told.contains("Webots did not become ready within 1 seconds"),
             "{branch}: {told}"
         );
+    }
+}
+
+/// Ends after a second in which it has listened, if its world contains `crash`; never listens, if it contains `never`.
+fn misbehaving() -> Webots {
+    Webots::script(&format!(
+        "for world; do case $world in --port=*) port=${{world#--port=}};; esac; done
+         grep -q never \"$world\" && exec sleep 1000
+         {DEMO} \"$@\" & child=$!
+         if grep -q crash \"$world\"; then
+             until (exec 3<>/dev/tcp/127.0.0.1/$port) 2>/dev/null; do sleep 0.1; done
+             sleep 1; kill -KILL $child; exit 3
+         fi
+         wait $child"
+    ))
+}
+
+#[actix_rt::test]
+async fn whether_webots_has_listened_decides_who_is_to_blame() {
+    // R2022b answers no requests, and a world that is being read answers none.
+    let cases = ["R2022b", "R2025a"].map(|release| {
+        [
+            ("never", "launch-failed", release),
+            ("stay", "load-timeout", release),
+            ("crash", "load-failed", release),
+        ]
+    });
+    for (level, user, network) in levels() {
+        let (stage, webots) = (Stage::new(), misbehaving());
+        let builder = stage.builder(&webots, level).before(user);
+        let server = builder
+            .set("sandbox.network", network)
+            .set("timing.launch", 8)
+            .set("maxConnections", 6)
+            .start()
+            .await;
+        let start = async |(deed, code, release): (&str, &str, &str)| {
+            let world = format!("{}# {deed}\n", slow("load=60")).replace("R2025a", release);
+            let branch = format!("{deed}-{release}");
+            stage.forge.commit("lab/arm", &branch, &[("worlds/a.wbt", &world)]);
+            let mut client = Client::start(&server, &arm_at(&branch)).await;
+            client.patiently("loading: Error:").await;
+            let told = client.reason();
+            assert_eq!(told["code"], code, "{level}, {network}, {branch}: {told}");
+        };
+        join_all(cases.concat().into_iter().map(start)).await;
+        assert_eq!(server.status().await["failedStarts"], 2, "{level}, {network}");
     }
 }

@@ -56,6 +56,19 @@ async fn a_start_that_fails_because_of_the_server_is_sent_elsewhere() {
 }
 
 #[actix_rt::test]
+async fn a_webots_that_ends_before_it_listens_has_failed_even_without_an_error() {
+    let server = server_of(Webots::script("echo 'wrong program'"), 1).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("loading: Error: Webots has ended").await;
+    let told = client.reason();
+    assert_eq!(
+        (&told["code"], &told["output"]),
+        (&"launch-failed".into(), &"wrong program".into())
+    );
+    assert_eq!((client.closed().await, failed_starts(&server).await), (Some(1013), 1));
+}
+
+#[actix_rt::test]
 async fn a_black_hole_takes_a_handful_of_clients_and_not_a_class() {
     let (hole, _folder, repaired) = broken(12).await;
     let healthy = demo_server(12).start().await;

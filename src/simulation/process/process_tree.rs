@@ -10,6 +10,7 @@ use std::time::Duration;
 
 use nix::sys::signal::{Signal, kill, killpg};
 use nix::unistd::{Pid, getpgid};
+use procfs::net::TcpState;
 use procfs::process::{Process, all_processes};
 
 /// The environment variable that marks every process of a simulation: its value is the instance's directory. Children
@@ -41,6 +42,18 @@ pub fn children(pid: i32) -> Vec<i32> {
                 .collect::<Vec<_>>()
         })
         .collect()
+}
+
+/// Whether something listens on this port in the network of the children of a process.
+pub fn children_listen(pid: i32, port: u16) -> bool {
+    children(pid).into_iter().any(|child| {
+        let Ok(child) = Process::new(child) else { return false };
+        let sockets = child.tcp().into_iter().chain(child.tcp6()).flatten();
+        let mut ports = sockets
+            .filter(|socket| socket.state == TcpState::Listen)
+            .map(|socket| socket.local_address.port());
+        ports.any(|listening| listening == port)
+    })
 }
 
 /// Kills every process that has the mark of an instance below `folder`, and the groups that such processes lead.

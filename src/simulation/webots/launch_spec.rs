@@ -11,7 +11,7 @@ use actix::prelude::*;
 
 use super::event::WebotsEvent;
 use super::release::Release;
-use super::startup::{StartupEvent, follow_startup};
+use super::startup::{ListenSign, StartupEvent, follow_startup};
 use crate::simulation::checkout::Project;
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::container::{ContainerRequest, ContainerService};
@@ -152,9 +152,15 @@ impl LaunchSpec {
         !Release::answers_during_start(self.release)
     }
 
-    /// Follows its start at its port, until it is ready.
-    pub fn follow_startup(&self, events: Recipient<StartupEvent>) -> impl Future<Output = ()> + use<> {
-        let is_forwarded = self.containers.is_some() || self.launcher.reached().is_some();
-        follow_startup(self.address(), is_forwarded, events)
+    /// Follows the start of this root process at its port, until it is ready.
+    pub fn follow_startup(&self, root: i32, events: Recipient<StartupEvent>) -> impl Future<Output = ()> + use<> {
+        let sign = if self.containers.is_some() {
+            ListenSign::Answers
+        } else if self.launcher.reached().is_some() {
+            ListenSign::InNetworkOf(root)
+        } else {
+            ListenSign::Accepts
+        };
+        follow_startup(self.address(), sign, !self.is_ready_by_heartbeat(), events)
     }
 }

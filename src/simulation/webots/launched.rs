@@ -110,7 +110,7 @@ impl Exit {
             return failure_of(cause);
         }
         let reason = match (self.status, reached) {
-            (ExitReason::Code(0), _) => Reason::Finished,
+            (ExitReason::Code(0), Reached::Ready) => Reason::Finished,
             (_, Reached::Start) => Reason::LaunchFailed,
             (_, Reached::Listening) => Reason::LoadFailed,
             (_, Reached::Ready) => Reason::Crashed,
@@ -147,6 +147,8 @@ mod tests {
         let killed = ExitReason::Signal(9);
         for (status, cause, reached, reason, words) in [
             (ok, None, Reached::Ready, Reason::Finished, "Webots has ended"),
+            (ok, None, Reached::Listening, Reason::LoadFailed, "Webots has ended"),
+            (ok, None, Reached::Start, Reason::LaunchFailed, "Webots has ended"),
             (
                 killed,
                 None,

@@ -5,8 +5,8 @@
 //! of a controller it answers `PROCESSING` until the world is ready, and writes nothing to its console. Releases before
 //! R2023b don't: a controller crashes them too, and the first heartbeat is the best sign that they are ready.
 //!
-//! Docker's proxy and pasta accept connections from the start, even if nothing inside listens: behind them, only an
-//! answer shows that Webots listens.
+//! Docker's proxy and pasta accept connections from the start, even if nothing inside listens: behind pasta, the network
+//! of the sandbox shows that Webots listens, behind Docker's proxy only an answer does.
 
 use std::cell::Cell;
 use std::convert::Infallible;
@@ -21,6 +21,8 @@ use tokio::net::TcpStream;
 use tokio::sync::Notify;
 use tokio_tungstenite::connect_async;
 use tokio_tungstenite::tungstenite::Message as Frame;
+
+use crate::simulation::process::process_tree;
 
 /// An event of the start of a Webots.
 #[derive(Message, Debug, Clone, PartialEq, Eq)]
@@ -47,29 +49,48 @@ const PART: u32 = 20;
 /// may accept the first request before anything inside listens, and Webots answers none while it reads a world.
 const TIMEOUT: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(10));
 
-/// Follows the start of the Webots at this address, and sends its events. The last one is [`StartupEvent::Ready`].
+/// What shows that Webots listens.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ListenSign {
+    /// Its port accepts a connection.
+    Accepts,
+    /// It is in the network of the children of this process, behind pasta.
+    InNetworkOf(i32),
+    /// It answers a request, behind Docker's proxy.
+    Answers,
+}
+
+/// Follows the start of the Webots at this address, and sends its events. If it answers controllers, the last one is
+/// [`StartupEvent::Ready`]; otherwise nothing is sent to it, and the only event is [`StartupEvent::Listening`].
 ///
 /// A container must run already: a request before it has its address delays all others by a second, until the kernel
 /// resolves the address again.
-pub async fn follow_startup(address: SocketAddr, is_forwarded: bool, events: Recipient<StartupEvent>) {
+pub async fn follow_startup(
+    address: SocketAddr,
+    sign: ListenSign,
+    answers_controllers: bool,
+    events: Recipient<StartupEvent>,
+) {
     let startup = Startup {
         address,
-        is_forwarded,
+        sign,
         events,
         begin: Instant::now(),
         listens: Cell::new(false),
         processing: Notify::new(),
         loaded: Notify::new(),
     };
+    let is_shown_by_request = answers_controllers && !matches!(sign, ListenSign::InNetworkOf(_));
     tokio::select! {
-        () = startup.until_ready() => startup.events.do_send(StartupEvent::Ready),
+        () = startup.until_ready(), if answers_controllers => startup.events.do_send(StartupEvent::Ready),
         never = startup.forward_progress() => match never {},
+        never = startup.watch_for_listening(), if !is_shown_by_request => match never {},
     }
 }
 
 struct Startup {
     address: SocketAddr,
-    is_forwarded: bool,
+    sign: ListenSign,
     events: Recipient<StartupEvent>,
     begin: Instant,
     /// Whether Webots is known to listen.
@@ -91,7 +112,7 @@ impl Startup {
     /// Sends requests until the world is ready.
     async fn until_ready(&self) {
         loop {
-            let answer = if self.is_forwarded && !self.listens.get() {
+            let answer = if self.sign != ListenSign::Accepts && !self.listens.get() {
                 let timeout = self.begin.elapsed().clamp(TIMEOUT.0, TIMEOUT.1);
                 let answer = actix_rt::time::timeout(timeout, self.request()).await;
                 answer.unwrap_or_else(|_| Err(io::ErrorKind::TimedOut.into()))
@@ -104,14 +125,35 @@ impl Startup {
                 Ok(Answer::Processing) => self.processing.notify_one(),
                 Err(_) => {}
             }
-            let pause = (self.begin.elapsed() / PART).clamp(PAUSE.0, PAUSE.1);
-            actix_rt::time::timeout(pause, self.loaded.notified()).await.ok();
+            actix_rt::time::timeout(self.pause(), self.loaded.notified()).await.ok();
         }
+    }
+
+    /// Watches for the sign that Webots listens, where requests don't show it in time: a world that is being read answers
+    /// none.
+    async fn watch_for_listening(&self) -> Infallible {
+        while !self.listens.get() {
+            let listens = match self.sign {
+                ListenSign::Accepts => TcpStream::connect(self.address).await.is_ok(),
+                ListenSign::InNetworkOf(pid) => process_tree::children_listen(pid, self.address.port()),
+                ListenSign::Answers => break,
+            };
+            if listens {
+                self.listens();
+            } else {
+                actix_rt::time::sleep(self.pause()).await;
+            }
+        }
+        std::future::pending().await
+    }
+
+    fn pause(&self) -> Duration {
+        (self.begin.elapsed() / PART).clamp(PAUSE.0, PAUSE.1)
     }
 
     async fn request(&self) -> io::Result<Answer> {
         let mut stream = TcpStream::connect(self.address).await?;
-        if !self.is_forwarded {
+        if self.sign == ListenSign::Accepts {
             self.listens();
         }
         stream.write_all(REQUEST).await?;
@@ -185,12 +227,12 @@ mod tests {
     }
 
     /// A stand-in for Webots, and the events of its start.
-    async fn start(is_forwarded: bool) -> (TcpListener, mpsc::UnboundedReceiver<StartupEvent>) {
+    async fn start(sign: ListenSign) -> (TcpListener, mpsc::UnboundedReceiver<StartupEvent>) {
         let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).await.unwrap();
         let (sender, events) = mpsc::unbounded_channel();
         let events_of_start = Listener(sender).start().recipient();
         let address = listener.local_addr().unwrap();
-        actix_rt::spawn(follow_startup(address, is_forwarded, events_of_start));
+        actix_rt::spawn(follow_startup(address, sign, true, events_of_start));
         (listener, events)
     }
 
@@ -205,7 +247,7 @@ mod tests {
 
     #[actix_rt::test]
     async fn an_accepted_connection_shows_that_it_listens_and_an_answer_that_it_is_ready() {
-        let (listener, mut events) = start(false).await;
+        let (listener, mut events) = start(ListenSign::Accepts).await;
         let mut stream = request(&listener).await;
         assert_eq!(events.recv().await, Some(StartupEvent::Listening));
         // However long the world is read, there is one request.
@@ -218,7 +260,7 @@ mod tests {
 
     #[actix_rt::test]
     async fn a_proxy_that_accepts_for_nobody_shows_nothing() {
-        let (listener, mut events) = start(true).await;
+        let (listener, mut events) = start(ListenSign::Answers).await;
         // It closes the first connection, and does not answer on the second.
         drop(listener.accept().await.unwrap());
         let _silent = listener.accept().await.unwrap();
@@ -231,7 +273,7 @@ mod tests {
 
     #[actix_rt::test]
     async fn progress_is_forwarded_and_the_world_ends_the_wait() {
-        let (listener, mut events) = start(false).await;
+        let (listener, mut events) = start(ListenSign::Accepts).await;
         request(&listener).await.write_all(b"PROCESSING").await.unwrap();
         assert_eq!(events.recv().await, Some(StartupEvent::Listening));
         // Requests continue beside the WebSocket.

@@ -209,15 +209,16 @@ impl Webots {
         })
     }
 
-    /// Follows its start, unless that has begun or its heartbeat shows when it is ready.
+    /// Follows its start, unless that has begun.
     fn follow_startup(&mut self, ctx: &mut Context<Self>) {
         if let State::Launching(Launching {
+            process,
             startup: startup @ None,
             ..
         }) = &mut self.state
-            && !self.spec.is_ready_by_heartbeat()
         {
-            let events = self.spec.follow_startup(ctx.address().recipient());
+            let root = process.group.leader();
+            let events = self.spec.follow_startup(root, ctx.address().recipient());
             *startup = Some(ctx.spawn(wrap_future(events)));
         }
     }
