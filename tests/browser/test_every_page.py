@@ -48,7 +48,7 @@ class EveryPage(BrowserTest):
                 policy, text = answer.headers["Content-Security-Policy"], answer.read().decode()
                 self.assertIn("default-src 'none'", policy)
                 self.assertNotIn("unsafe-inline", policy)
-                self.assertRegex(policy, r"script-src 'self'( http: https: 'wasm-unsafe-eval')?;")
+                self.assertRegex(policy, r"script-src 'self'( http: https: 'unsafe-eval')?;")
                 self.assertEqual(answer.headers["X-Content-Type-Options"], "nosniff")
                 for word in [" style=", "<style", " onclick=", "<script>"]:
                     self.assertNotIn(word, text)

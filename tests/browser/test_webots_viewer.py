@@ -10,7 +10,7 @@ from door import COOKIE, OneDoor
 from fleet import WORLD
 from playwright.sync_api import expect
 
-# Like the real one, it links a style sheet of another site and adds a script to the page.
+# Like the real one, it links a style sheet of another site, adds a script to the page, and compiles a function.
 COMPONENT = """
 import { greeting } from './part.js';
 class WebotsView extends HTMLElement {
@@ -26,6 +26,7 @@ class WebotsView extends HTMLElement {
   connect(server, mode, broadcast) {
     localStorage.setItem('theme', 'dark');
     this.textContent = `${greeting} ${server} ${Module.locateFile('wren.data', '')} ${window.ran} ${window.origin}`;
+    this.textContent += new Function('return " compiled"')();
     this.stream(`${server}/`, broadcast);
   }
   // As the real one does it: texts over the stream, files from where the stream is.
@@ -71,7 +72,7 @@ class WebotsViewer(BrowserTest):
         page.tab.get_by_role("button", name="Connect", exact=True).click()
         view = page.tab.frame_locator("#stage iframe").locator("webots-view")
         expect(view).to_contain_text("connected to ws://127.0.0.1:")
-        expect(view).to_contain_text("/wwi/wren.data undefined null")
+        expect(view).to_contain_text("/wwi/wren.data undefined null compiled")
         expect(view).to_have_css("font-size", "20px")
 
     def test_a_scene_of_the_demonstration_is_shown_by_the_small_viewer(self):
