@@ -199,12 +199,7 @@ class Fleet:
         """A folder that stands in for GitHub, with the demonstration's worlds in demo/worlds."""
         forge = self.folder / "forge"
         work = self.folder / "work"
-        shutil.copytree(ROOT / "config/demo", work)
-        (work / "worlds/textures").mkdir()
-        (work / "worlds/textures/wood.png").write_text("a picture")
-        # Fewer frames: without a GPU, most of the processor time is spent on drawing.
-        for motion in work.glob("worlds/*.motion.json"):
-            motion.write_text(json.dumps({**json.loads(motion.read_text()), "FPS": 2}))
+        self._project(work)
         git = ["git", "-c", "user.name=Test", "-c", "user.email=test@localhost", "-c", "commit.gpgSign=false"]
         bare = forge / "demo/worlds"
         bare.mkdir(parents=True)
@@ -217,6 +212,15 @@ class Fleet:
         ]:
             subprocess.run([*git, *command], cwd=folder, check=True)
         return forge
+
+    def _project(self, work):
+        """Makes the folder with the worlds."""
+        shutil.copytree(ROOT / "config/demo", work)
+        (work / "worlds/textures").mkdir()
+        (work / "worlds/textures/wood.png").write_text("a picture")
+        # Fewer frames: without a GPU, most of the processor time is spent on drawing.
+        for motion in work.glob("worlds/*.motion.json"):
+            motion.write_text(json.dumps({**json.loads(motion.read_text()), "FPS": 2}))
 
     def _simulation(self, name, more):
         places = more.get("maxConnections", 4)
