@@ -1,11 +1,66 @@
-// All words of the viewer page, the small viewer and the watch page, in English. The page chooses them by codes: another
-// language is a file with the same names.
+// All words of the viewer page, the small viewer and the watch page, in English. The page chooses them by codes: each
+// other language is a file with the same names.
 
-import { duration } from './times.js';
+import { formats } from './intl.js';
 
 /** @typedef {import('./visit.js').OwnProblem} OwnProblem */
+/** @typedef {import('./messages.js').StepCode} StepCode */
+
+const { clock, duration, number, percent, plural } = formats('en');
 
 export const words = {
+  /** The language, as the page names it to browsers and screen readers. */
+  language: 'en',
+  /** What the pages themselves say, by the names in their HTML. */
+  page: {
+    skip: 'Skip to the content',
+    pages: 'Pages',
+    monitor: 'Monitor',
+    viewer: 'Viewer',
+    simulation: 'Simulation',
+    empty: 'The simulation appears here.',
+    version: 'Version',
+    'session-server': 'Session server',
+    'try-title': 'Try a world – session server',
+    try: 'Try a world',
+    connecting: 'Connecting',
+    'to-session-server': 'to the session server …',
+    url: 'URL of a world',
+    'url-help': 'The page of a .wbt file on its forge: below /blob/ or /tree/, in a folder worlds.',
+    'shown-by': 'Shown by',
+    automatic: 'the viewer that fits',
+    webots: 'Webots’ own viewer',
+    small: 'the small viewer',
+    connect: 'Connect',
+    disconnect: 'Disconnect',
+    examples: 'Examples',
+    keep: 'Keep it',
+    printed: 'Printed by the project or the simulator:',
+    steps: 'Steps',
+    session: 'Session server',
+    'about-session': 'chooses a simulation server',
+    server: 'Simulation server',
+    'about-server': 'takes the world',
+    place: 'Place',
+    'about-place': 'in the line, if all are taken',
+    checkout: 'Checkout',
+    'about-checkout': 'of the world’s project',
+    launch: 'Launch',
+    'about-launch': 'of the simulator',
+    'about-simulation': 'runs for you until you leave',
+    watched: 'Your teacher is watching.',
+    'about-tabs':
+      'Each tab has a simulation of its own: two tabs are two simulations. A page that is loaded again, or whose connection breaks, finds its simulation again; that ends with “Disconnect”, or some time after its tab was closed.',
+    'simulation-server': 'Simulation server',
+    'watch-title': 'Watching – simulation server',
+    watch: 'Watching a simulation',
+    'about-watching': 'You see what its user sees, and change nothing; its user is told that you watch.',
+    'watch-small': 'Show it in the small viewer.',
+    who: 'Who',
+    unverified: 'unverified',
+    world: 'World',
+    'stop-watching': 'Close this page to stop watching.',
+  },
   availability: {
     connecting: ['Connecting', 'to the session server …'],
     free: ['Available', 'A simulation server can take you.'],
@@ -19,6 +74,8 @@ export const words = {
     clearLeft: 'You have left the simulation; it has ended.',
     clearStopped: 'You wait no longer.',
     webotsViewer: 'Webots’ viewer',
+    /** @param {unknown} why */
+    noWebotsViewer: (why) => `Webots’ viewer can’t be loaded: ${why}. Choose the small viewer and connect again.`,
     onlySmall: 'Webots’ own viewer is not to be had here; the small viewer shows the simulation.',
   },
   steps: {
@@ -37,17 +94,19 @@ export const words = {
       if (ahead === 0) {
         return 'you are next';
       }
-      return ahead === 1 ? 'one client is ahead of you' : `${ahead} clients are ahead of you`;
+      return `${number(ahead)} ${plural(ahead, { one: 'client is', other: 'clients are' })} ahead of you`;
     },
+    /** What the server says of its progress is English. @type {Partial<Record<StepCode, string>>} */
+    progress: {},
     granted: 'taken',
     launching: 'webots is starting',
     launched: 'the simulator is ready',
     joining: 'connecting to the simulator',
     /**
      * @param {string} status
-     * @param {number} percent
+     * @param {number} done in percent
      */
-    loading: (status, percent) => `${status} ${percent} %`,
+    loading: (status, done) => `${status} ${percent(done)}`,
     shown: 'is shown',
     framed: 'is shown by Webots’ own viewer',
     closed: 'the simulator has closed its connection',
@@ -61,7 +120,7 @@ export const words = {
   },
   lost: {
     /** @param {number} seconds */
-    since: (seconds) => `No connection since ${duration(seconds)}.`,
+    since: (seconds) => `No connection for ${duration(seconds)}.`,
     /** @param {number} seconds */
     waits: (seconds) =>
       seconds > 0 ? `Your simulation waits another ${duration(seconds)}.` : 'Your simulation may have ended.',
@@ -95,6 +154,8 @@ export const words = {
     'no-webgl': 'The scene can’t be shown: this browser offers no WebGL, so that nothing can be drawn.',
     unreadable: 'The scene can’t be shown: the simulator has sent a scene that can’t be read.',
   },
+  /** What a server says of the reasons is English, and says more. @type {Record<string, string>} */
+  reasons: {},
   /** What the visitor can do. */
   advice: {
     general: 'Connect again. If that fails too, tell the administrator what is written here.',
@@ -131,6 +192,8 @@ export const words = {
     home: 'Home view',
     homeTitle: 'Look from where the world says',
     clock: 'Simulation time',
+    /** @param {number} time in milliseconds */
+    time: (time) => clock(time),
     tools: 'Simulation',
     help: 'Drag or use the arrow keys to look around; with Shift to move; wheel, pinch, + and − to come closer; Home to go back.',
     console: 'Console',

@@ -16,10 +16,12 @@
  * @typedef {{ token: string, absence: number }} Resumption
  */
 
+/** A step of a start that a server tells, by its number or name. @typedef {'search' | 'fetch' | 'write' | 'done' | 'launch'} StepCode */
+
 /**
  * A message of a simulation server.
  * @typedef {{ is: 'queued', ahead: number }
- *   | { is: 'progress', text: string }
+ *   | { is: 'progress', text: string, step: StepCode | undefined, percent: number | undefined }
  *   | { is: 'launched', closesIn: number }
  *   | { is: 'ready', address: string, kind: string | undefined }
  *   | { is: 'resumable', resumption: Resumption }
@@ -123,7 +125,7 @@ export class SimulationReader {
       return this.#readValue(text);
     }
     // The text after `queue:` says the same, for Webots' page.
-    return wasQueue ? { is: 'alive' } : { is: 'progress', text: withoutCount(progress) };
+    return wasQueue ? { is: 'alive' } : readProgress(progress);
   }
 
   /**
@@ -162,12 +164,39 @@ export class SimulationReader {
 }
 
 /**
- * Progress without its count of steps, `Step 1/9 : `, which is for the progress bar of Webots' page.
- * @param {string} text
+ * Reads progress. A checkout has nine steps, `Step 1/9 : TEXT`: the second to the seventh are the fetch.
+ * @param {string} progress
+ * @returns {Message}
  */
-function withoutCount(text) {
-  const end = text.indexOf(' : ');
-  return text.startsWith('Step ') && end > 0 ? text.slice(end + ' : '.length) : text;
+function readProgress(progress) {
+  const [, number, rest] = /^Step ([1-9])\/9 : (.*)$/s.exec(progress) ?? [];
+  const text = rest ?? progress;
+  const found = /(\d{1,3})\s?%/.exec(text)?.[1];
+  return {
+    is: 'progress',
+    text,
+    step: stepCode(number, text),
+    percent: found === undefined ? undefined : Number(found),
+  };
+}
+
+/**
+ * @param {string | undefined} number
+ * @param {string} text
+ * @returns {StepCode | undefined}
+ */
+function stepCode(number, text) {
+  switch (number) {
+    case undefined:
+      return text === 'checkout done' ? 'done' : text === 'webots is starting' ? 'launch' : undefined;
+    case '1':
+      return 'search';
+    case '8':
+    case '9':
+      return 'write';
+    default:
+      return 'fetch';
+  }
 }
 
 /**

@@ -1,9 +1,9 @@
 // What the viewer page shows during a visit, derived from its state alone. No DOM.
 
-import { words } from './english.js';
 import { adviceFor } from './reasons.js';
 import { isConnected, reasonOf, resumptionOf, SHOWN_AFTER } from './visit.js';
 
+/** @typedef {import('./language.js').Words} Words */
 /** @typedef {import('./visit.js').Going} Going */
 /** @typedef {import('./visit.js').Lost} Lost */
 /** @typedef {import('./visit.js').Problem} Problem */
@@ -21,9 +21,9 @@ export const STEPS = /** @type {const} */ (['session', 'server', 'place', 'check
 /** @typedef {{ text: string, advice: string }} Notice */
 
 /**
- * What is shown. `idle`, `closes`: seconds left. `leave`: the label of the button that leaves, which is off without one.
+ * What is shown. `sentence`: what the server said, if that is not the text. `idle`, `closes`: seconds left. `leave`: the label of the button that leaves, which is off without one.
  * @typedef {{ lamp: 'on' | 'off' | undefined, availability: string[], progress: Progress | undefined,
- *   notice: Notice | undefined, problem: (Notice & { output: string | undefined }) | undefined,
+ *   notice: Notice | undefined, problem: (Notice & { sentence: string | undefined, output: string | undefined }) | undefined,
  *   idle: string | undefined, closes: string | undefined, isWatched: boolean, leave: string | undefined,
  *   opensTabs: boolean }} PageView
  */
@@ -31,9 +31,10 @@ export const STEPS = /** @type {const} */ (['session', 'server', 'place', 'check
 /**
  * @param {Visit} visit
  * @param {number} now in milliseconds
+ * @param {Words} words
  * @returns {PageView}
  */
-export function view({ fleet, state }, now) {
+export function view({ fleet, state }, now, words) {
   const facts = isConnected(state) && 'facts' in state ? state.facts : undefined;
   const isLost = state.is === 'lost' && now - state.heardAt >= SHOWN_AFTER;
   /** @param {number | undefined} time */
@@ -43,30 +44,34 @@ export function view({ fleet, state }, now) {
   return {
     lamp: isLost ? undefined : lamps[fleet],
     availability: words.availability[isLost ? 'lost' : fleet],
-    progress: state.is === 'ended' ? failedProgress(state.from) : progress(state),
-    notice: isLost ? lostNotice(state, now) : waitingNotice(state),
-    problem: state.is === 'ended' ? problemView(state.problem) : undefined,
+    progress: state.is === 'ended' ? failedProgress(state.from, words) : progress(state, words),
+    notice: isLost ? lostNotice(state, now, words) : waitingNotice(state, words),
+    problem: state.is === 'ended' ? problemView(state.problem, words) : undefined,
     idle: idle === undefined ? undefined : words.idle(idle),
     closes: closes === undefined ? undefined : words.closes(closes),
     isWatched: facts?.isWatched ?? false,
-    leave: leaveLabel(state),
+    leave: leaveLabel(state, words),
     opensTabs: resumptionOf(state) !== undefined,
   };
 }
 
-/** @param {State} state */
-function leaveLabel(state) {
+/**
+ * @param {State} state
+ * @param {Words} words
+ */
+function leaveLabel(state, words) {
   if (state.is === 'idle' || state.is === 'ended') {
     return undefined;
   }
-  return waitingNotice(state) ? words.buttons.stop : words.buttons.leave;
+  return waitingNotice(state, words) ? words.buttons.stop : words.buttons.leave;
 }
 
 /**
  * @param {State} state
+ * @param {Words} words
  * @returns {Notice | undefined}
  */
-export function waitingNotice(state) {
+export function waitingNotice(state, words) {
   const why = state.is === 'waiting' ? state.why : state.is === 'asking' ? state.waitsFor : undefined;
   if (!why) {
     return undefined;
@@ -88,9 +93,10 @@ export function timeLeft({ resumption, heardAt }, now) {
 /**
  * @param {Lost} state
  * @param {number} now
+ * @param {Words} words
  * @returns {Notice}
  */
-function lostNotice(state, now) {
+function lostNotice(state, now, words) {
   return { text: words.lost.since((now - state.heardAt) / 1000), advice: words.lost.waits(timeLeft(state, now)) };
 }
 
@@ -106,10 +112,15 @@ function capitalized(sentence) {
   return isWord ? sentence.charAt(0).toUpperCase() + sentence.slice(1) : sentence;
 }
 
-/** @param {Problem} problem */
-function problemText(problem) {
+/**
+ * What happened; without words for the code, the sentence of the server.
+ * @param {Problem} problem
+ * @param {Words} words
+ */
+function problemText(problem, words) {
   if ('sentence' in problem) {
-    return capitalized(problem.sentence);
+    const known = new Map(Object.entries(words.reasons));
+    return known.get(problem.reason?.code ?? '') ?? capitalized(problem.sentence);
   }
   switch (problem.code) {
     case 'absent':
@@ -123,36 +134,51 @@ function problemText(problem) {
   }
 }
 
-/** @param {Problem} problem */
-function problemAdvice(problem) {
+/**
+ * @param {Problem} problem
+ * @param {Words} words
+ */
+function problemAdvice(problem, words) {
   if ('sentence' in problem) {
     return words.advice[adviceFor(problem.reason?.code)];
   }
   return words.advice[problem.code === 'simulator-unreachable' ? 'firewall' : 'general'];
 }
 
-/** @param {Problem} problem */
-function problemView(problem) {
-  return { text: problemText(problem), advice: problemAdvice(problem), output: reasonOf(problem)?.output };
+/**
+ * @param {Problem} problem
+ * @param {Words} words
+ */
+function problemView(problem, words) {
+  const text = problemText(problem, words);
+  const sentence = 'sentence' in problem ? capitalized(problem.sentence) : undefined;
+  return {
+    text,
+    sentence: sentence === text ? undefined : sentence,
+    advice: problemAdvice(problem, words),
+    output: reasonOf(problem)?.output,
+  };
 }
 
 /* steps */
 
 /**
  * @param {Going} from
+ * @param {Words} words
  * @returns {Progress}
  */
-function failedProgress(from) {
-  return { ...(progress(from) ?? { at: 'session', notes: {} }), is: 'failed' };
+function failedProgress(from, words) {
+  return { ...(progress(from, words) ?? { at: 'session', notes: {} }), is: 'failed' };
 }
 
 /**
  * @param {Going} state
+ * @param {Words} words
  * @returns {Progress | undefined}
  */
-function progress(state) {
+function progress(state, words) {
   if (isConnected(state)) {
-    return connectedProgress(state);
+    return connectedProgress(state, words);
   }
   switch (state.is) {
     case 'asking':
@@ -164,7 +190,7 @@ function progress(state) {
     case 'waiting':
       return { at: 'session', is: 'doing', notes: { session: words.steps.allBusy } };
     case 'redirected':
-      return { at: 'session', is: 'doing', notes: { session: words.steps.redirected(problemText(state.why)) } };
+      return { at: 'session', is: 'doing', notes: { session: words.steps.redirected(problemText(state.why, words)) } };
     default:
       return undefined;
   }
@@ -172,9 +198,10 @@ function progress(state) {
 
 /**
  * @param {import('./visit.js').Connected} state
+ * @param {Words} words
  * @returns {Progress}
  */
-function connectedProgress(state) {
+function connectedProgress(state, words) {
   const session = state.isRestored ? words.steps.notAsked : words.steps.chosen;
   const asked = { session, server: state.server };
   switch (state.is) {
@@ -182,16 +209,20 @@ function connectedProgress(state) {
       if (state.place.is === 'opening') {
         return { at: 'server', is: 'doing', notes: { session, server: words.steps.connecting(state.server) } };
       }
-      return { at: 'place', is: 'doing', notes: { ...asked, place: placeNote(state.place) } };
+      return { at: 'place', is: 'doing', notes: { ...asked, place: placeNote(state.place, words) } };
     case 'starting': {
       const granted = { ...asked, place: words.steps.granted };
       return state.phase === 'checkout'
-        ? { at: 'checkout', is: 'doing', notes: { ...granted, checkout: state.text ?? '' } }
-        : { at: 'launch', is: 'doing', notes: { ...granted, launch: state.text ?? words.steps.launching } };
+        ? { at: 'checkout', is: 'doing', notes: { ...granted, checkout: startNote(state, words) ?? '' } }
+        : {
+            at: 'launch',
+            is: 'doing',
+            notes: { ...granted, launch: startNote(state, words) ?? words.steps.launching },
+          };
     }
     case 'running': {
       const ready = { ...asked, place: words.steps.granted, launch: words.steps.launched };
-      const { is, note } = sceneProgress(state.scene);
+      const { is, note } = sceneProgress(state.scene, words);
       return { at: 'simulation', is, notes: { ...ready, simulation: note } };
     }
     case 'lost':
@@ -203,16 +234,32 @@ function connectedProgress(state) {
   }
 }
 
-/** @param {Extract<import('./visit.js').Connecting['place'], { is: 'asked' | 'queued' }>} place */
-function placeNote(place) {
+/**
+ * What the server says of a start; in other languages than its own, by the code of the step.
+ * @param {import('./visit.js').Starting} state
+ * @param {Words} words
+ */
+function startNote({ progress: told }, words) {
+  /** @type {Partial<Record<import('./messages.js').StepCode, string>>} */
+  const known = words.steps.progress;
+  const step = told?.step && known[told.step];
+  return step && told.percent !== undefined ? words.steps.loading(step, told.percent) : (step ?? told?.text);
+}
+
+/**
+ * @param {Extract<import('./visit.js').Connecting['place'], { is: 'asked' | 'queued' }>} place
+ * @param {Words} words
+ */
+function placeNote(place, words) {
   return place.is === 'queued' ? words.steps.queued(place.ahead) : words.steps.requesting;
 }
 
 /**
  * @param {import('./visit.js').Scene} scene
+ * @param {Words} words
  * @returns {{ is: 'doing' | 'done' | 'failed', note: string }}
  */
-function sceneProgress(scene) {
+function sceneProgress(scene, words) {
   switch (scene.is) {
     case 'connecting':
       return { is: 'doing', note: words.steps.joining };

@@ -2,9 +2,11 @@
 
 /** @typedef {import('./messages.js').Reason} Reason */
 
+/** The advice that a page has words for. @typedef {keyof typeof import('./english.js').words.advice} AdviceName */
+
 /**
  * The advice for each reason of a server, by its name in the page's words.
- * @satisfies {Record<string, keyof typeof import('./english.js').words.advice>}
+ * @satisfies {Record<string, AdviceName>}
  */
 export const ADVICE = {
   'invalid-request': 'general',
@@ -30,6 +32,9 @@ export const ADVICE = {
   'checkout-timeout': 'smaller',
   'remote-failed': 'later',
   'invalid-project': 'project',
+  'remote-unreachable': 'administrator',
+  'image-not-found': 'project',
+  'builders-busy': 'later',
   'build-failed': 'project',
   'build-timeout': 'project',
   'image-too-large': 'project',
@@ -62,7 +67,7 @@ export const ADVICE = {
 /**
  * The advice for a code. Codes of later versions, and failures without one, get the general advice.
  * @param {string | undefined} code
- * @returns {keyof typeof import('./english.js').words.advice}
+ * @returns {AdviceName}
  */
 export function adviceFor(code) {
   const advice = new Map(Object.entries(ADVICE));

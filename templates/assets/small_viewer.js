@@ -3,7 +3,6 @@
 import { Camera } from './camera.js';
 import { make } from './dom.js';
 import { Drawing } from './draw.js';
-import { words } from './english.js';
 import { Scene, SceneError } from './scene.js';
 import { Stream } from './stream.js';
 
@@ -23,14 +22,15 @@ const LINES = 200;
  */
 
 /**
- * `kind`: the kind of stream, if it is known; `isOnlooker`: the simulation's time goes on; `isReadOnly`: without buttons
+ * `words`: what the viewer says; `kind`: the kind of stream, if it is known; `isOnlooker`: the simulation's time goes on; `isReadOnly`: without buttons
  * that change the simulation.
- * @typedef {{ kind?: string | undefined, isOnlooker?: boolean, isReadOnly?: boolean }} ViewerOptions
+ * @typedef {{ words: import('./language.js').Words, kind?: string | undefined, isOnlooker?: boolean, isReadOnly?: boolean }} ViewerOptions
  */
 
 export class SmallViewer {
   #stream;
   #tell;
+  #words;
   /** @type {Scene | undefined} */
   #scene;
   #camera;
@@ -53,8 +53,9 @@ export class SmallViewer {
    * @param {ViewerOptions} options
    * @param {(event: ViewerEvent) => void} tell
    */
-  constructor(stage, url, { kind, isOnlooker = false, isReadOnly = false }, tell) {
+  constructor(stage, url, { words, kind, isOnlooker = false, isReadOnly = false }, tell) {
     this.#tell = tell;
+    this.#words = words;
     this.#parts = this.#build(isReadOnly);
     stage.replaceChildren(...this.#parts.all);
     this.#drawing = new Drawing(this.#parts.canvas);
@@ -98,12 +99,12 @@ export class SmallViewer {
       made.addEventListener('click', action);
       return made;
     };
-    const { viewer } = words;
+    const { viewer } = this.#words;
     const play = button(viewer.play, () => this.#toggle(), viewer.playTitle);
     const step = button(viewer.step, () => this.#stream.send('step'), viewer.stepTitle);
     const reset = button(viewer.reset, () => this.#reset(), viewer.resetTitle);
     const home = button(viewer.home, () => this.#camera.home(), viewer.homeTitle);
-    const clock = make('span', { className: 'clock', id: 'clock', textContent: '0:00.000' });
+    const clock = make('span', { className: 'clock', id: 'clock', textContent: viewer.time(0) });
     clock.setAttribute('role', 'timer');
     clock.setAttribute('aria-label', viewer.clock);
     const mode = make('span', { className: 'mode', id: 'mode', textContent: viewer.modes.loading });
@@ -141,7 +142,7 @@ export class SmallViewer {
     for (const button of [this.#parts.play, this.#parts.step, this.#parts.reset, this.#parts.home]) {
       button.disabled = false;
     }
-    this.#parts.canvas.setAttribute('aria-label', words.viewer.view(scene.title));
+    this.#parts.canvas.setAttribute('aria-label', this.#words.viewer.view(scene.title));
     this.#tell({ is: 'shown', title: scene.title });
     this.#enter('pause');
   }
@@ -155,20 +156,14 @@ export class SmallViewer {
 
   /** @param {number} time in milliseconds */
   #setTime(time) {
-    const seconds = Math.floor(time / 1000);
-    /**
-     * @param {number} number
-     * @param {number} digits
-     */
-    const pad = (number, digits) => String(number).padStart(digits, '0');
-    this.#parts.clock.textContent = `${Math.floor(seconds / 60)}:${pad(seconds % 60, 2)}.${pad(Math.round(time) % 1000, 3)}`;
+    this.#parts.clock.textContent = this.#words.viewer.time(time);
   }
 
   /** @param {Mode} mode */
   #enter(mode) {
     this.#mode = mode;
-    this.#parts.play.textContent = mode === 'pause' ? words.viewer.play : words.viewer.pause;
-    this.#parts.mode.textContent = words.viewer.modes[mode];
+    this.#parts.play.textContent = mode === 'pause' ? this.#words.viewer.play : this.#words.viewer.pause;
+    this.#parts.mode.textContent = this.#words.viewer.modes[mode];
     if (!this.#isFrozen) {
       this.#tell({ is: 'mode', mode });
     }
@@ -176,7 +171,7 @@ export class SmallViewer {
 
   /** Marks what is shown as out of date. */
   markStale() {
-    this.#parts.mode.textContent = words.viewer.modes.lost;
+    this.#parts.mode.textContent = this.#words.viewer.modes.lost;
   }
 
   /** Keeps what is shown, and closes the connection. */

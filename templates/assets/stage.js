@@ -1,6 +1,5 @@
 // The place of the scene on the viewer page: chooses between Webots' own viewer and the small one, and shows it.
 
-import { words } from './english.js';
 import { SceneError } from './scene.js';
 import { SmallViewer } from './small_viewer.js';
 import { isDemonstration } from './stream.js';
@@ -13,6 +12,7 @@ const HEARD = 500;
 
 export class Stage {
   #element;
+  #words;
   #tell;
   /** @type {SmallViewer | { close(): void, freeze?: undefined } | undefined} */
   #viewer;
@@ -22,10 +22,12 @@ export class Stage {
 
   /**
    * @param {HTMLElement} element
+   * @param {import('./language.js').Words} words
    * @param {(event: VisitEvent) => void} tell
    */
-  constructor(element, tell) {
+  constructor(element, words, tell) {
     this.#element = element;
+    this.#words = words;
     this.#tell = tell;
   }
 
@@ -50,7 +52,7 @@ export class Stage {
       this.#showWebots(address, webots);
     }
     if (isSmall && choice === 'webots') {
-      say(words.stage.onlySmall);
+      say(this.#words.stage.onlySmall);
     }
   }
 
@@ -68,24 +70,29 @@ export class Stage {
       }
     };
     try {
-      this.#viewer = new SmallViewer(this.#element, address, { kind, isOnlooker: isBack }, (event) => {
-        switch (event.is) {
-          case 'loading':
-            return tell({ type: 'scene', scene: event });
-          case 'shown':
-            tell({ type: 'scene', scene: { is: 'shown', title: event.title, runs: false } });
-            // On a phone the scene would be out of sight, below the steps.
-            return this.#element.scrollIntoView({ block: 'nearest' });
-          case 'mode':
-            return tell({ type: 'mode', runs: event.mode !== 'pause' });
-          case 'heard':
-            return this.#hear(tell);
-          case 'failed':
-            return tell({ type: 'sceneFailed', why: event.why });
-          case 'closed':
-            return tell({ type: 'sceneClosed' });
-        }
-      });
+      this.#viewer = new SmallViewer(
+        this.#element,
+        address,
+        { words: this.#words, kind, isOnlooker: isBack },
+        (event) => {
+          switch (event.is) {
+            case 'loading':
+              return tell({ type: 'scene', scene: event });
+            case 'shown':
+              tell({ type: 'scene', scene: { is: 'shown', title: event.title, runs: false } });
+              // On a phone the scene would be out of sight, below the steps.
+              return this.#element.scrollIntoView({ block: 'nearest' });
+            case 'mode':
+              return tell({ type: 'mode', runs: event.mode !== 'pause' });
+            case 'heard':
+              return this.#hear(tell);
+            case 'failed':
+              return tell({ type: 'sceneFailed', why: event.why });
+            case 'closed':
+              return tell({ type: 'sceneClosed' });
+          }
+        },
+      );
     } catch (error) {
       if (!(error instanceof SceneError)) {
         throw error;
@@ -109,9 +116,9 @@ export class Stage {
    */
   #showWebots(address, script) {
     const frame = document.createElement('iframe');
-    frame.title = words.stage.webotsViewer;
+    frame.title = this.#words.stage.webotsViewer;
     frame.allow = 'fullscreen';
-    frame.src = `webots-viewer#${new URLSearchParams({ script, stream: address })}`;
+    frame.src = `webots-viewer#${new URLSearchParams({ script, stream: address, lang: this.#words.language })}`;
     this.#element.replaceChildren(frame);
     this.#viewer = { close: () => frame.remove() };
     this.#tell({ type: 'scene', scene: { is: 'framed' } });

@@ -2,8 +2,8 @@
 // effects, and draws what it shows (`page_view.js`).
 
 import { find, setText } from './dom.js';
-import { words } from './english.js';
 import { forget, keep, kept } from './kept.js';
+import { wordsOfPage } from './language.js';
 import { STEPS, timeLeft, view, waitingNotice } from './page_view.js';
 import { SessionServer } from './session_server.js';
 import { SimulationLink } from './simulation_link.js';
@@ -13,20 +13,22 @@ import { BEGIN, next } from './visit.js';
 /** @typedef {import('./visit.js').Effect} Effect */
 /** @typedef {import('./visit.js').Event} VisitEvent */
 
+const search = new URLSearchParams(location.search);
+const words = await wordsOfPage(search.get('lang'));
 const form = find('start', HTMLFormElement);
 const address = find('url', HTMLInputElement);
 const viewers = find('kind', HTMLSelectElement);
 const connect = find('connect', HTMLButtonElement);
 const disconnect = find('disconnect', HTMLButtonElement);
 /** The visitor's name, from the link to this page. */
-const visitor = new URLSearchParams(location.search).get('name')?.trim() || undefined;
+const visitor = search.get('name')?.trim() || undefined;
 
 let visit = BEGIN;
 /** @type {ReturnType<typeof setTimeout> | undefined} */
 let timer;
 /** @type {SimulationLink | undefined} */
 let link;
-const stage = new Stage(find('stage', HTMLElement), take);
+const stage = new Stage(find('stage', HTMLElement), words, take);
 const sessionServer = new SessionServer(take);
 
 /** @param {VisitEvent} event */
@@ -49,8 +51,8 @@ function take(event) {
     timer = setTimeout(() => take({ type: 'tick' }), Math.max(0, visit.wakeAt - Date.now()));
   }
   draw();
-  const waits = waitingNotice(visit.state);
-  if (waits && !waitingNotice(before.state)) {
+  const waits = waitingNotice(visit.state, words);
+  if (waits && !waitingNotice(before.state, words)) {
     say(`${waits.text} ${waits.advice}`);
   }
 }
@@ -147,11 +149,12 @@ function announce(text) {
 }
 
 function draw() {
-  const shown = view(visit, Date.now());
+  const shown = view(visit, Date.now(), words);
   drawAvailability(shown.lamp, shown.availability);
   drawProgress(shown.progress);
   drawNotice('notice', shown.notice);
   drawNotice('problem', shown.problem);
+  show(find('problem-sentence', HTMLElement), shown.problem?.sentence);
   show(find('problem-output', HTMLElement), shown.problem?.output, find('problem-output-text', HTMLElement));
   drawIdle(shown.idle);
   show(find('left', HTMLElement), shown.closes);
@@ -249,7 +252,7 @@ function sayStep(text) {
 /** Resumes the simulation of this tab after a reload, or a return to the page. */
 function restore() {
   const simulation = kept();
-  const named = new URLSearchParams(location.search).get('url');
+  const named = search.get('url');
   if (!simulation || (named !== null && named !== simulation.world)) {
     forget();
     return;
@@ -262,7 +265,8 @@ form.addEventListener('submit', (event) => {
   event.preventDefault();
   const world = address.value.trim();
   // A link that starts the same world.
-  history.replaceState(null, '', `?${new URLSearchParams({ url: world, ...(visitor && { name: visitor }) })}`);
+  search.set('url', world);
+  history.replaceState(null, '', `?${search}`);
   take({ type: 'submitted', world });
 });
 disconnect.addEventListener('click', () => {
@@ -276,7 +280,7 @@ for (const example of form.querySelectorAll('[data-url]')) {
     connect.focus();
   });
 }
-address.value = new URLSearchParams(location.search).get('url') ?? '';
+address.value = search.get('url') ?? '';
 if (visitor) {
   show(find('visitor', HTMLElement), words.visitor(visitor));
 }

@@ -54,7 +54,7 @@ import { helpsToWait } from './reasons.js';
  */
 
 /** @typedef {Target & { is: 'connecting', place: { is: 'opening' } | { is: 'asked' } | { is: 'queued', ahead: number } }} Connecting */
-/** @typedef {Target & { is: 'starting', phase: 'checkout' | 'launch', text?: string | undefined, facts: Facts }} Starting */
+/** @typedef {Target & { is: 'starting', phase: 'checkout' | 'launch', progress?: Extract<Message, { is: 'progress' }> | undefined, facts: Facts }} Starting */
 /** `heardAt`: the last sign of life of the server or the simulator.
  * @typedef {Target & { is: 'running', address: string, scene: Scene, facts: Facts, heardAt: number, resumption?: Resumption | undefined }} Running
  */
@@ -370,7 +370,7 @@ function whileStarting(state, event, around) {
     case 'queued':
       return { to: { ...target, is: 'connecting', place: { is: 'queued', ahead: message.ahead } } };
     case 'progress':
-      return { to: { ...target, is: 'starting', phase, text: message.text, facts } };
+      return { to: { ...target, is: 'starting', phase, progress: message, facts } };
     case 'launched':
       return { to: { ...target, is: 'starting', phase: 'launch', facts } };
     case 'ready':

@@ -1,10 +1,12 @@
 // The page on which an administrator watches a simulation: a read-only viewer.
 
 import { find } from './dom.js';
-import { words } from './english.js';
+import { wordsOfPage } from './language.js';
 import { SceneError } from './scene.js';
 import { SmallViewer } from './small_viewer.js';
 
+const search = new URLSearchParams(location.search);
+const words = await wordsOfPage(search.get('lang'));
 const stage = find('stage', HTMLElement);
 
 /** @param {string} text */
@@ -35,7 +37,7 @@ function take(event) {
 }
 
 function openSmall() {
-  const options = { kind: stage.dataset.kind || undefined, isOnlooker: true, isReadOnly: true };
+  const options = { words, kind: stage.dataset.kind || undefined, isOnlooker: true, isReadOnly: true };
   try {
     return new SmallViewer(stage, address(), options, take);
   } catch (error) {
@@ -53,7 +55,7 @@ function showWebots(path) {
   frame.title = words.stage.webotsViewer;
   frame.allow = 'fullscreen';
   const script = new URL(path, location.href).href;
-  frame.src = `webots-viewer#${new URLSearchParams({ script, stream: address(), watch: '' })}`;
+  frame.src = `webots-viewer#${new URLSearchParams({ script, stream: address(), watch: '', lang: words.language })}`;
   stage.replaceChildren(frame);
   tell(words.watching.on);
 }

@@ -5,10 +5,12 @@
 // Webots has all of these files, and this page runs no inline scripts.
 
 import { find } from './dom.js';
+import { wordsOfPage } from './language.js';
 
 const HOME = /^https:\/\/cyberbotics\.com\/wwi\/[^/]+\//;
 const wanted = new URLSearchParams(location.hash.slice(1));
 const script = wanted.get('script') ?? '';
+const words = await wordsOfPage(wanted.get('lang'));
 const base = script.slice(0, script.lastIndexOf('/') + 1);
 
 /** @param {string} text */
@@ -82,7 +84,5 @@ try {
   // The kind of stream is left to the component: its name has changed over the versions of Webots.
   view.connect(wanted.get('stream'), undefined, wanted.has('watch'), matchMedia('(pointer: coarse)').matches, -1);
 } catch (error) {
-  problem(
-    `Webots’ viewer can’t be loaded: ${error instanceof Error ? error.message : error}. Choose the small viewer and connect again.`,
-  );
+  problem(words.stage.noWebotsViewer(error instanceof Error ? error.message : error));
 }

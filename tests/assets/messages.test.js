@@ -75,13 +75,27 @@ test('no text of a project is taken for a message of the server', () => {
   const reason = { ...DRAINING, output };
   const [, failed] = read(`reason: ${JSON.stringify(reason)}`, 'loading: Error: it stops');
   assert.deepEqual(failed, { is: 'failed', failure: { sentence: 'it stops', reason } });
-  assert.deepEqual(read('loading: reason: {}')[0], { is: 'progress', text: 'reason: {}' });
-  assert.deepEqual(read('loading: Step by step')[0], { is: 'progress', text: 'Step by step' });
+  assert.deepEqual(read('loading: reason: {}')[0], {
+    is: 'progress',
+    text: 'reason: {}',
+    step: undefined,
+    percent: undefined,
+  });
+  assert.deepEqual(read('loading: Step by step')[0], {
+    is: 'progress',
+    text: 'Step by step',
+    step: undefined,
+    percent: undefined,
+  });
 });
 
 test('the text after a position in the queue is for other pages', () => {
   const texts = ['queue: 2', 'loading: waiting for a place, 2 clients are ahead', 'loading: Step 1/9 : begins'];
-  assert.deepEqual(read(...texts), [{ is: 'queued', ahead: 2 }, { is: 'alive' }, { is: 'progress', text: 'begins' }]);
+  assert.deepEqual(read(...texts), [
+    { is: 'queued', ahead: 2 },
+    { is: 'alive' },
+    { is: 'progress', text: 'begins', step: 'search', percent: undefined },
+  ]);
 });
 
 test('the kind of the stream belongs to its address, and the absence to the token', () => {

@@ -38,6 +38,6 @@ test('waiting helps where others have to leave first', () => {
   const waits = reasons().filter(helpsToWait);
   assert.deepEqual(
     waits.map(({ code }) => code),
-    ['no-idle-time', 'no-server-available', 'queue-full', 'share-used'],
+    ['no-idle-time', 'no-server-available', 'queue-full', 'share-used', 'builders-busy'],
   );
 });

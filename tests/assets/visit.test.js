@@ -2,7 +2,7 @@
 
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
-
+import { words } from '../../templates/assets/english.js';
 import { FleetReader, SimulationReader } from '../../templates/assets/messages.js';
 import { view } from '../../templates/assets/page_view.js';
 import { BEGIN, next } from '../../templates/assets/visit.js';
@@ -94,7 +94,7 @@ class Visit {
 
   /** What the page shows. */
   get view() {
-    return view(this.visit, this.now);
+    return view(this.visit, this.now, words);
   }
 
   /** The names of the effects since the last call. */
@@ -141,7 +141,7 @@ test('a visit from the start to the end', () => {
   visit.receive('loading: Step 3/9 : fetching 40 %');
   assert.deepEqual([visit.view.progress?.at, visit.view.progress?.notes.checkout], ['checkout', 'fetching 40 %']);
   visit.receive('loading: webots is starting', 'shutdownTimeout: 7200');
-  assert.deepEqual([visit.view.progress?.at, visit.view.closes], ['launch', 'It will be closed in 2 h 00 min.']);
+  assert.deepEqual([visit.view.progress?.at, visit.view.closes], ['launch', 'It will be closed in 2 hours.']);
   visit.receive('kind: w3d', 'webots:ws://one:2001');
   assert.deepEqual(visit.effects.at(-1), {
     do: 'show',
@@ -153,7 +153,7 @@ test('a visit from the start to the end', () => {
   visit.receive('absence: 60', `resume: ${TOKEN}`);
   assert.deepEqual(visit.effects.at(-1), { do: 'store', kept: KEPT });
   visit.take({ type: 'scene', scene: { is: 'loading', status: 'Parsing nodes', percent: 50 } });
-  assert.deepEqual(visit.view.progress?.notes.simulation, 'Parsing nodes 50 %');
+  assert.deepEqual(visit.view.progress?.notes.simulation, 'Parsing nodes 50%');
   visit.take(SHOWN);
   assert.deepEqual([visit.view.progress?.at, visit.view.progress?.is], ['simulation', 'done']);
   assert.ok(visit.view.opensTabs);
@@ -218,6 +218,7 @@ test('a server without reasons: its sentence, general advice, another server by 
     text: 'No simulation server available at the moment.',
     advice: unreasoned().advice,
     output: undefined,
+    sentence: undefined,
   });
 });
 
@@ -357,8 +358,8 @@ test('a lost connection is shown after two seconds, and found again', () => {
   assert.deepEqual(visit.did(), ['freeze', 'connect']);
   assert.equal(notice(visit), undefined);
   visit.take({ type: 'closed', code: 1006 }).pass(3);
-  assert.match(notice(visit)?.text ?? '', /^No connection since [34] s\.$/);
-  assert.equal(notice(visit)?.advice, 'Your simulation waits another 57 s.');
+  assert.match(notice(visit)?.text ?? '', /^No connection for [34] seconds\.$/);
+  assert.equal(notice(visit)?.advice, 'Your simulation waits another 57 seconds.');
   assert.equal(visit.view.progress?.is, 'done', 'its scene is still shown');
   assert.ok(visit.did().includes('sayLost'));
   visit.receive('session: 1');
@@ -400,13 +401,13 @@ test('who is away for too long, or comes back to nothing, is told', () => {
   }
   assert.match(
     offline.view.problem?.text ?? '',
-    /^There was no connection for 2 min 0\d s: the simulation has ended\.$/,
+    /^There was no connection for 2 minutes, \d seconds?: the simulation has ended\.$/,
   );
   const late = running().take({ type: 'closed', code: 1006 }).pass(70);
   const { now } = late;
   late.receive(...error('this simulation has ended', reason('ended', 'user', 'here')));
   assert.equal(late.now, now);
-  assert.match(late.view.problem?.text ?? '', /^There was no connection for 1 min 10 s/);
+  assert.match(late.view.problem?.text ?? '', /^There was no connection for 1 minute, 10 seconds/);
   const reloaded = new Visit().take({ type: 'restored', kept: KEPT });
   assert.deepEqual(reloaded.effects, [{ do: 'connect', server: SERVER, request: { resume: TOKEN } }]);
   reloaded.receive(...error('this simulation has ended', reason('ended', 'user', 'here')));
@@ -421,7 +422,10 @@ test('a server that refuses all attempts while the session server answers is gon
     assert.deepEqual(visit.did().slice(-1), ['probe']);
     visit.take({ type: 'probed' }).pass(1);
   }
-  assert.match(visit.view.problem?.text ?? '', /^There was no connection for [34] s: the simulation has ended\.$/);
+  assert.match(
+    visit.view.problem?.text ?? '',
+    /^There was no connection for [34] seconds: the simulation has ended\.$/,
+  );
   const offline = running().take({ type: 'closed', code: 1006 });
   for (let attempt = 0; attempt < 4; ++attempt) {
     offline.take({ type: 'closed', code: 1006 }).pass(1);
@@ -444,10 +448,10 @@ test('a page that is hidden leaves what can be resumed', () => {
 
 test('a paused simulation is told, and kept by a button or because it runs', () => {
   const visit = running().receive('idle: 120');
-  assert.equal(visit.view.idle, 'The simulation is paused, and ends in 2 min 00 s.');
+  assert.equal(visit.view.idle, 'The simulation is paused, and ends in 2 minutes.');
   visit.did();
   visit.pass(3);
-  assert.deepEqual([visit.did(), visit.view.idle], [[], 'The simulation is paused, and ends in 1 min 57 s.']);
+  assert.deepEqual([visit.did(), visit.view.idle], [[], 'The simulation is paused, and ends in 1 minute, 57 seconds.']);
   visit.take({ type: 'keep' });
   assert.deepEqual(visit.effects, [{ do: 'send', message: { keep: true } }]);
   visit.did();

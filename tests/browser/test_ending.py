@@ -24,7 +24,7 @@ class OfflineForLong(Running):
         self.assertEqual(page.tab.evaluate("JSON.parse(sessionStorage.getItem('simulation')).absence"), 10)
         page.context.set_offline(False)
         expect(page.tab.locator("#problem-text")).to_have_text(
-            re.compile(r"^There was no connection for \d+ s: the simulation has ended.$")
+            re.compile(r"^There was no connection for \d+ seconds: the simulation has ended.$")
         )
         expect(page.tab.get_by_role("button", name="Connect", exact=True)).to_be_enabled()
         self.assertIsNone(page.tab.evaluate("sessionStorage.getItem('simulation')"))
@@ -37,7 +37,7 @@ class Idle(Running):
     def test_who_stays_paused_is_told_and_keeps_the_simulation_by_a_button(self):
         page, server = self.start_world()
         told = page.tab.locator("#idle")
-        expect(told).to_contain_text(re.compile("The simulation is paused, and ends in [1-6] s."))
+        expect(told).to_contain_text(re.compile("The simulation is paused, and ends in [1-6] seconds?."))
         expect(page.tab.locator("#spoken")).to_contain_text("The simulation is paused")
         page.tab.get_by_role("button", name="Keep it").click()
         expect(told).to_be_hidden()

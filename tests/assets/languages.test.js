@@ -1,0 +1,140 @@
+// The languages: each has words for all codes, and the pages and modules have no others.
+
+import assert from 'node:assert/strict';
+import { readdirSync, readFileSync } from 'node:fs';
+import { test } from 'node:test';
+
+import { words as english } from '../../templates/assets/english.js';
+import { formats } from '../../templates/assets/intl.js';
+import { firstOf, LANGUAGES } from '../../templates/assets/language.js';
+import { ADVICE } from '../../templates/assets/reasons.js';
+
+const TEMPLATES = new URL('../../templates/', import.meta.url);
+const translations = Object.entries(LANGUAGES).filter(([language]) => language !== 'en');
+
+/** @param {string} path */
+const read = (path) => readFileSync(new URL(path, TEMPLATES), 'utf8');
+
+/**
+ * All texts by their names; functions have been called.
+ * @param {unknown} value
+ * @param {string} name
+ * @returns {[string, string][]}
+ */
+function texts(value, name = '') {
+  if (typeof value === 'string') {
+    return [[name, value]];
+  }
+  if (typeof value === 'function') {
+    const argument =
+      { absent: { since: 5 }, 'simulator-unreachable': { address: 'x' }, 'no-scene': { why: 'no-webgl' } }[
+        name.split('.').at(-1) ?? ''
+      ] ?? 5;
+    return [[name, value(argument, 40)]];
+  }
+  return Object.entries(value ?? {}).flatMap(([key, part]) => texts(part, `${name}.${key}`));
+}
+
+test('each language has a text for each code and name, without one of English', async () => {
+  const own = texts(english).filter(([name]) => name !== '.language');
+  assert.ok(own.length > 120, `${own.length}`);
+  // Some words are the same.
+  const shared = new Set(['.page.version', '.page.pages', '.page.monitor', '.page.simulation', '.viewer.tools']);
+  for (const [language, load] of translations) {
+    const { words } = await load();
+    const all = new Map(texts(words));
+    for (const [name, text] of own) {
+      const translated = all.get(name) ?? '';
+      assert.notEqual(translated, '', `${language} ${name}`);
+      if (text.split(' ').length > 2 && !shared.has(name) && !name.endsWith('.time') && !name.endsWith('.loading')) {
+        assert.notEqual(translated, text, `${language} ${name}`);
+      }
+      assert.doesNotMatch(translated, /undefined|NaN|\[object/, `${language} ${name}`);
+    }
+    assert.deepEqual(Object.keys(words.reasons).sort(), Object.keys(ADVICE).sort(), language);
+    assert.deepEqual(
+      Object.keys(words.steps.progress).sort(),
+      ['done', 'fetch', 'launch', 'search', 'write'],
+      language,
+    );
+    assert.equal(words.language.split('-')[0], language);
+  }
+});
+
+test('the pages have the English words that they name, and no others', () => {
+  /** @type {Set<string>} */
+  const used = new Set();
+  for (const path of ['page.html', 'session/viewer.html', 'simulation/watch.html', 'simulation/who.html']) {
+    const html = read(path)
+      .replace(/<noscript>.*?<\/noscript>/gs, '')
+      .replace(
+        /\{% block title_words %\} data-words="([\w-]+)"\{% endblock %\}\n\{% block title %\}([^{]*)/g,
+        '<i data-words="$1">$2</i>',
+      )
+      .replace(/\{%.*?%\}|\{\{.*?\}\}/gs, '');
+    for (const [, label, name] of html.matchAll(/aria-label="([^"]*)"(?: data-label-words="([\w-]+)")?/g)) {
+      assert.equal(label, Object.entries(english.page).find(([key]) => key === name)?.[1], `${path}: ${label}`);
+      used.add(name ?? '');
+    }
+    const rest = html.replace(/<(\w+)[^>]* data-words="([\w-]+)"[^>]*>([^<]*)<\/\1>/g, (_, _tag, name, text) => {
+      assert.equal(text, Object.entries(english.page).find(([key]) => key === name)?.[1], `${path}: ${name}`);
+      used.add(name);
+      return '';
+    });
+    assert.doesNotMatch(rest.replace(/<[^>]*>/gs, ''), /[a-z]/i, path);
+  }
+  assert.deepEqual([...used].sort(), Object.keys(english.page).sort());
+});
+
+test('modules have no words of their own', () => {
+  const files = Object.values(LANGUAGES).map((load) => /'\.\/(\w+\.js)'/.exec(String(load))?.[1]);
+  assert.ok(files.every(Boolean));
+  const administrators = [
+    'charts.js',
+    'chart.js',
+    'live.js',
+    'session_monitor.js',
+    'simulation_monitor.js',
+    'times.js',
+  ];
+  const modules = readdirSync(new URL('assets', TEMPLATES)).filter((name) => name.endsWith('.js'));
+  for (const name of modules.filter((name) => ![...files, ...administrators].includes(name))) {
+    const code = read(`assets/${name}`)
+      .replace(/\/\*.*?\*\//gs, '')
+      .replace(/^\s*\/\/.*$/gm, '')
+      .replace(/throw new Error\(.*/g, '');
+    for (const [, text = ''] of code.matchAll(/['`]([^'`\n]*)['`]/g)) {
+      assert.doesNotMatch(text.replace(/\$\{[^}]*\}/g, ''), /^[A-Z][a-z]+ [a-z]+|[a-z]\.$/, `${name}: ${text}`);
+    }
+  }
+});
+
+test('the language is the first of the wanted ones that there is', () => {
+  assert.equal(firstOf(['', 'ru-RU', 'de-CH', 'fr']), 'de');
+  assert.equal(firstOf(['ZH-hant-TW']), 'zh');
+  assert.equal(firstOf(['ru', 'toString']), 'en');
+  assert.equal(firstOf([]), 'en');
+});
+
+test('plural forms, durations and numbers are those of the language', async () => {
+  const german = (await LANGUAGES.de()).words;
+  assert.equal(german.steps.queued(1), '1 Person ist vor dir');
+  assert.equal(german.steps.queued(1200), '1.200 Personen sind vor dir');
+  assert.equal(german.closes(3660), 'Sie wird in 1 Stunde, 1 Minute geschlossen.');
+  const french = (await LANGUAGES.fr()).words;
+  assert.equal(french.steps.queued(1), '1 personne est devant vous');
+  assert.equal(english.steps.queued(0), 'you are next');
+  assert.equal(english.steps.queued(1), '1 client is ahead of you');
+  const { clock, duration } = formats('en');
+  assert.deepEqual([0, 1, 59.6, 61, 3600, 7384, -3].map(duration), [
+    '0 seconds',
+    '1 second',
+    '1 minute',
+    '1 minute, 1 second',
+    '1 hour',
+    '2 hours, 3 minutes',
+    '0 seconds',
+  ]);
+  assert.deepEqual([0, 61_004.4, 3_600_500].map(clock), ['0:00.000', '1:01.004', '60:00.500']);
+  assert.equal(german.viewer.time(1500), '0:01,500');
+});
