@@ -48,7 +48,7 @@ class Idle(Running):
         expect(told).to_be_hidden()
         self.assertEqual(len(server.status()["simulations"]), 1)
         page.tab.get_by_role("button", name="Pause", exact=True).click()
-        expect(page.tab.locator("#problem-text")).to_contain_text("The simulation was paused for 0.2 minutes")
+        expect(page.tab.locator("#problem-text")).to_contain_text("The simulation was paused for 0.2 min")
         expect(page.tab.locator("#problem-advice")).to_contain_text("Connect again")
         expect(told).to_be_hidden()
         self.assertEqual(server.status()["simulations"], [])

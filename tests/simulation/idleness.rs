@@ -11,7 +11,7 @@ use crate::support::{Client, arm, demo_server};
 /// In minutes: three seconds. The client is warned when half of it is left.
 const LIMIT: f64 = 0.05;
 const TOLD: &str = "idle: 2";
-const WHY: &str = "The simulation was paused for 0.05 minutes";
+const WHY: &str = "The simulation was paused for 0.05 min";
 
 #[actix_rt::test]
 async fn a_paused_simulation_ends_unless_its_client_keeps_it() {

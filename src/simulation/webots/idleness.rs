@@ -40,7 +40,7 @@ impl Webots {
         let timer = ctx.run_later(limit.saturating_sub(notice), move |this, ctx| {
             this.send(WebotsEvent::IdleEnd(Some(Instant::now() + notice)));
             let timer = ctx.run_later(notice, move |this, ctx| {
-                let message = format!("The simulation was paused for {minutes} minutes");
+                let message = format!("The simulation was paused for {minutes} min");
                 this.stop(Failure::new(Reason::Idle, message), ctx);
             });
             this.set_idle_end(timer, true);
