@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 
 use serde_json::{Value, json};
+use tokio::io::AsyncWriteExt;
 
 use super::stand_in::{Manner, StandIn};
 use super::{addresses, times_logged, until_states};
@@ -176,6 +177,33 @@ async fn a_silent_server_holds_up_nobody_and_leaves_nothing_open() {
     assert!(session.log().contains("no answer within 2 s"), "{}", session.log());
     let opened = smtp.count("opened");
     smtp.wait_for_times("closed", opened).await;
+}
+
+#[actix_rt::test]
+async fn a_line_without_end_fills_no_memory() {
+    const MOST: usize = 512 << 20;
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let port = listener.local_addr().unwrap().port();
+    actix_rt::spawn(async move {
+        while let Ok((mut client, _)) = listener.accept().await {
+            let line = vec![b'2'; 64 << 10];
+            for _ in 0..MOST / line.len() {
+                if client.write_all(&line).await.is_err() {
+                    break;
+                }
+            }
+        }
+    });
+    let session = mailing(&addresses(&[StandIn::start(Manner::Reset)]), port)
+        .start()
+        .await;
+    let problem = format!("127.0.0.1:{port}: ");
+    until("the mail has failed", async || session.log().contains(&problem)).await;
+    let status = procfs::process::Process::new(session.pid()).unwrap().status().unwrap();
+    let most = status.vmhwm.unwrap() << 10;
+    assert!(most < 128 << 20, "{most} bytes");
+    let told = format!("{problem}it has sent more than 65536 bytes");
+    assert!(session.log().contains(&told), "{}", session.log());
 }
 
 /// The exit code and output of a session server with this option and these keys, which trusts only the authorities in

@@ -1,19 +1,28 @@
-//! Delivers e-mails to the administrator with lettre's transport.
+//! Delivers e-mails to the administrator with lettre's SMTP client, one connection for each.
 //!
 //! With a password the connection is encrypted before the login: from the first byte (implicit TLS), or by STARTTLS.
 //! The trusted authorities are read from the system for each e-mail, so that a renewed file needs no restart.
 
 use std::error::Error;
 
+use lettre::Message;
 use lettre::message::Mailbox;
 use lettre::message::header::{ContentType, HeaderName, HeaderValue};
 use lettre::transport::smtp::Error as SmtpError;
-use lettre::transport::smtp::authentication::Credentials;
-use lettre::transport::smtp::client::{Tls, TlsParameters};
-use lettre::{AsyncSmtpTransport, AsyncTransport, Message, Tokio1Executor};
+use lettre::transport::smtp::authentication::{Credentials, DEFAULT_MECHANISMS};
+use lettre::transport::smtp::client::{AsyncSmtpConnection, TlsParameters};
+use lettre::transport::smtp::extension::ClientId;
+use rustls::pki_types::ServerName;
+use tokio::net::TcpStream;
+use tokio_rustls::TlsConnector;
 
+use super::limited_stream::LimitedStream;
 use crate::session::config::SessionConfig;
 use crate::shared::config::Secret;
+use crate::shared::http::tls;
+
+/// Why an e-mail was not sent.
+type Problem = Box<dyn Error + Send + Sync>;
 
 /// The usual port of implicit TLS.
 const IMPLICIT_TLS_PORT: u16 = 465;
@@ -85,36 +94,49 @@ impl SmtpRelay {
         message
             .headers_mut()
             .insert_raw(HeaderValue::new(name, "auto-generated".to_owned()));
-        // The caller sets the timeout, because lettre's covers connecting only. Each e-mail gets a new connection:
-        // lettre's pool would reuse one that has timed out.
-        let answer = async { self.transport()?.send(message).await }
-            .await
-            .map_err(|error| reason(&error))?;
+        // The caller sets the timeout.
+        self.send(&message).await.map_err(|problem| reason(&*problem))
+    }
+
+    async fn send(&self, message: &Message) -> Result<String, Problem> {
+        let mut server = self.connect().await?;
+        let answer = server.send(message.envelope(), &message.formatted()).await?;
+        server.abort().await;
         Ok(answer.first_line().unwrap_or_default().to_owned())
     }
 
-    fn transport(&self) -> Result<AsyncSmtpTransport<Tokio1Executor>, SmtpError> {
-        let mut builder = AsyncSmtpTransport::<Tokio1Executor>::builder_dangerous(self.host.as_str()).port(self.port);
-        if self.login.is_some() || self.implicit_tls {
-            let parameters = TlsParameters::new(self.host.clone())?;
-            builder = builder.tls(if self.implicit_tls {
-                Tls::Wrapper(parameters)
-            } else {
-                Tls::Required(parameters)
-            });
-        }
+    /// Connects, encrypts, and logs in, as the configuration says.
+    async fn connect(&self) -> Result<AsyncSmtpConnection, Problem> {
+        let stream = TcpStream::connect((self.host.as_str(), self.port)).await?;
+        let peer = stream.peer_addr()?;
+        let own_name = ClientId::default();
+        let mut server = if self.implicit_tls {
+            let config = tls::client_config().ok_or("TLS can't be set up")?;
+            let name = ServerName::try_from(self.host.clone())?;
+            let stream = TlsConnector::from(config).connect(name, stream).await?;
+            let stream = Box::new(LimitedStream::new(stream, peer));
+            AsyncSmtpConnection::connect_with_transport(stream, &own_name).await?
+        } else {
+            let stream = Box::new(LimitedStream::new(stream, peer));
+            AsyncSmtpConnection::connect_with_transport(stream, &own_name).await?
+        };
         if let Some(login) = &self.login {
-            builder = builder.credentials(login.clone());
+            if !self.implicit_tls {
+                server
+                    .starttls(TlsParameters::new(self.host.clone())?, &own_name)
+                    .await?;
+            }
+            server.auth(DEFAULT_MECHANISMS, login).await?;
         }
-        Ok(builder.build())
+        Ok(server)
     }
 }
 
 /// Why an e-mail was not sent: the SMTP server's answer, or the innermost cause.
-fn reason(error: &SmtpError) -> String {
-    let causes = std::iter::successors(Some(error as &dyn Error), |error| (*error).source());
+fn reason(problem: &(dyn Error + 'static)) -> String {
+    let causes = std::iter::successors(Some(problem), |problem| (*problem).source());
     let cause = causes.last().map(ToString::to_string).unwrap_or_default();
-    match error.status() {
+    match problem.downcast_ref().and_then(SmtpError::status) {
         Some(code) => format!("{code} {cause}"),
         None if cause.starts_with("invalid peer certificate") => {
             format!("its certificate is not trusted: {cause} (SSL_CERT_FILE may name another authority)")
