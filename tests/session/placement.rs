@@ -110,6 +110,50 @@ async fn a_world_goes_only_where_it_will_be_accepted() {
 }
 
 #[actix_rt::test]
+async fn a_dedicated_server_comes_first_and_no_burst_exceeds_a_shared_idle_time() {
+    let status = |owner: &str, load: f64, share: f64| {
+        let allowed = [format!("https://github.com/{owner}")];
+        Manner::Status(
+            json!({"load": load, "instances": {"places": 100}, "docker": share > 0.0, "shareIdleTime": share,
+            "allowedRepositories": allowed}),
+        )
+    };
+    let servers = [status("lab", 60.0, 0.0), status("school", 25.0, 50.0)].map(StandIn::start);
+    let url = |owner: &str| world(&format!("{owner}/arm"), "main", "worlds/a.wbt");
+    // The lab's server has a higher load. The other one exceeds 50 % with the third client.
+    let expected = [("lab", 0, 2), ("stranger", 1, 3)];
+    let session = between_reports(&servers, 10.0).start().await;
+    until_states(&session, &["up", "up"]).await;
+    let ask = async |owner: &str| http::get(&session.url(&format!("/session?url={}", url(owner)))).await;
+    for (owner, server, clients) in expected {
+        for _ in 0..clients {
+            assert_eq!(ask(owner).await.text(), servers[server].url());
+        }
+    }
+    assert_eq!(ask("stranger").await.header("webots-reason"), Some("no-idle-time"));
+    // The same by the line.
+    let session = between_reports(&servers, 10.0).start().await;
+    until_states(&session, &["up", "up"]).await;
+    let wait = async |owner: &str| {
+        let mut client = Client::connect(&session.websocket("/session")).await;
+        client.send(&json!({"url": url(owner), "wait": true}).to_string()).await;
+        client
+    };
+    for (owner, server, clients) in expected {
+        for _ in 0..clients {
+            assert_eq!(wait(owner).await.until("ws://").await, servers[server].url());
+        }
+    }
+    let mut waits = wait("stranger").await;
+    assert_eq!(waits.until("queue: ").await, "queue: 0");
+    assert!(
+        !waits.heard.iter().any(|text| text.starts_with("ws://")),
+        "{:?}",
+        waits.heard
+    );
+}
+
+#[actix_rt::test]
 async fn somebody_who_only_asks_does_not_close_the_fleet() {
     let counting = json!({"load": 10, "instances": {"queued": 0, "starting": 0, "idle": 0, "running": 0, "places": 100,
         "arrivals": 0}});

@@ -8,7 +8,7 @@ use actix::prelude::*;
 use prometheus::Histogram;
 
 use super::server_record::ServerRecord;
-use super::server_table::{ServerTable, accepts};
+use super::server_table::{ServerTable, accepts, admission};
 use super::slot_link::{LinkChange, LinkEvent};
 use crate::session::line::{Dispatcher, Entered, Entry, LineStatus, Moment, Place, Progress, Served, Ticket, Turn};
 use crate::shared::domain::{Failure, ProjectUrl, PublicAddress, Reason};
@@ -85,9 +85,9 @@ impl LineKeeper {
         }
     }
 
-    /// Whether the free slots of a server belong to the line.
-    pub(super) fn claims(&self, records: &Records, server: &PublicAddress) -> bool {
-        self.dispatcher.claims(server, accepts(records))
+    /// Whether the free slots of a server with this load, in percent, belong to the line.
+    pub(super) fn claims(&self, records: &Records, server: &PublicAddress, load: f64) -> bool {
+        self.dispatcher.claims(server, load, admission(records))
     }
 
     /// A client asks for a slot.
@@ -96,7 +96,8 @@ impl LineKeeper {
         if matches!(refused.reason, Reason::RepositoryNotAllowed | Reason::RepositoryBlocked) {
             return Err(refused);
         }
-        let (now, client) = (moment(), wait.client);
+        let now = moment();
+        let client = wait.client;
         let entry = Entry {
             world: wait.world,
             client: client.clone(),
@@ -208,7 +209,7 @@ impl LineKeeper {
         };
         let served = self
             .dispatcher
-            .serve(fleet, accepts(records), will_reserve, only, moment());
+            .serve(fleet, admission(records), will_reserve, only, moment());
         let Served { turns, wishes } = served;
         self.give(turns);
         for (server, wishes) in wishes {

@@ -15,7 +15,7 @@ use super::line_keeper::{LineKeeper, StopWaiting, Wait};
 use super::name_table::look_up_all;
 use super::server_monitor::{Parent, ProbeResult};
 use super::server_record::{Answer, FleetStatus, Intake, ServerRecord, ServerState, ServerStatus};
-use super::server_table::ServerTable;
+use super::server_table::{ServerTable, admission};
 use super::slot_link::LinkEvent;
 use super::state_history::StateHistory;
 use crate::session::config::SessionConfig;
@@ -87,7 +87,7 @@ impl Registry {
     /// Publishes a change of availability, to those who are not in the line.
     fn publish(&mut self) {
         let ServerTable { records, fleet, .. } = &mut self.servers;
-        let is_left = |server: &PublicAddress| !self.line.claims(records, server);
+        let is_left = |server: &PublicAddress, load: f64| !self.line.claims(records, server, load);
         let available = fleet.available(Instant::now(), is_left);
         if *self.available.borrow() != available {
             log::info!("{} simulation server is available", if available { "a" } else { "no" });
@@ -139,17 +139,16 @@ impl Registry {
     fn pick(&mut self, world: Option<&ProjectUrl>, from: Option<IpAddr>) -> Result<PublicAddress, Failure> {
         let ServerTable { records, fleet, .. } = &mut self.servers;
         let line = &self.line;
-        let admission = |address: &PublicAddress, load: f64| {
-            if line.claims(records, address) {
+        let terms = |address: &PublicAddress, load: f64| {
+            if line.claims(records, address, load) {
                 return None;
             }
-            let Some(world) = world else {
-                return Some(Admission::Dedicated);
-            };
-            let answer = records.get(address)?.state.last_answer()?;
-            answer.report.check(world, Load::try_from(load).ok()?).ok()
+            match world {
+                Some(world) => admission(records)(address, world, load),
+                None => Some(Admission::Dedicated),
+            }
         };
-        let picked = fleet.pick_admitted(Instant::now(), self.quota.take(from), admission);
+        let picked = fleet.pick_admitted(Instant::now(), self.quota.take(from), terms);
         picked.ok_or_else(|| self.servers.refusal(world))
     }
 

@@ -14,7 +14,7 @@ use super::server_record::ServerRecord;
 use super::slot_link::{LinkChange, LinkEvent};
 use crate::session::config::SessionConfig;
 use crate::session::placement::LoadBalancer;
-use crate::shared::domain::{Failure, Load, ProjectUrl, PublicAddress, Wishes};
+use crate::shared::domain::{Admission, Failure, Load, ProjectUrl, PublicAddress, Wishes};
 use crate::shared::http::tls;
 use crate::shared::run::permanent::PanicCounter;
 
@@ -142,7 +142,17 @@ impl ServerTable {
     }
 }
 
-/// Whether a server accepts a world, by its last report.
+/// On what terms a server takes a client for a world at a load, in percent, by its last report; `None` if it does not.
+pub fn admission(
+    records: &HashMap<PublicAddress, ServerRecord>,
+) -> impl Fn(&PublicAddress, &ProjectUrl, f64) -> Option<Admission> {
+    |server, world, load| {
+        let answer = records.get(server)?.state.last_answer()?;
+        answer.report.check(world, Load::try_from(load).ok()?).ok()
+    }
+}
+
+/// Whether a server accepts a world at the load of its last report.
 pub fn accepts(records: &HashMap<PublicAddress, ServerRecord>) -> impl Fn(&PublicAddress, &ProjectUrl) -> bool {
     |server, world| {
         let answer = records.get(server).and_then(|record| record.state.last_answer());

@@ -13,7 +13,7 @@ use super::rate::{Rate, estimate};
 use super::ticket::Ticket;
 use super::waiting_line::{Entry, Group, Place, Progress, WaitingLine};
 use crate::session::placement::LoadBalancer;
-use crate::shared::domain::{Hello, Offers, Pass, ProjectUrl, Wishes};
+use crate::shared::domain::{Admission, Hello, Offers, Pass, ProjectUrl, Wishes};
 
 /// A moment, by both clocks.
 #[derive(Debug, Clone, Copy)]
@@ -210,7 +210,8 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
         if offers.free == 0 {
             fleet.fill(server);
         }
-        let (run, valid) = (link.server, link.pass);
+        let run = link.server;
+        let valid = link.pass;
         for past in self.turns.values_mut().filter(|_| !offers.used.is_empty()) {
             let reservation = past
                 .turn
@@ -240,7 +241,7 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
     pub fn serve(
         &mut self,
         fleet: &mut LoadBalancer<Server>,
-        accepts: impl Fn(&Server, &ProjectUrl) -> bool,
+        admission: impl Fn(&Server, &ProjectUrl, f64) -> Option<Admission>,
         will_reserve: impl Fn(&Server) -> bool,
         only: Option<&Server>,
         now: Moment,
@@ -250,7 +251,7 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
             mut assigned,
             starved,
             plain,
-        } = self.share(fleet, &accepts, &will_reserve, now);
+        } = self.share(fleet, &admission, &will_reserve, now);
         let mut turns = Vec::new();
         for (place, server) in plain {
             turns.extend(self.turn(place, &server, None, now));
@@ -265,9 +266,11 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
             let mut first = room.unwrap_or_default();
             let mut all = first.len();
             if !starved.is_empty() && fleet.would_take(server) {
+                let load = fleet.effective_load(server);
+                let accepts = |world: &ProjectUrl| load.is_some_and(|load| admission(server, world, load).is_some());
                 let taken: HashSet<&str> = starved
                     .iter()
-                    .filter(|group| accepts(server, &group.world))
+                    .filter(|group| accepts(&group.world))
                     .map(|group| group.repository())
                     .collect();
                 let waiting = line.iter().filter(|(_, one)| taken.contains(one.group.repository()));
@@ -295,7 +298,7 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
     fn share(
         &self,
         fleet: &mut LoadBalancer<Server>,
-        accepts: &impl Fn(&Server, &ProjectUrl) -> bool,
+        admission: &impl Fn(&Server, &ProjectUrl, f64) -> Option<Admission>,
         will_reserve: &impl Fn(&Server) -> bool,
         now: Moment,
     ) -> Shares<Server> {
@@ -324,10 +327,11 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
             if pending.contains(place) || starved.contains(&Arc::as_ptr(&waiting.group)) {
                 continue;
             }
-            let may_take = |server: &Server| {
-                accepts(server, &waiting.group.world) && (self.links.contains_key(server) || !will_reserve(server))
+            let terms = |server: &Server, load| {
+                let is_ready = self.links.contains_key(server) || !will_reserve(server);
+                admission(server, &waiting.group.world, load).filter(|_| is_ready)
             };
-            match fleet.pick(now.instant, true, may_take) {
+            match fleet.pick_admitted(now.instant, true, terms) {
                 None => {
                     starved.insert(Arc::as_ptr(&waiting.group));
                     shares.starved.push(Arc::clone(&waiting.group));
@@ -370,9 +374,17 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
         Some((waiting.client, turn))
     }
 
-    /// Whether the free slots of a server belong to the line: somebody waits for a world that it accepts.
-    pub fn claims(&self, server: &Server, accepts: impl Fn(&Server, &ProjectUrl) -> bool) -> bool {
-        self.line.groups().any(|(group, _)| accepts(server, &group.world))
+    /// Whether the free slots of a server belong to the line: somebody waits for a world that it takes at its load, in
+    /// percent.
+    pub fn claims(
+        &self,
+        server: &Server,
+        load: f64,
+        admission: impl Fn(&Server, &ProjectUrl, f64) -> Option<Admission>,
+    ) -> bool {
+        self.line
+            .groups()
+            .any(|(group, _)| admission(server, &group.world, load).is_some())
     }
 
     /// Whether nobody waits.
@@ -513,7 +525,8 @@ impl Classes {
         servers: &[Server],
         accepts: impl Fn(&Server, &ProjectUrl) -> bool,
     ) -> Self {
-        let (mut sets, mut of_group): (Vec<Vec<bool>>, _) = (Vec::new(), HashMap::new());
+        let mut sets: Vec<Vec<bool>> = Vec::new();
+        let mut of_group = HashMap::new();
         if line.groups().count() > MAX_GROUPS {
             sets.push(vec![true; servers.len()]);
         } else {
@@ -678,9 +691,11 @@ mod tests {
         fn serve(&mut self) {
             loop {
                 let accepts = accepts(&self.servers);
+                let admission =
+                    |server: &usize, world: &ProjectUrl, _| accepts(server, world).then_some(Admission::Dedicated);
                 let Served { turns, wishes } =
                     self.dispatcher
-                        .serve(&mut self.balancer, accepts, |_| false, None, self.now);
+                        .serve(&mut self.balancer, admission, |_| false, None, self.now);
                 if turns.is_empty() && wishes.is_empty() {
                     return;
                 }
@@ -689,7 +704,8 @@ mod tests {
                 }
                 self.take(turns);
                 for (id, wishes) in wishes {
-                    let (number, back) = (wishes.number, u32::try_from(wishes.back.len()).unwrap());
+                    let number = wishes.number;
+                    let back = u32::try_from(wishes.back.len()).unwrap();
                     self.servers[id].wishes = wishes.first;
                     self.servers[id].taken -= back;
                     self.offer(id, number);

@@ -66,7 +66,8 @@ impl Rate {
 /// Seconds until a client has a slot that has `ahead` clients ahead of it, from the rates of the servers that may take
 /// it, coarsely rounded; `None` without a basis.
 pub(super) fn estimate(rates: impl Iterator<Item = (u32, Duration)>, ahead: u32) -> Option<u32> {
-    let (mut freed, mut per_second) = (0_u32, 0.0);
+    let mut freed = 0_u32;
+    let mut per_second = 0.0;
     for (slots, time) in rates.filter(|(_, time)| !time.is_zero()) {
         freed = freed.saturating_add(slots);
         per_second += f64::from(slots) / time.as_secs_f64();

@@ -350,7 +350,8 @@ mod tests {
                 instances,
                 ..ServerReport::load_only(Load::try_from(load).unwrap())
             };
-            let (at, policy) = (self.at(seconds), PlacementPolicy::default());
+            let at = self.at(seconds);
+            let policy = PlacementPolicy::default();
             self.0.expire(at, &policy);
             self.0.report(at, &report, true, &policy, &mut self.2, &mut self.3);
         }

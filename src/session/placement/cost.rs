@@ -144,10 +144,8 @@ impl CostFit {
     /// The base and the cost of a client, both in percent of load, and the variance of the cost.
     fn fit(&self) -> (f64, f64, f64) {
         let trust = NOISE / (self.guess * self.guess);
-        let (weight, load) = (
-            self.weight + self.idle_weight,
-            self.load + self.idle_weight * self.idle_load,
-        );
+        let weight = self.weight + self.idle_weight;
+        let load = self.load + self.idle_weight * self.idle_load;
         let squares = self.clients_squared + trust;
         let products = self.clients_by_load + trust * self.guess;
         // Positive, because weight * clients_squared >= clients * clients holds before the positive terms are added to
@@ -312,7 +310,7 @@ mod tests {
         for second in 0..300_u32 {
             let now = start + Duration::from_secs(second.into());
             fleet.report(&0, now, &report(100.0, 20 + second, 20 + second), true);
-            assert!(!fleet.available(now, |_| true));
+            assert!(!fleet.available(now, |_, _| true));
         }
         assert!(fleet.client_cost(&0).is_some_and(|cost| cost >= 2.0));
     }
@@ -320,7 +318,9 @@ mod tests {
     /// One server, with reports of (seconds, load, clients).
     fn taught(reports: &[(u32, f64, u32)]) -> (LoadBalancer<u32>, Instant) {
         let (mut fleet, start) = fleet(2.0, 1);
-        let (mut second, mut arrivals, mut before) = (0, 0, 0);
+        let mut second = 0;
+        let mut arrivals = 0;
+        let mut before = 0;
         for (seconds, load, present) in reports {
             arrivals += present.saturating_sub(before);
             before = *present;

@@ -188,10 +188,10 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
         self.replicas.count(0.0, count(given_up));
     }
 
-    /// Whether some server that is `eligible` can take a client.
-    pub fn available(&mut self, now: Instant, eligible: impl Fn(&Id) -> bool) -> bool {
+    /// Whether some server that is `eligible` at its load, in percent, can take a client.
+    pub fn available(&mut self, now: Instant, eligible: impl Fn(&Id, f64) -> bool) -> bool {
         self.expire(now);
-        self.ranking.values().any(eligible)
+        self.ranking.iter().any(|(rank, id)| eligible(id, rank.load()))
     }
 
     /// Whether others are preferred to a server, because its last starts have failed.
@@ -225,7 +225,8 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
 
 /// Updates the rank of a server after a change.
 fn sort_in<Id: Clone>(server: &mut Backend, id: &Id, policy: &PlacementPolicy, ranking: &mut BTreeMap<Rank, Id>) {
-    let (before, now) = (server.rank, server.current_rank(policy));
+    let before = server.rank;
+    let now = server.current_rank(policy);
     if before != now {
         before.map(|rank| ranking.remove(&rank));
         now.map(|rank| ranking.insert(rank, id.clone()));
@@ -294,7 +295,7 @@ mod tests {
             let mut fleet = fleet(2.0, now, []);
             fleet.add(0);
             fleet.report(&0, now, &report(load, instances), accepting);
-            assert_eq!(fleet.available(now, |_| true), available, "{why}");
+            assert_eq!(fleet.available(now, |_, _| true), available, "{why}");
             assert_eq!(fleet.pick(now, true, |_| true).is_some(), available, "{why}");
         }
     }
@@ -312,7 +313,7 @@ mod tests {
                 }
                 let id = fleet.pick(at, false, |_| true).unwrap();
                 got[usize::try_from(id).unwrap()] += 1;
-                assert!(fleet.available(at, |_| true));
+                assert!(fleet.available(at, |_, _| true));
             }
             assert!(got.iter().all(|got| (400..600).contains(got)), "{got:?}");
             let end = now + Duration::from_secs(15);
@@ -345,7 +346,7 @@ mod tests {
                 ..load_only(load)
             }),
         );
-        assert!(fleet.available(now, |_| true));
+        assert!(fleet.available(now, |_, _| true));
         assert_eq!(fleet.pick(now, true, |_| true), Some(0));
         assert_eq!(fleet.pick(now, true, |id| *id == 1), Some(1));
     }
@@ -458,7 +459,7 @@ mod tests {
                 prop_assert!(placed == 0 || level(id) <= lowest + 2.0 + 1e-9);
                 prop_assert!(level(id) < 95.0 + 2.0);
             }
-            prop_assert_eq!(fleet.available(now, |_| true), lowest < 95.0);
+            prop_assert_eq!(fleet.available(now, |_, _| true), lowest < 95.0);
         }
 
         #[test]
@@ -478,8 +479,8 @@ mod tests {
                 match action {
                     0 => fleet.lose(&id),
                     1 => { fleet.remove(&id); fleet.add(id); }
-                    2 => prop_assert_eq!(fleet.available(now, |_| true), fleet.pick(now, true, |_| true).is_some()),
-                    3 => prop_assert_eq!(fleet.available(now, |_| true), fleet.pick(now, false, |_| true).is_some()),
+                    2 => prop_assert_eq!(fleet.available(now, |_, _| true), fleet.pick(now, true, |_| true).is_some()),
+                    3 => prop_assert_eq!(fleet.available(now, |_, _| true), fleet.pick(now, false, |_| true).is_some()),
                     _ => fleet.report(&id, now, &report(load, instances.map(counts)), action > 4),
                 }
                 for id in 0..3 {
