@@ -105,6 +105,15 @@ export const words = {
     idleTime: '其他来源的世界只在服务器空闲时运行。',
     advice: '有服务器空闲时会自动开始。',
   },
+  line: {
+    advice: '轮到您时会自动开始。重新加载页面不会失去您的位置。',
+    /**
+     * @param {string} position
+     * @param {number} seconds
+     */
+    estimated: (position, seconds) => `${position}，大约${Math.max(1, Math.round(seconds / 60))}分钟`,
+    turn: '轮到您了。',
+  },
   lost: {
     since: (seconds) => `连接已中断 ${duration(seconds)}。`,
     waits: (seconds) => (seconds > 0 ? `您的仿真还会等待 ${duration(seconds)}。` : '您的仿真可能已经结束。'),

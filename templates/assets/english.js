@@ -118,6 +118,16 @@ export const words = {
     idleTime: 'Worlds of others run here only while the servers have little to do.',
     advice: 'It starts by itself when one is free.',
   },
+  line: {
+    advice: 'It starts by itself when it is your turn. You keep your place if you load the page again.',
+    /**
+     * @param {string} position
+     * @param {number} seconds
+     */
+    estimated: (position, seconds) =>
+      `${position}, about ${seconds < 90 ? 'a minute' : `${Math.round(seconds / 60)} minutes`}`,
+    turn: 'It is your turn.',
+  },
   lost: {
     /** @param {number} seconds */
     since: (seconds) => `No connection for ${duration(seconds)}.`,

@@ -109,6 +109,16 @@ export const words = {
     idleTime: 'Les mondes extérieurs ne tournent ici que lorsque les serveurs ont peu à faire.',
     advice: 'Elle démarre d’elle-même dès qu’un serveur est libre.',
   },
+  line: {
+    advice: 'Elle démarre d’elle-même quand c’est votre tour. Vous gardez votre place si vous rechargez la page.',
+    /**
+     * @param {string} position
+     * @param {number} seconds
+     */
+    estimated: (position, seconds) =>
+      `${position}, environ ${seconds < 90 ? 'une minute' : `${Math.round(seconds / 60)} minutes`}`,
+    turn: 'C’est votre tour.',
+  },
   lost: {
     since: (seconds) => `Pas de connexion depuis ${duration(seconds)}.`,
     waits: (seconds) =>

@@ -109,6 +109,17 @@ export const words = {
     idleTime: 'Fremde Welten laufen hier nur, solange die Server wenig zu tun haben.',
     advice: 'Es geht von selbst los, sobald einer frei ist.',
   },
+  line: {
+    advice:
+      'Es startet von selbst, wenn Sie an der Reihe sind. Sie behalten Ihren Platz, wenn Sie die Seite neu laden.',
+    /**
+     * @param {string} position
+     * @param {number} seconds
+     */
+    estimated: (position, seconds) =>
+      `${position}, etwa ${seconds < 90 ? 'eine Minute' : `${Math.round(seconds / 60)} Minuten`}`,
+    turn: 'Sie sind an der Reihe.',
+  },
   lost: {
     since: (seconds) => `Keine Verbindung seit ${duration(seconds)}.`,
     waits: (seconds) =>

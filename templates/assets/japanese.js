@@ -106,6 +106,15 @@ export const words = {
     idleTime: '外部のワールドは、サーバーに余裕があるときだけ動きます。',
     advice: '空きができると自動的に始まります。',
   },
+  line: {
+    advice: '順番が来ると自動的に始まります。ページを再読み込みしても順番は保たれます。',
+    /**
+     * @param {string} position
+     * @param {number} seconds
+     */
+    estimated: (position, seconds) => `${position}、約${Math.max(1, Math.round(seconds / 60))}分`,
+    turn: 'あなたの順番です。',
+  },
   lost: {
     since: (seconds) => `接続が切れてから ${duration(seconds)}たちました。`,
     waits: (seconds) =>

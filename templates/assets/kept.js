@@ -41,3 +41,58 @@ export function forget() {
     // Nothing was stored.
   }
 }
+
+/* the place in the line */
+
+const TICKET = 'ticket';
+/** How long a ticket is valid, in milliseconds: the session server sends it again and again. */
+const VALIDITY = 30_000;
+/** @type {{ world: string, ticket: string, at: number } | undefined} */
+let place;
+
+/**
+ * Stores the ticket of this tab for its place in the line.
+ * @param {string} world
+ * @param {string} ticket
+ */
+export function keepTicket(world, ticket) {
+  place = { world, ticket, at: Date.now() };
+  try {
+    sessionStorage.setItem(TICKET, JSON.stringify(place));
+  } catch {
+    // The page's own copy remains.
+  }
+}
+
+/**
+ * The world that this tab waits for, and its ticket, if it is still valid.
+ * @returns {{ world: string, ticket: string } | undefined}
+ */
+export function keptTicket() {
+  let stored = place;
+  try {
+    stored = JSON.parse(sessionStorage.getItem(TICKET) ?? 'null') ?? place;
+  } catch {
+    // The page's own copy remains.
+  }
+  return stored && Date.now() - stored.at < VALIDITY ? stored : undefined;
+}
+
+/**
+ * The ticket for a world, if there is one.
+ * @param {string} world
+ */
+export function ticketFor(world) {
+  const stored = keptTicket();
+  return stored?.world === world ? stored.ticket : undefined;
+}
+
+/** Removes the ticket: its turn is over, or the visitor waits no longer. */
+export function forgetTicket() {
+  place = undefined;
+  try {
+    sessionStorage.removeItem(TICKET);
+  } catch {
+    // Nothing was stored.
+  }
+}

@@ -203,13 +203,18 @@ function stepCode(number, text) {
  * A message of the session server.
  * @typedef {{ is: 'available', now: boolean }
  *   | { is: 'announced', text: string }
- *   | { is: 'chosen', server: string }
+ *   | { is: 'ticket', ticket: string }
+ *   | { is: 'queued', ahead: number }
+ *   | { is: 'estimated', seconds: number }
+ *   | { is: 'chosen', server: string, pass?: string }
  *   | { is: 'refused', failure: Failure }} FleetMessage
  */
 
 /** Reads the texts of the session server's WebSocket. */
 export class FleetReader {
   #reasons = new Reasons();
+  /** @type {string | undefined} */
+  #pass;
 
   /**
    * Reads a text; `undefined` if it belongs to the next one, or is of a later version.
@@ -231,7 +236,30 @@ export class FleetReader {
     if (sentence !== undefined) {
       return { is: 'refused', failure: this.#reasons.failure(sentence) };
     }
-    const isAddress = text.startsWith('ws://') || text.startsWith('wss://');
-    return isAddress ? { is: 'chosen', server: text } : undefined;
+    if (text.startsWith('ws://') || text.startsWith('wss://')) {
+      const pass = this.#pass;
+      this.#pass = undefined;
+      return { is: 'chosen', server: text, ...(pass && { pass }) };
+    }
+    return this.#readLine(text);
+  }
+
+  /**
+   * Reads a text about the line.
+   * @param {string} text
+   * @returns {FleetMessage | undefined}
+   */
+  #readLine(text) {
+    this.#pass = after(text, 'pass:') ?? this.#pass;
+    const ticket = after(text, 'ticket:');
+    if (ticket !== undefined) {
+      return { is: 'ticket', ticket };
+    }
+    const ahead = after(text, 'queue:');
+    if (ahead !== undefined) {
+      return { is: 'queued', ahead: Number(ahead) };
+    }
+    const seconds = after(text, 'estimate:');
+    return seconds === undefined ? undefined : { is: 'estimated', seconds: Number(seconds) };
   }
 }

@@ -29,6 +29,16 @@ export const STEPS = /** @type {const} */ (['session', 'server', 'place', 'check
  */
 
 /**
+ * The title of the page while the visitor waits in the line; otherwise it is that of the page.
+ * @param {State} state
+ * @param {string} title
+ */
+export function titleOf(state, title) {
+  const ahead = state.is === 'asking' ? state.line?.ahead : undefined;
+  return ahead === undefined ? title : `(${ahead + 1}) ${title}`;
+}
+
+/**
  * @param {Visit} visit
  * @param {number} now in milliseconds
  * @param {Words} words
@@ -44,7 +54,7 @@ export function view({ fleet, state }, now, words) {
   return {
     lamp: isLost ? undefined : lamps[fleet],
     availability: words.availability[isLost ? 'lost' : fleet],
-    progress: state.is === 'ended' ? failedProgress(state.from, words) : progress(state, words),
+    progress: state.is === 'ended' ? failedProgress(state.from, now, words) : progress(state, now, words),
     notice: isLost ? lostNotice(state, now, words) : waitingNotice(state, words),
     problem: state.is === 'ended' ? problemView(state.problem, words) : undefined,
     idle: idle === undefined ? undefined : words.idle(idle),
@@ -72,6 +82,9 @@ function leaveLabel(state, words) {
  * @returns {Notice | undefined}
  */
 export function waitingNotice(state, words) {
+  if (state.is === 'asking' && state.line) {
+    return { text: words.waiting.general, advice: words.line.advice };
+  }
   const why = state.is === 'waiting' ? state.why : state.is === 'asking' ? state.waitsFor : undefined;
   if (!why) {
     return undefined;
@@ -164,24 +177,29 @@ function problemView(problem, words) {
 
 /**
  * @param {Going} from
+ * @param {number} now
  * @param {Words} words
  * @returns {Progress}
  */
-function failedProgress(from, words) {
-  return { ...(progress(from, words) ?? { at: 'session', notes: {} }), is: 'failed' };
+function failedProgress(from, now, words) {
+  return { ...(progress(from, now, words) ?? { at: 'session', notes: {} }), is: 'failed' };
 }
 
 /**
  * @param {Going} state
+ * @param {number} now
  * @param {Words} words
  * @returns {Progress | undefined}
  */
-function progress(state, words) {
+function progress(state, now, words) {
   if (isConnected(state)) {
     return connectedProgress(state, words);
   }
   switch (state.is) {
     case 'asking':
+      if (state.line) {
+        return { at: 'session', is: 'doing', notes: { session: lineNote(state.line, now, words) } };
+      }
       return {
         at: 'session',
         is: 'doing',
@@ -232,6 +250,19 @@ function connectedProgress(state, words) {
         notes: { ...asked, simulation: words.steps.returning },
       };
   }
+}
+
+/**
+ * @param {import('./visit.js').Line} line
+ * @param {number} now
+ * @param {Words} words
+ */
+function lineNote({ ahead, turnAt }, now, words) {
+  if (ahead === undefined) {
+    return words.steps.choosing;
+  }
+  const position = words.steps.queued(ahead);
+  return turnAt === undefined ? position : words.line.estimated(position, Math.max(0, (turnAt - now) / 1000));
 }
 
 /**

@@ -1,5 +1,6 @@
-// The WebSocket of the session server: whether a simulation server is free, announcements, and requests for a server.
+// The WebSocket of the session server: whether a simulation server is free, announcements, and the line for a server.
 
+import { keepTicket, ticketFor } from './kept.js';
 import { FleetReader } from './messages.js';
 
 /** @typedef {import('./messages.js').Failure} Failure */
@@ -8,20 +9,23 @@ import { FleetReader } from './messages.js';
 const RECONNECT = 2000;
 
 /**
- * What the session server sends. `answered`: the answer to the request with this number.
+ * What the session server sends. `answered`: the answer to the request with this number; `queued`, `estimated`: how many
+ * clients are ahead of it, and the seconds until its turn.
  * @typedef {{ type: 'connected' }
  *   | { type: 'disconnected' }
  *   | { type: 'available', now: boolean }
  *   | { type: 'announced', text: string }
- *   | { type: 'answered', id: number, answer: { server: string } | { failure: Failure } }} FleetEvent
+ *   | { type: 'queued', id: number, ahead: number }
+ *   | { type: 'estimated', id: number, seconds: number }
+ *   | { type: 'answered', id: number, answer: { server: string, pass?: string | undefined } | { failure: Failure } }} FleetEvent
  */
 
 export class SessionServer {
   #tell;
   /** @type {WebSocket} */
   #socket;
-  /** The numbers of the requests that are not answered yet; answers come in order. @type {number[]} */
-  #asked = [];
+  /** The request that is not answered yet: another one replaces it. @type {{ id: number, world: string } | undefined} */
+  #asked;
 
   /**
    * Connects, again and again.
@@ -40,7 +44,7 @@ export class SessionServer {
     socket.addEventListener('open', () => this.#tell({ type: 'connected' }));
     socket.addEventListener('message', ({ data }) => this.#read(reader.read(String(data))));
     socket.addEventListener('close', () => {
-      this.#asked = [];
+      this.#asked = undefined;
       this.#tell({ type: 'disconnected' });
       setTimeout(() => {
         this.#socket = this.#open();
@@ -58,8 +62,23 @@ export class SessionServer {
       case 'announced':
         this.#tell({ type: 'announced', text: message.text });
         break;
+      case 'ticket':
+        if (this.#asked) {
+          keepTicket(this.#asked.world, message.ticket);
+        }
+        break;
+      case 'queued':
+        if (this.#asked) {
+          this.#tell({ type: 'queued', id: this.#asked.id, ahead: message.ahead });
+        }
+        break;
+      case 'estimated':
+        if (this.#asked) {
+          this.#tell({ type: 'estimated', id: this.#asked.id, seconds: message.seconds });
+        }
+        break;
       case 'chosen':
-        this.#answer({ server: message.server });
+        this.#answer({ server: message.server, pass: message.pass });
         break;
       case 'refused':
         this.#answer({ failure: message.failure });
@@ -67,16 +86,18 @@ export class SessionServer {
     }
   }
 
-  /** @param {{ server: string } | { failure: Failure }} answer */
+  /** @param {{ server: string, pass?: string | undefined } | { failure: Failure }} answer */
   #answer(answer) {
-    const id = this.#asked.shift();
-    if (id !== undefined) {
-      this.#tell({ type: 'answered', id, answer });
+    const asked = this.#asked;
+    this.#asked = undefined;
+    if (asked) {
+      this.#tell({ type: 'answered', id: asked.id, answer });
     }
   }
 
   /**
-   * Requests a simulation server for a world. Without a connection there is no answer.
+   * Requests a simulation server for a world, at the place in the line that this tab had. Without a connection there is
+   * no answer.
    * @param {number} id
    * @param {string} world
    */
@@ -84,7 +105,15 @@ export class SessionServer {
     if (this.#socket.readyState !== WebSocket.OPEN) {
       return;
     }
-    this.#asked.push(id);
-    this.#socket.send(JSON.stringify({ url: world, reason: true }));
+    this.#asked = { id, world };
+    this.#socket.send(JSON.stringify({ url: world, reason: true, wait: true, ticket: ticketFor(world) }));
+  }
+
+  /** Gives up the place in the line. */
+  stopWaiting() {
+    this.#asked = undefined;
+    if (this.#socket.readyState === WebSocket.OPEN) {
+      this.#socket.send(JSON.stringify({ wait: false }));
+    }
   }
 }

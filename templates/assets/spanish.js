@@ -109,6 +109,16 @@ export const words = {
     idleTime: 'Los mundos ajenos solo funcionan aquí mientras los servidores tienen poco que hacer.',
     advice: 'Empezará por sí sola cuando haya uno libre.',
   },
+  line: {
+    advice: 'Empieza sola cuando sea su turno. Conserva su lugar si vuelve a cargar la página.',
+    /**
+     * @param {string} position
+     * @param {number} seconds
+     */
+    estimated: (position, seconds) =>
+      `${position}, aproximadamente ${seconds < 90 ? 'un minuto' : `${Math.round(seconds / 60)} minutos`}`,
+    turn: 'Es su turno.',
+  },
   lost: {
     since: (seconds) => `Sin conexión desde hace ${duration(seconds)}.`,
     waits: (seconds) =>

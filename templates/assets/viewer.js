@@ -2,12 +2,13 @@
 // effects, and draws what it shows (`page_view.js`).
 
 import { find, setText } from './dom.js';
-import { forget, keep, kept } from './kept.js';
+import { forget, forgetTicket, keep, kept, keptTicket } from './kept.js';
 import { wordsOfPage } from './language.js';
-import { STEPS, timeLeft, view, waitingNotice } from './page_view.js';
+import { STEPS, timeLeft, titleOf, view, waitingNotice } from './page_view.js';
 import { SessionServer } from './session_server.js';
 import { SimulationLink } from './simulation_link.js';
 import { Stage } from './stage.js';
+import { ring } from './turn.js';
 import { BEGIN, next } from './visit.js';
 
 /** @typedef {import('./visit.js').Effect} Effect */
@@ -23,6 +24,8 @@ const disconnect = find('disconnect', HTMLButtonElement);
 /** The visitor's name, from the link to this page. */
 const visitor = search.get('name')?.trim() || undefined;
 
+const TITLE = document.title;
+let shownTitle = TITLE;
 let visit = BEGIN;
 /** @type {ReturnType<typeof setTimeout> | undefined} */
 let timer;
@@ -50,10 +53,14 @@ function take(event) {
   if (visit.wakeAt !== undefined) {
     timer = setTimeout(() => take({ type: 'tick' }), Math.max(0, visit.wakeAt - Date.now()));
   }
+  // The turn is over once a simulation starts, and a place that was left is given up.
+  if (event.type === 'left' || ['starting', 'running', 'lost', 'ended'].includes(visit.state.is)) {
+    forgetTicket();
+  }
   draw();
   const waits = waitingNotice(visit.state, words);
   if (waits && !waitingNotice(before.state, words)) {
-    say(`${waits.text} ${waits.advice}`);
+    say(`${said}. ${waits.text} ${waits.advice}`);
   }
 }
 
@@ -94,13 +101,22 @@ function carryOut(effect) {
       return visit.state.is === 'lost' ? say(words.lost.said(timeLeft(visit.state, Date.now()))) : undefined;
     case 'sayFound':
       return say(words.lost.found);
+    case 'stopWaiting':
+      return sessionServer.stopWaiting();
+    case 'sayTurn':
+      say(words.line.turn);
+      drawTitle(TITLE);
+      return ring(words.line.turn);
   }
 }
 
 /** @param {Extract<Effect, { do: 'connect' }>} effect */
 function open({ server, request }) {
   link?.detach();
-  const start = 'resume' in request ? request : { start: { url: request.world, resumable: true, name: visitor } };
+  const start =
+    'resume' in request
+      ? request
+      : { start: { url: request.world, pass: request.pass, resumable: true, name: visitor } };
   link = new SimulationLink(server, start, take);
 }
 
@@ -133,6 +149,17 @@ function show(element, text, place = element) {
 }
 
 /**
+ * Sets the title of the page, unless that says that it is the visitor's turn.
+ * @param {string} title
+ */
+function drawTitle(title) {
+  if (title !== shownTitle) {
+    document.title = title;
+    shownTitle = title;
+  }
+}
+
+/**
  * Tells screen readers something.
  * @param {string} text
  */
@@ -150,6 +177,7 @@ function announce(text) {
 
 function draw() {
   const shown = view(visit, Date.now(), words);
+  drawTitle(titleOf(visit.state, TITLE));
   drawAvailability(shown.lamp, shown.availability);
   drawProgress(shown.progress);
   drawNotice('notice', shown.notice);
@@ -253,6 +281,12 @@ function sayStep(text) {
 function restore() {
   const simulation = kept();
   const named = search.get('url');
+  const waits = keptTicket();
+  if (!simulation && waits && (named === null || named === waits.world)) {
+    address.value = waits.world;
+    take({ type: 'awaited', world: waits.world });
+    return;
+  }
   if (!simulation || (named !== null && named !== simulation.world)) {
     forget();
     return;

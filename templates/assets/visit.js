@@ -46,9 +46,13 @@ import { helpsToWait } from './reasons.js';
  *   | { is: 'closed', until: number }} Scene
  */
 
+/** A place in the line: how many are ahead, if that is known, and when it will be the visitor's turn, in milliseconds.
+ * @typedef {{ ahead: number | undefined, turnAt?: number | undefined }} Line
+ */
+
 /** The states before a simulation server is known. `until`: when the next thing happens by itself.
  * @typedef {{ is: 'idle' }
- *   | { is: 'asking', goal: Goal, id: number, until: number, waitsFor?: Problem | undefined }
+ *   | { is: 'asking', goal: Goal, id: number, until?: number | undefined, waitsFor?: Problem | undefined, line?: Line | undefined }
  *   | { is: 'waiting', goal: Goal, why: Problem, until?: number | undefined }
  *   | { is: 'redirected', goal: Goal, why: Problem, until: number }} Unconnected
  */
@@ -83,6 +87,7 @@ import { helpsToWait } from './reasons.js';
 /**
  * @typedef {{ type: 'submitted', world: string }
  *   | { type: 'restored', kept: Kept }
+ *   | { type: 'awaited', world: string }
  *   | { type: 'left' }
  *   | { type: 'hidden' }
  *   | { type: 'keep' }
@@ -102,10 +107,11 @@ import { helpsToWait } from './reasons.js';
  * What the page does. `leave` ends the simulation, `detach` lets it wait; both close the viewer. `freeze` keeps what the
  * viewer shows and closes its stream. `probe` finds out whether the session server answers.
  * @typedef {{ do: 'ask', id: number, world: string }
- *   | { do: 'connect', server: string, request: { world: string } | { resume: string } }
+ *   | { do: 'connect', server: string, request: { world: string, pass?: string | undefined } | { resume: string } }
  *   | { do: 'show', address: string, kind: string | undefined, server: string, isBack: boolean }
  *   | { do: 'store', kept: Kept }
  *   | { do: 'send', message: object }
+ *   | { do: 'stopWaiting' | 'sayTurn' }
  *   | { do: 'clear' | 'clearLeft' | 'clearStopped' | 'leave' | 'detach' | 'freeze' | 'probe' | 'sayLost' | 'sayFound' }} Effect
  */
 
@@ -122,6 +128,10 @@ const FIRST_WAIT = 2000;
 const LONGEST_WAIT = 30_000;
 /** Longest random pause after a server has become free, so that not all waiting pages ask at once, in milliseconds. */
 const JITTER = 3000;
+/** The number of no request. */
+const NOT_ASKED = 0;
+/** Reasons for which a pass is refused: the session server gives another one. */
+const NO_PASS = ['invalid-pass', 'used-pass', 'expired-pass'];
 /** Close codes after which another simulation server may accept the client: going away, try again later. */
 const TRY_ANOTHER = [1001, 1013];
 /** Time without a sign of life after which the connection is lost, in milliseconds; Webots gives one every five seconds. */
@@ -158,7 +168,7 @@ export function next(visit, event, now, random) {
   if (isConnected(from) && !isConnected(to)) {
     effects.unshift({ do: event.type === 'hidden' && resumptionOf(from) ? 'detach' : 'leave' });
   }
-  const asked = to.is === 'asking' ? to.id : visit.asked;
+  const asked = to.is === 'asking' ? Math.max(to.id, visit.asked) : visit.asked;
   return { visit: { fleet, state: to, asked, wakeAt: wakeAt(to, visit.wakeAt, now) }, effects };
 }
 
@@ -215,8 +225,14 @@ function transition(state, event, around) {
       return ask({ world: event.world, attempt: 0, wait: FIRST_WAIT }, around, undefined, [{ do: 'clear' }]);
     case 'restored':
       return restore(event.kept, around);
+    case 'awaited':
+      // It is asked for when the session server is there.
+      return { to: inLine({ world: event.world, attempt: 0, wait: FIRST_WAIT }) };
     case 'left':
-      return { to: { is: 'idle' }, effects: [{ do: isConnected(state) ? 'clearLeft' : 'clearStopped' }] };
+      return {
+        to: { is: 'idle' },
+        effects: isConnected(state) ? [{ do: 'clearLeft' }] : [{ do: 'stopWaiting' }, { do: 'clearStopped' }],
+      };
     case 'hidden':
       return state.is === 'ended' ? undefined : { to: { is: 'idle' } };
   }
@@ -268,26 +284,49 @@ function ask(goal, { fleet, asked, now }, waitsFor, before = []) {
  */
 function whileAsking(state, event, around) {
   if (event.type === 'disconnected') {
-    return { to: end({ code: 'session-unreachable' }, state) };
+    return { to: state.line ? inLine(state.goal, state.line) : end({ code: 'session-unreachable' }, state) };
   }
-  if (event.type === 'tick' && around.now >= state.until) {
+  if (event.type === 'available' && state.line && state.id === NOT_ASKED) {
+    const { to, effects } = ask(state.goal, around);
+    return to.is === 'asking' ? { to: { ...to, line: state.line }, ...(effects && { effects }) } : undefined;
+  }
+  if (event.type === 'tick' && state.until !== undefined && around.now >= state.until) {
     return { to: end({ code: 'session-silent' }, state) };
   }
-  if (event.type !== 'answered' || event.id !== state.id) {
+  if (!('id' in event) || event.id !== state.id) {
     return undefined;
   }
   const { goal } = state;
+  if (event.type === 'queued') {
+    return { to: { ...state, until: undefined, line: { ...state.line, ahead: event.ahead } } };
+  }
+  if (event.type === 'estimated') {
+    const line = { ahead: state.line?.ahead, turnAt: around.now + SECOND * event.seconds };
+    return { to: { ...state, until: undefined, line } };
+  }
   if ('failure' in event.answer) {
     const { failure } = event.answer;
     // After a redirection the session server may not have noticed yet that the last server can't take anybody.
     const isFinal = goal.attempt === 0 || failure.reason?.retry === 'no';
     return isFinal ? waitOrEnd(failure, goal, state, around) : redirect(failure, goal, state, around);
   }
-  const { server } = event.answer;
+  const { server, pass } = event.answer;
+  /** @type {Effect[]} */
+  const effects = [{ do: 'connect', server, request: { world: goal.world, ...(pass && { pass }) } }];
   return {
     to: { is: 'connecting', goal, server, isRestored: false, place: { is: 'opening' } },
-    effects: [{ do: 'connect', server, request: { world: goal.world } }],
+    effects: state.line ? [...effects, { do: 'sayTurn' }] : effects,
   };
+}
+
+/**
+ * A place in the line, for which the session server is asked when it is there.
+ * @param {Goal} goal
+ * @param {Line} [line]
+ * @returns {Unconnected}
+ */
+function inLine(goal, line = { ahead: undefined }) {
+  return { is: 'asking', goal, id: NOT_ASKED, line };
 }
 
 /**
@@ -396,7 +435,7 @@ function startFailed(state, { code, failure }, around) {
       : redirect({ code: 'server-unreachable' }, goal, state, around);
   }
   const isForAnother = failure.reason
-    ? failure.reason.retry === 'elsewhere'
+    ? failure.reason.retry === 'elsewhere' || NO_PASS.includes(failure.reason.code)
     : code !== undefined && TRY_ANOTHER.includes(code);
   return isForAnother ? redirect(failure, goal, state, around) : waitOrEnd(failure, goal, state, around);
 }

@@ -4,7 +4,7 @@ import assert from 'node:assert/strict';
 import { test } from 'node:test';
 import { words } from '../../templates/assets/english.js';
 import { FleetReader, SimulationReader } from '../../templates/assets/messages.js';
-import { view } from '../../templates/assets/page_view.js';
+import { titleOf, view } from '../../templates/assets/page_view.js';
 import { BEGIN, next } from '../../templates/assets/visit.js';
 
 /** @typedef {import('../../templates/assets/visit.js').Event} VisitEvent */
@@ -80,7 +80,12 @@ class Visit {
     for (const text of texts) {
       const message = reader.read(text);
       if (message?.is === 'chosen') {
-        this.take({ type: 'answered', id: this.visit.asked, answer: { server: message.server } });
+        const { server, pass } = message;
+        this.take({ type: 'answered', id: this.visit.asked, answer: { server, pass } });
+      } else if (message?.is === 'queued') {
+        this.take({ type: 'queued', id: this.visit.asked, ahead: message.ahead });
+      } else if (message?.is === 'estimated') {
+        this.take({ type: 'estimated', id: this.visit.asked, seconds: message.seconds });
       } else if (message?.is === 'refused') {
         this.take({ type: 'answered', id: this.visit.asked, answer: { failure: message.failure } });
       }
@@ -125,6 +130,40 @@ const running = () =>
     .take(SHOWN);
 /** A sentence of a server behind its reason. @type {(sentence: string, why?: Reason) => string[]} */
 const error = (sentence, why) => [...(why ? [`reason: ${JSON.stringify(why)}`] : []), `loading: Error: ${sentence}`];
+
+test('a place in the line, its turn, and the pass', () => {
+  const visit = asking();
+  visit.answer('ticket: t', 'queue: 2', 'estimate: 240');
+  assert.equal(visit.view.progress?.notes.session, '2 clients are ahead of you, about 4 minutes');
+  assert.equal(visit.view.leave, 'Stop waiting');
+  assert.equal(titleOf(visit.state, 'Try a world'), '(3) Try a world');
+  // It waits longer than any answer may take.
+  visit.pass(600).answer('queue: 0');
+  assert.equal(visit.view.progress?.notes.session, 'you are next, about a minute');
+  visit.answer('pass: p', SERVER);
+  const request = { world: WORLD, pass: 'p' };
+  assert.deepEqual(visit.effects.slice(-2), [{ do: 'connect', server: SERVER, request }, { do: 'sayTurn' }]);
+  // A pass that is refused leads to another one.
+  visit.take(
+    { type: 'opened' },
+    { type: 'closed', failure: { sentence: 'late', reason: reason('expired-pass', 'user', 'later') } },
+  );
+  assert.equal(visit.state.is, 'redirected');
+});
+
+test('the place in the line is kept without a connection, after a reload, and until it is given up', () => {
+  const visit = asking();
+  visit.answer('queue: 5').take({ type: 'disconnected' });
+  assert.equal(visit.view.progress?.notes.session, '5 clients are ahead of you');
+  visit.take({ type: 'available', now: false });
+  assert.deepEqual(visit.effects.at(-1), { do: 'ask', id: 2, world: WORLD });
+  visit.answer('queue: 4').take({ type: 'left' });
+  assert.deepEqual(visit.effects.slice(-2), [{ do: 'stopWaiting' }, { do: 'clearStopped' }]);
+  const reloaded = new Visit().take({ type: 'awaited', world: WORLD });
+  assert.equal(reloaded.view.leave, 'Stop waiting');
+  reloaded.take({ type: 'available', now: false });
+  assert.deepEqual(reloaded.effects.at(-1), { do: 'ask', id: 1, world: WORLD });
+});
 
 test('a visit from the start to the end', () => {
   const visit = asking();

@@ -148,7 +148,7 @@ class Busy(Running):
         third.tab.get_by_role("button", name="Playground").click()
         third.tab.get_by_role("button", name="Connect", exact=True).click()
         expect(third.tab.locator("#notice-text")).to_have_text("All servers are busy.")
-        expect(third.tab.locator("#notice-advice")).to_have_text("It starts by itself when one is free.")
+        expect(third.tab.locator("#notice-advice")).to_contain_text("It starts by itself when it is your turn.")
         expect(third.tab.locator("#problem")).to_be_hidden()
         self.assertEqual(third.faults(), [])
         third.tab.get_by_role("button", name="Stop waiting").click()
@@ -159,6 +159,49 @@ class Busy(Running):
         expect(third.tab.locator("[data-step=simulation].done")).to_be_visible()
         expect(third.tab.locator("#notice")).to_be_hidden()
         for page in (second, third):
+            page.tab.get_by_role("button", name="Disconnect").click()
+
+
+class InLine(Running):
+    key = "a secret of these tests"
+    # The load of a busy machine must not fill a server.
+    session = {"fleetKey": key, "loadThreshold": 1000}
+    simulation = {"maxConnections": 1, "fleetKey": key}
+
+    def join(self):
+        """A page that asks for a world."""
+        page = self.open(self.fleet.session.url("viewer"))
+        expect(page.tab.locator("#availability")).not_to_contain_text("Connecting")
+        page.tab.get_by_role("button", name="Playground").click()
+        page.tab.get_by_role("button", name="Connect", exact=True).click()
+        return page
+
+    def test_six_pages_wait_in_order_one_reloads_and_one_goes_away(self):
+        running = [self.running()[0], self.running()[0]]
+        line = []
+        for ahead in range(6):
+            page = self.join()
+            expect(page.tab.locator("#notice-text")).to_have_text("All servers are busy.")
+            expect(page.tab).to_have_title(re.compile(rf"^\({ahead + 1}\) "))
+            line.append(page)
+        words = ["you are next", "one client is ahead of you", "2 clients are ahead of you"]
+        for page, word in zip(line, words, strict=False):
+            expect(page.tab.locator("#step-session small")).to_contain_text(word)
+            # Screen readers hear it.
+            expect(page.tab.locator("#spoken")).to_contain_text(word)
+        line[2].tab.reload()
+        expect(line[2].tab).to_have_title(re.compile(r"^\(3\) "))
+        line.pop(4).tab.get_by_role("button", name="Stop waiting").click()
+        expect(line[4].tab).to_have_title(re.compile(r"^\(5\) "))
+        for page in line:
+            running.pop(0).tab.get_by_role("button", name="Disconnect").click()
+            expect(page.tab.locator("[data-step=simulation].done")).to_be_visible()
+            others = line[line.index(page) + 1 :]
+            for ahead, other in enumerate(others):
+                expect(other.tab).to_have_title(re.compile(rf"^\({ahead + 1}\) "))
+            running.append(page)
+        for page in running:
+            self.assertEqual(page.faults(), [])
             page.tab.get_by_role("button", name="Disconnect").click()
 
 

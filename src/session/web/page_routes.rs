@@ -26,6 +26,7 @@ const ASSETS: &[Asset] = &[
     asset!("simulation_link.js"),
     asset!("stage.js"),
     asset!("kept.js"),
+    asset!("turn.js"),
     asset!("session_monitor.js"),
 ];
 
