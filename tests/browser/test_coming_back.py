@@ -165,7 +165,8 @@ class Busy(Running):
 class InLine(Running):
     key = "a secret of these tests"
     # The load of a busy machine must not fill a server.
-    session = {"fleetKey": key, "loadThreshold": 1000}
+    # Nor must the session server take the port of a slot.
+    session = {"fleetKey": key, "loadThreshold": 1000, "port": free_ports(64) + 63}
     simulation = {"maxConnections": 1, "fleetKey": key}
 
     def join(self):
