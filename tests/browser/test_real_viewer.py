@@ -1,0 +1,122 @@
+"""Webots' own viewer draws an export of Webots that the demo simulator streams, as it draws it from its files."""
+
+import os
+import re
+import signal
+import unittest
+
+import real
+from case import BrowserTest
+from fleet import SOON, WORLD, until
+from playwright.sync_api import expect
+
+# Without a GPU the engine is slow.
+PATIENCE = 3 * SOON
+# Pictures of one scene differ a little: ambient occlusion is noise that is averaged over several frames.
+SAME = 0.985
+
+
+class RealViewer:
+    """The tests; a class runs them with a way of the stream."""
+
+    # The viewer loads files of its own, and scenes their textures, from other sites: `real` answers.
+    elsewhere = frozenset({"cyberbotics.com", "raw.githubusercontent.com"})
+
+    @classmethod
+    def setUpClass(cls):
+        # While the engine reads a scene, a slow machine's page hears nothing, and would take the connection for lost.
+        cls.simulation = {"webotsHome": str(real.PARTS), "timing": {"absence": 0}, **cls.keys}
+        super().setUpClass()
+
+    @classmethod
+    def make_fleet(cls):
+        return real.RealFleet(cls.session, cls.simulation)
+
+    def keeps_to_the_rules(self, page):
+        self.assertLessEqual(page.hosts(), {self.host, *self.elsewhere}, "who was asked")
+
+    def offline(self, url):
+        """A page whose requests to other sites are answered here."""
+        page = self.open("about:blank", width=640, height=480)
+        page.context.route(re.compile("^https:"), real.answer)
+        page.context.set_default_timeout(1000 * PATIENCE)
+        page.tab.goto(url)
+        return page
+
+    def streamed(self):
+        """The fleet's page with the viewer in it, and the viewer's frame."""
+        page = self.offline(self.fleet.session.url(f"viewer?url={WORLD.format(real.world())}"))
+        expect(page.tab.locator("#availability.on")).to_be_visible()
+        page.tab.get_by_label("Shown by").select_option("webots")
+        page.tab.get_by_role("button", name="Connect", exact=True).click()
+        frame = page.tab.locator("#stage iframe").element_handle().content_frame()
+        frame.wait_for_selector("#play-button", state="attached")
+        return page, frame
+
+    def from_files(self, frame):
+        """A page of the same size that draws the export from its files."""
+        page = self.offline("about:blank")
+        width, height = frame.evaluate("[innerWidth, innerHeight]")
+        page.tab.set_viewport_size({"width": width, "height": height})
+        page.tab.goto(f"{real.SITE}files.html")
+        page.tab.wait_for_selector("#play-button", state="attached")
+        return page.tab
+
+    def shared(self, frame, files, time):
+        """The share of pixels that the viewer and the files have in common, with the files at this time."""
+        frames = real.frames()
+        round_of = frames[-1]["time"] + frames[1]["time"] - frames[0]["time"] or 1
+        last = max(number for number, one in enumerate(frames) if one["time"] <= time % max(round_of, 1))
+        files.evaluate("step => document.querySelector('webots-view')._view.animation.updateAnimationState(step)", last)
+        return files.evaluate(real.COMPARE, [frame.evaluate(real.DRAW), files.evaluate(real.DRAW)])
+
+    def press(self, frame, name):
+        frame.locator(f"#{name}-button").dispatch_event("click")
+
+    def time(self, frame):
+        return frame.evaluate("document.querySelector('webots-view')._view.time")
+
+    def test_it_draws_what_the_files_have_and_obeys_its_buttons(self):
+        page, frame = self.streamed()
+        self.press(frame, "play")
+        until("the robot drives", lambda: self.time(frame) > 500)
+        self.press(frame, "play")
+        paused = until("time stands still", lambda: self.stands_still(frame))
+        files = self.from_files(frame)
+        there = self.shared(frame, files, paused)
+        self.assertGreater(there["content"], 0.2, "it is no picture")
+        self.assertGreater(there["equal"], SAME, f"at {paused}")
+        elsewhere = self.shared(frame, files, 0)
+        self.assertLess(elsewhere["equal"], there["equal"] - 0.005, "the robot can't be seen")
+
+        self.press(frame, "step")
+        until("it has made a step", lambda: paused < self.time(frame) < paused + 100)
+        self.press(frame, "reset")
+        until("it is reset", lambda: self.time(frame) == 0)
+        self.assertGreater(self.shared(frame, files, 0)["equal"], SAME, "after a reset")
+
+        page.tab.set_viewport_size({"width": 560, "height": 460})
+        until("it has the new size", lambda: frame.evaluate("canvas.width === view3d.clientWidth && innerWidth < 560"))
+        small = self.from_files(frame)
+        self.assertGreater(self.shared(frame, small, 0)["equal"], SAME, "after a change of size")
+
+        (server,) = [one for one in (self.fleet.simulation, self.fleet.other) if one.status()["simulations"]]
+        os.kill(server.status()["simulations"][0]["pid"], signal.SIGKILL)
+        expect(page.tab.locator("#problem-text")).not_to_be_empty()
+        expect(page.tab.get_by_role("button", name="Connect", exact=True)).to_be_enabled()
+
+    def stands_still(self, frame):
+        """The time once two looks at it, with a drawing between them, are the same."""
+        before = self.time(frame)
+        frame.evaluate(real.DRAW)
+        frame.evaluate("new Promise(resolve => setTimeout(resolve, 500))")
+        return before if self.time(frame) == before else None
+
+
+@unittest.skipUnless(real.is_there(), real.MISSING)
+class Direct(RealViewer, BrowserTest):
+    keys = {"streaming": "direct"}
+
+
+if __name__ == "__main__":
+    unittest.main()
