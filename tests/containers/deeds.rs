@@ -4,9 +4,21 @@ use super::daemon::{ask, containers, docker, of_service, running, server_running
 use super::image::NAME;
 use crate::support::{Builder, arm, is_told, until};
 
-/// A server whose Webots does this and then sends heartbeats.
+/// Listens on the port of Webots, and answers as a Webots whose world has no such robot: the world is ready.
+const READY: &str = r#"
+for argument; do [[ $argument != --port=* ]] || port=${argument#--port=}; done
+python3 -c '
+import socketserver, sys
+class Answer(socketserver.BaseRequestHandler):
+    def handle(self):
+        self.request.recv(100)
+        self.request.sendall(b"FAILED")
+socketserver.TCPServer(("", int(sys.argv[1])), Answer).serve_forever()' "$port" &
+"#;
+
+/// A server whose Webots has a world, does this and then sends heartbeats.
 fn doing(script: &str) -> Builder {
-    server_running(&format!("{script}\nwhile :; do echo .; sleep 0.2; done"))
+    server_running(&format!("{READY}\n{script}\nwhile :; do echo .; sleep 0.2; done"))
 }
 
 #[actix_rt::test]
@@ -80,7 +92,7 @@ async fn what_fills_the_project_is_told_and_ended() {
 async fn links_in_the_project_lead_no_other_container_astray() {
     let Some(_docker) = docker().await else { return };
     // Webots replaces the participant's folder by a symlink to files of the machine, and asks for a reset.
-    let server = server_running(
+    let server = doing(
         "cd /usr/local/webots-project\nrm -rf controllers\nln -s /etc controllers\nln -s /etc c\n\
          while :; do echo .; echo reset; sleep 0.2; done",
     );

@@ -71,6 +71,25 @@ async fn a_world_runs_in_a_container_and_leaves_nothing() {
 }
 
 #[actix_rt::test]
+async fn a_container_is_ready_when_its_world_is() {
+    let Some(_docker) = docker().await else { return };
+    let options = "\n#demo-simulator: download=2 load=2\n";
+    let server = daemon::server_with(&[("worlds/a.wbt", &WORLD.replacen('\n', options, 1))]);
+    let server = server.start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.patiently("loading: Downloading assets: ").await;
+    let begin = Instant::now();
+    let told = client.patiently("webots:").await;
+    let url = told.strip_prefix("webots:").unwrap();
+    // The download's first texts come at its beginning.
+    assert!(begin.elapsed() > Duration::from_secs(2), "{:?}", begin.elapsed());
+    // A viewer crashes a Webots without a world.
+    let viewer = Client::connect(&format!("{url}/")).await.with_running_scene().await;
+    drop(viewer);
+    client.patiently(".").await;
+}
+
+#[actix_rt::test]
 async fn who_comes_back_finds_its_container_as_it_runs() {
     let Some(_docker) = docker().await else { return };
     let server = server(1).start().await;
