@@ -1,14 +1,15 @@
 //! What ends with a simulation at each level, and how it ends.
 
+use std::process::Command;
 use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
-use super::deeds::Stage;
+use super::deeds::{Stage, as_nobody};
 use super::network::levels;
-use crate::simulation::scene::{gone_within, instance_folders, nothing_left};
-use crate::support::{Client, DEMO, Webots, server_of, until};
+use crate::simulation::scene::{gone_within, instance_folders, nothing_left, stages};
+use crate::support::{Client, DEMO, Webots, instances_below, server_of, until};
 
 /// The processes that have this word in their command line.
 pub fn named(word: &str) -> Vec<i32> {
@@ -129,4 +130,31 @@ async fn a_simulation_that_ignores_sigterm_is_killed() {
             "{level}, {network}: it was killed after {took:?}"
         );
     }
+}
+
+#[actix_rt::test]
+async fn the_folder_of_a_simulation_is_removed_once_there_is_room_for_processes_again() {
+    // The limit does not apply to root.
+    let Some(nobody) = as_nobody() else { return };
+    let (stage, webots) = (Stage::new(), Webots::launcher());
+    let server = stage.builder(&webots, "none").before(nobody).start().await;
+    let client = Client::ready(&server).await;
+    let limit = |processes: &str| {
+        // Root may lack the capability for processes of others.
+        let (pid, most) = (server.pid().to_string(), format!("--nproc={processes}:"));
+        let mut prlimit = Command::new("bash");
+        prlimit.args(["-c", nobody, "prlimit", "--pid", &pid, &most]);
+        assert!(prlimit.status().unwrap().success());
+    };
+    limit("1");
+    client.leave().await;
+    let gone = async || stages(&server).await.is_empty() && instances_below(&server.folder).is_empty();
+    until("the simulation has ended", gone).await;
+    let begin = Instant::now();
+    while begin.elapsed() < Duration::from_secs(2) {
+        assert_eq!(instance_folders(&server.folder).len(), 1);
+        actix_rt::time::sleep(Duration::from_millis(100)).await;
+    }
+    limit("1000");
+    nothing_left(&server, 2).await;
 }

@@ -1,9 +1,11 @@
-//! The directories of running simulations: guards that remove them on drop, by the system's `rm`. It handles any depth,
-//! which a recursion in the server would not, and does not follow symlinks.
+//! The directories of running simulations: guards that have them removed on drop, by the system's `rm`. It handles any
+//! depth, which a recursion in the server would not, and does not follow symlinks. One thread removes them all: it is
+//! there before the first of them, and needs no other thread on a machine that has none to spare.
 
 use std::ffi::OsString;
 use std::io;
 use std::path::{Path, PathBuf};
+use std::sync::mpsc;
 use std::time::Duration;
 
 use super::process_group::ExitReason;
@@ -11,13 +13,21 @@ use super::process_tree;
 use super::runner::Run;
 
 /// The directory of one run of the server: `runs/run-*` in `cacheDir`. It contains a directory for each simulation.
-pub struct RunDir(PathBuf);
+pub struct RunDir {
+    path: PathBuf,
+    /// The thread that removes the directories of simulations.
+    remover: mpsc::Sender<PathBuf>,
+}
 
-/// The directory of one simulation. Dropping it removes it with its contents.
+/// The directory of one simulation. Dropping it removes it with its contents, soon afterwards.
 #[derive(Debug)]
-pub struct InstanceDir(PathBuf);
+pub struct InstanceDir {
+    path: PathBuf,
+    remover: mpsc::Sender<PathBuf>,
+}
 
-/// Attempts to remove a directory before it is left to the next start, and the pause between two attempts.
+/// Attempts to remove a directory before it is left to the next start, and the pause before another attempt: a machine
+/// without free files or processes for `rm` may recover.
 const TRIES: u32 = 60;
 const PAUSE: Duration = Duration::from_secs(1);
 /// Timeout of an attempt: a program that still runs may keep adding files.
@@ -28,7 +38,7 @@ impl RunDir {
     /// server that owns `cache`: the processes of every other run are killed.
     ///
     /// # Errors
-    /// When the directory can't be created.
+    /// When the directory can't be created, or there is no thread.
     pub fn open(cache: &Path) -> io::Result<Self> {
         let runs = cache.join("runs");
         std::fs::create_dir_all(&runs)?;
@@ -43,7 +53,10 @@ impl RunDir {
         if dead > 0 {
             log::warn!("removed what {dead} earlier runs had left");
         }
-        Ok(Self(tempfile::Builder::new().prefix("run-").tempdir_in(&runs)?.keep()))
+        let (remover, folders) = mpsc::channel();
+        std::thread::Builder::new().spawn(move || remove_each(&folders))?;
+        let path = tempfile::Builder::new().prefix("run-").tempdir_in(&runs)?.keep();
+        Ok(Self { path, remover })
     }
 
     /// Creates a directory for a simulation, with the directory of its project inside.
@@ -52,20 +65,26 @@ impl RunDir {
     /// When a directory can't be created.
     pub fn instance(&self) -> io::Result<InstanceDir> {
         // The directory of the run may have been removed.
-        std::fs::create_dir_all(&self.0)?;
-        let instance = InstanceDir(tempfile::Builder::new().prefix("instance-").tempdir_in(&self.0)?.keep());
+        std::fs::create_dir_all(&self.path)?;
+        let instance = InstanceDir {
+            path: tempfile::Builder::new()
+                .prefix("instance-")
+                .tempdir_in(&self.path)?
+                .keep(),
+            remover: self.remover.clone(),
+        };
         std::fs::create_dir(instance.project())?;
         Ok(instance)
     }
 
     /// Its path.
     pub fn path(&self) -> &Path {
-        &self.0
+        &self.path
     }
 
     /// Removes the directory with its contents.
     pub fn remove(&self) {
-        remove(&self.0);
+        remove(&self.path);
     }
 }
 
@@ -75,34 +94,45 @@ impl InstanceDir {
 
     /// Its path.
     pub fn path(&self) -> &Path {
-        &self.0
+        &self.path
     }
 
     /// The directory of the project. It is created with the instance: if it were created later, that could happen after
     /// the instance was removed.
     pub fn project(&self) -> PathBuf {
-        self.0.join(Self::PROJECT)
+        self.path.join(Self::PROJECT)
     }
 }
 
 impl Drop for InstanceDir {
     fn drop(&mut self) {
-        // A project may contain many files, and this may run on an actor's thread.
-        let folder = std::mem::take(&mut self.0);
-        let shown = folder.display().to_string();
-        let remove = move || {
-            // A machine without free files or processes for `rm` may recover.
-            for _ in 1..TRIES {
-                if remove_tree(&folder).is_ok() {
-                    return;
-                }
-                std::thread::sleep(PAUSE);
-            }
-            remove(&folder);
-        };
-        if let Err(error) = std::thread::Builder::new().spawn(remove) {
-            log::error!("{shown} is left to the next start: no thread for its removal: {error}");
+        // A project may contain many files, and this may run on an actor's thread. The receiver lives as long as senders.
+        self.remover.send(std::mem::take(&mut self.path)).ok();
+    }
+}
+
+/// Removes each of these directories, until the last sender is gone.
+fn remove_each(folders: &mpsc::Receiver<PathBuf>) {
+    let mut left: Vec<(PathBuf, u32)> = Vec::new();
+    loop {
+        if left.is_empty() {
+            let Ok(folder) = folders.recv() else { return };
+            left.push((folder, TRIES));
+        } else {
+            std::thread::sleep(PAUSE);
         }
+        left.extend(folders.try_iter().map(|folder| (folder, TRIES)));
+        left.retain_mut(|(folder, tries)| {
+            *tries -= 1;
+            let Err(error) = remove_tree(folder) else { return false };
+            if *tries == 0 {
+                log::error!(
+                    "{} is left to the next start, for it can't be removed: {error}",
+                    folder.display()
+                );
+            }
+            *tries > 0
+        });
     }
 }
 
