@@ -4,7 +4,7 @@ use webots_fleet::simulation::container::ResourceOwner;
 
 use super::daemon::{ask, containers, docker, dockerfile, of_service, running, server, server_built, server_with};
 use super::image::NAME;
-use crate::support::{Client, WORLD, arm, is_told, until};
+use crate::support::{Client, WORLD, arm, arm_at, is_told, until};
 
 #[actix_rt::test]
 async fn a_projects_dockerfile_is_built_once_for_all_clients() {
@@ -162,6 +162,29 @@ async fn a_client_that_leaves_in_the_middle_of_a_build_ends_it() {
         .forge()
         .commit("lab/arm", "main", &[("Dockerfile", &dockerfile(""))]);
     Client::start(&server, &arm()).await.patiently("webots:").await;
+}
+
+#[actix_rt::test]
+async fn builds_without_end_by_one_address_leave_a_builder_to_others() {
+    let Some(_docker) = docker().await else { return };
+    let server = server(4)
+        .set("trustedProxies", serde_json::json!(["127.0.0.1"]))
+        .set("maxPlacesPerAddress", 3);
+    for branch in ["a", "b", "c"] {
+        let endless = format!("FROM {NAME}\nLABEL test.branch={branch}\nRUN sleep 1000\n");
+        server.forge().commit("lab/arm", branch, &[("Dockerfile", &endless)]);
+    }
+    let files = [("Dockerfile", &*dockerfile("RUN true"))];
+    server.forge().commit("lab/arm", "main", &files);
+    let server = server.start().await;
+    let mut endless = Vec::new();
+    for (branch, progress) in [("a", "Step 4/6"), ("b", "Step 4/6"), ("c", "waiting for other images")] {
+        let mut client = Client::start_from(&server, "192.0.2.2", &arm_at(branch)).await;
+        client.patiently(&format!("loading: {progress}")).await;
+        endless.push(client);
+    }
+    let mut other = Client::start_from(&server, "192.0.2.3", &arm()).await;
+    other.patiently("webots:").await;
 }
 
 #[actix_rt::test]

@@ -125,6 +125,7 @@ impl Session {
             mode: self.mode,
             gpu,
             slot,
+            client: self.peer,
             events: ctx.address().recipient(),
         };
         let thread = self.server.webots_thread(spec.slot.port);

@@ -33,7 +33,7 @@ pub struct ContainerSettings {
     /// Directories of the machine that are mounted in containers, as `FOLDER:PATH` or `FOLDER:PATH:ro`. Default: none.
     #[serde(deserialize_with = "one_or_many")]
     pub mounts: Vec<String> = Vec::new(),
-    /// Images that are built or pulled at a time. Default: 3.
+    /// Images that are built or pulled at a time; for one address one less, if there are several. Default: 3.
     #[serde(deserialize_with = "whole::<1, 1000, _, _>")]
     pub builds: usize = 3,
     /// Days after which an image that this server has built is removed, unless a container uses it. Default: 14.

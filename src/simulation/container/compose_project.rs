@@ -1,6 +1,7 @@
 //! The compose project of a simulation: its services, and what each may do.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::net::IpAddr;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -26,6 +27,8 @@ pub struct ContainerRequest {
     pub port: u16,
     /// The GPU that it was given; without one, it gets all.
     pub gpu: Option<Gpu>,
+    /// The address of its client, if it is known; images are built in its share.
+    pub address: Option<IpAddr>,
     /// Webots and its arguments, without the world, which comes last.
     pub command: Vec<String>,
 }

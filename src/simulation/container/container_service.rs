@@ -81,7 +81,7 @@ impl ContainerService {
         request: ContainerRequest,
         progress: OnProgress<'_>,
     ) -> Result<SimulationContainers, Failure> {
-        let project = &request.project;
+        let (project, address) = (&request.project, request.address);
         let docker = &self.docker;
         let folder = project.folder.clone();
         let owner = self.images.owner.clone();
@@ -95,7 +95,7 @@ impl ContainerService {
         let is_projects = image.folder.is_some() || controller.is_some();
         let made = async |build: ImageBuild, from: &Path, to: &Path| {
             let has_project = build.folder.is_some();
-            let image = self.images.build(project, build, progress).await?;
+            let image = self.images.build(project, build, address, progress).await?;
             if has_project {
                 export(&image, (docker, &self.config), &guard.name, from, project, to).await?;
             }
@@ -111,7 +111,9 @@ impl ContainerService {
         };
         let has_editor = yml.kind != ProjectKind::Default;
         if has_editor {
-            self.images.pull(&self.config.container.editor_image, progress).await?;
+            self.images
+                .pull(&self.config.container.editor_image, address, progress)
+                .await?;
         }
         let compose = ComposeProject {
             name: guard.name.clone(),

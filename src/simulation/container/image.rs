@@ -1,14 +1,16 @@
 //! The images of simulations: pulled, and built once for all clients of the same project; old ones are removed.
 
 use std::ffi::OsString;
+use std::net::IpAddr;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
 use actix_rt::task::spawn_blocking;
-use tokio::sync::{Semaphore, SemaphorePermit, watch};
+use tokio::sync::watch;
 
 use super::build_plan::{self, ImageBuild};
+use super::builders::{Builder, Builders};
 use super::built_image::BuiltImage;
 use super::compose_project::DEFAULT_MEMORY;
 use super::docker::{Docker, DockerError, SHORT_TIMEOUT, data_folder, docker_disk_fault};
@@ -27,8 +29,7 @@ pub struct Images {
     /// The owner in their labels.
     pub owner: ResourceOwner,
     config: Arc<SimulationConfig>,
-    /// Limits concurrent builds.
-    builds: Semaphore,
+    builders: Builders,
     jobs: SingleFlight<String, Result<(), Failure>>,
 }
 
@@ -53,25 +54,30 @@ const LOOK_INTERVAL: Duration = Duration::from_secs(1);
 impl Images {
     /// The images of this owner.
     pub fn new(docker: Docker, owner: ResourceOwner, config: Arc<SimulationConfig>) -> Self {
-        let builds = Semaphore::new(config.container.builds);
+        let builders = Builders::new(config.container.builds);
         Self {
             docker,
             owner,
             config,
-            builds,
+            builders,
             jobs: SingleFlight::default(),
         }
     }
 
-    /// Pulls a configured image unless it exists. Returns its id, which differs from those of later images of the same
-    /// name.
+    /// Pulls a configured image unless it exists, for a client with this address. Returns its id, which differs from those
+    /// of later images of the same name.
     ///
     /// # Errors
     /// Why it can't be pulled.
-    pub async fn pull(self: &Arc<Self>, image: &str, progress: OnProgress<'_>) -> Result<String, Failure> {
+    pub async fn pull(
+        self: &Arc<Self>,
+        image: &str,
+        address: Option<IpAddr>,
+        progress: OnProgress<'_>,
+    ) -> Result<String, Failure> {
         let (this, name) = (Arc::clone(self), image.to_owned());
         let pull = move |sender: watch::Sender<String>| async move {
-            let _permit = this.permit(&sender).await?;
+            let _builder = this.builder(address, &sender).await?;
             let on_line = |line: &str| drop(sender.send(format!("Step 1/{STEPS} : fetching {name}: {line}")));
             let command = ["docker", "pull", &name].map(OsString::from).to_vec();
             let pulled = this.docker.follow(command, this.config.timing.build, on_line).await;
@@ -83,7 +89,7 @@ impl Images {
         self.made(image, ID, progress, pull).await
     }
 
-    /// Builds an image of a project unless it exists.
+    /// Builds an image of a project unless it exists, for a client with this address.
     ///
     /// # Errors
     /// Why it can't be built or used.
@@ -91,6 +97,7 @@ impl Images {
         self: &Arc<Self>,
         project: &Arc<Project>,
         mut build: ImageBuild,
+        address: Option<IpAddr>,
         progress: OnProgress<'_>,
     ) -> Result<BuiltImage, Failure> {
         let version = &project.world.version;
@@ -111,14 +118,21 @@ impl Images {
         for base in &build.dockerfile.bases {
             let is_default = DEFAULT_BASE.contains(&base.as_str());
             parts.extend(if is_default {
-                Some(self.pull(&webots, progress).await?)
+                Some(self.pull(&webots, address, progress).await?)
             } else {
                 self.inspect(base, ID).await?
             });
         }
         let name = format!("webots-fleet/{}:{}", self.owner.0, digest(parts.join("\0").as_bytes()));
         let (this, project, tag) = (Arc::clone(self), Arc::clone(project), name.clone());
-        let job = |sender| async move { this.build_now(&tag, &project, build, sender).await };
+        let job = move |sender: watch::Sender<String>| async move {
+            // A build without steps of a project takes seconds.
+            let _builder = match build.folder {
+                Some(_) => Some(this.builder(address, &sender).await?),
+                None => None,
+            };
+            this.build_now(&tag, &project, build, sender).await
+        };
         let config = self.made(&name, CONFIG, progress, job).await?;
         BuiltImage::read(name, &config).map_err(of_project)
     }
@@ -147,12 +161,6 @@ impl Images {
         build: ImageBuild,
         sender: watch::Sender<String>,
     ) -> Result<(), Failure> {
-        // A build without steps of a project takes seconds.
-        let _permit = if build.folder.is_some() {
-            Some(self.permit(&sender).await?)
-        } else {
-            None
-        };
         let ImageBuild {
             dockerfile,
             folder,
@@ -225,7 +233,7 @@ impl Images {
     /// The failure of a build during which the disk of Docker has become full: the server takes no clients with a full
     /// disk, so builds have filled it. Of several builds none is known to be the cause.
     fn has_filled_disk(&self) -> Failure {
-        if self.config.container.builds - self.builds.available_permits() > 1 {
+        if self.builders.in_use() > 1 {
             let message = "The builds of several projects have filled the disk of Docker (diskReserve), and were ended";
             return Failure::new(Reason::BuildersBusy, message);
         }
@@ -282,24 +290,16 @@ impl Images {
         }
     }
 
-    /// Waits until another image may be built or pulled.
-    async fn permit(&self, sender: &watch::Sender<String>) -> Result<SemaphorePermit<'_>, Failure> {
-        if let Ok(permit) = self.builds.try_acquire() {
-            return Ok(permit);
-        }
-        sender.send("waiting for images of others to be built".to_owned()).ok();
+    /// Waits until another image may be built or pulled for this address.
+    async fn builder(&self, address: Option<IpAddr>, sender: &watch::Sender<String>) -> Result<Builder<'_>, Failure> {
         let limit = self.config.timing.build;
-        let why = || {
-            format!(
-                "Images of others were being built for {} s (timing.build)",
-                limit.as_secs()
-            )
-        };
-        let permit = actix_rt::time::timeout(limit, self.builds.acquire())
-            .await
-            .ok()
-            .and_then(Result::ok);
-        permit.ok_or_else(|| Failure::new(Reason::BuildersBusy, why()))
+        let on_wait = || drop(sender.send("waiting for other images to be built".to_owned()));
+        let builder = self.builders.take(address, limit, on_wait).await;
+        builder.ok_or_else(|| {
+            let limit = limit.as_secs();
+            let message = format!("Other images were being built for {limit} s (timing.build)");
+            Failure::new(Reason::BuildersBusy, message)
+        })
     }
 
     /// What Docker reports about an image in this format; `None` if it does not exist.

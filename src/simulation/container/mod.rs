@@ -1,6 +1,7 @@
 //! Simulations in Docker containers: what a project requests, its image, and a compose project for each simulation.
 
 mod build_plan;
+mod builders;
 mod built_image;
 mod compose_project;
 mod container_service;

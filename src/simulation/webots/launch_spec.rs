@@ -12,6 +12,7 @@ use actix::prelude::*;
 use super::event::WebotsEvent;
 use super::release::Release;
 use super::startup::{ListenSign, StartupEvent, follow_startup};
+use crate::shared::http::Peer;
 use crate::simulation::checkout::Project;
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::container::{ContainerRequest, ContainerService};
@@ -48,6 +49,8 @@ pub struct LaunchSpec {
     pub gpu: Option<Gpu>,
     /// The slot, with its port.
     pub slot: Slot,
+    /// Its client.
+    pub client: Peer,
     /// Receives the events.
     pub events: Recipient<WebotsEvent>,
 }
@@ -62,6 +65,7 @@ impl LaunchSpec {
             project: Arc::clone(&self.project),
             port: self.slot.port,
             gpu: self.gpu.clone(),
+            address: self.client.rate_limit_key(),
             command,
         }
     }
