@@ -95,7 +95,7 @@ pub async fn serve(assembly: Application) -> Result<(), AppError> {
         mut signals,
     } = assembly;
     let owner = server.containers.as_ref().map(|containers| containers.run.0.as_str());
-    let _guardian = Guardian::start(server.run.path(), owner)?;
+    let guardian = Guardian::start(server.run.path(), owner)?;
     let shared = web::Data::from(Arc::clone(&server));
     let options = HttpServerOptions {
         max_connections: max_tcp(&server.config),
@@ -119,7 +119,7 @@ pub async fn serve(assembly: Application) -> Result<(), AppError> {
     };
     let http = server::serve(socket, server.connections.clone(), options, app)?;
     let handle = http.handle();
-    let serving = actix_rt::spawn(http);
+    let mut serving = actix_rt::spawn(http);
     let config = &server.config;
     let port = config.port;
     start::announce(
@@ -137,6 +137,8 @@ pub async fn serve(assembly: Application) -> Result<(), AppError> {
     let why = tokio::select! {
         why = handle_signals(&mut signals, &server) => why,
         fault = permanent::stopped("LoadMonitor", server.load_monitor.clone()) => return Err(fault.into()),
+        ended = &mut serving => return Err(server::fault(ended).into()),
+        never = guardian.watch() => match never {},
     };
     log::info!("stopping");
     service_manager::stopping(why);
@@ -221,8 +223,9 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
         .monitor_log_enabled
         .then(|| config.log_dir.0.join("simulation/monitor.csv"));
     let spread = Arc::new(Spread::over(config.displays_of_gpus().len()));
+    let thread = || Arbiter::try_new().map(|thread| thread.handle());
     let (load_monitor, readings) = LoadMonitor::new(slots.clone(), run.path(), csv, spread.clone())?;
-    let load_monitor = LoadMonitor::start_in_arbiter(&Arbiter::new().handle(), |_| load_monitor);
+    let load_monitor = LoadMonitor::start_in_arbiter(&thread()?, |_| load_monitor);
     announcer::start(&config);
     let watcher = Watcher::start(run.path().to_owned(), config.disk_reserve)?;
     let starts = metrics.counter(
@@ -258,7 +261,7 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
         containers,
         run: Arc::new(run),
         phase: watch::Sender::new(Phase::Open),
-        webots_threads: std::array::from_fn(|_| Arbiter::new().handle()),
+        webots_threads: [thread()?, thread()?, thread()?, thread()?],
         admin_auth: config.admin_password.clone().map(BasicAuth::new),
         connections: ConnectionLimiter::new(max_tcp(&config), config.max_clients, config.max_clients_per_address),
         metrics,

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
 
-use tokio::sync::watch;
+use tokio::sync::{oneshot, watch};
 use which::which;
 
 use super::config::SimulationConfig;
@@ -70,9 +70,14 @@ pub fn watch(
             };
             actix_rt::time::sleep(pause).await;
             let (config, run, readings) = (Arc::clone(&config), run.clone(), Arc::clone(&readings.borrow()));
-            let all = move || check(&config, &run, Some(&readings)).err();
-            let mut checked = actix_rt::task::spawn_blocking(all);
-            let found = if let Ok(found) = actix_rt::time::timeout(HUNG, &mut checked).await {
+            let (told, mut checked) = oneshot::channel();
+            // A thread for each check, because simulations need new threads, too.
+            let started = std::thread::Builder::new().name("readiness".to_owned()).spawn(move || {
+                told.send(check(&config, &run, Some(&readings)).err()).ok();
+            });
+            let found = if let Err(error) = started {
+                Ok(Some(format!("This simulation server can't start a thread: {error}")))
+            } else if let Ok(found) = actix_rt::time::timeout(HUNG, &mut checked).await {
                 found
             } else {
                 publish(

@@ -1,11 +1,21 @@
 //! Limits of a simulation at each level, and what happens if it exceeds them.
 
+use std::os::unix::fs::MetadataExt;
+use std::path::Path;
+use std::process::Command;
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
+use nix::sys::signal::Signal;
+use tempfile::TempDir;
+
+use super::deeds::as_nobody;
 use super::lives::{long, named};
 use crate::simulation::ends::line;
 use crate::simulation::scene::{instance_folders, nothing_left};
-use crate::support::{Client, DEMO, SOON, Server, Webots, arm, http, server_of, skip, until};
+use crate::support::{
+    Builder, Client, DEMO, SOON, Server, Webots, arm, demo_server, holds_soon, http, server_of, skip, until,
+};
 
 const LEVELS: [&str; 2] = ["none", "sandbox"];
 
@@ -186,4 +196,71 @@ async fn a_simulation_has_its_own_control_group() {
         until("its group is gone", async || delegated.groups() == ["server"]).await;
         assert_eq!(named(&hidden), [0; 0], "{level}: what hides ends too");
     }
+}
+
+/// The start of a server that may have this many processes and threads, as a user of its own with this folder.
+fn with_processes(folder: &Path, processes: u32) -> Builder {
+    let user = folder.metadata().unwrap().uid();
+    let command =
+        format!("exec setpriv --reuid={user} --regid={user} --clear-groups prlimit --nproc={processes} \"$0\" \"$@\"");
+    demo_server(1).set("isolation", "none").folder(folder).before(&command)
+}
+
+/// A folder of a user that has no process.
+fn folder_of_a_user() -> Option<TempDir> {
+    as_nobody()?;
+    static USERS: AtomicU32 = AtomicU32::new(1);
+    let folder = tempfile::tempdir().unwrap();
+    let user = (std::process::id() << 8) + USERS.fetch_add(1, Ordering::Relaxed);
+    std::os::unix::fs::chown(folder.path(), Some(user), Some(user)).unwrap();
+    Some(folder)
+}
+
+#[actix_rt::test]
+async fn a_server_that_may_start_too_few_threads_serves_or_ends() {
+    let cores = u32::try_from(std::thread::available_parallelism().unwrap().get()).unwrap();
+    let (mut served, mut log) = (false, String::new());
+    for processes in 6..=cores + 16 {
+        // The guardian of the one before may still be there.
+        let Some(folder) = folder_of_a_user() else { return };
+        let mut server = with_processes(folder.path(), processes).spawn();
+        let mut code = None;
+        let decided = holds_soon(async || {
+            code = server.exit_code();
+            served = http::try_get(&server.url("/health")).await.is_ok();
+            served || code.is_some()
+        });
+        assert!(decided.await, "with {processes}: {}", server.log());
+        if let Some(code) = code {
+            assert_eq!(code, 1, "with {processes}: {}", server.log());
+        } else {
+            server.signal(Signal::SIGKILL);
+            server.ended().await;
+        }
+        log = server.log();
+    }
+    assert!(served, "the largest number is enough: {log}");
+}
+
+#[actix_rt::test]
+async fn a_server_that_can_start_no_more_threads_is_not_ready() {
+    let Some(folder) = folder_of_a_user() else { return };
+    let server = with_processes(folder.path(), 200).start().await;
+    assert_eq!(server.health().await, (200, "ok".to_owned()));
+    let limit = |processes: u32| {
+        // As the server's user, and only the soft limit: who is root in a container may not change others' limits.
+        let (pid, user) = (server.pid(), folder.path().metadata().unwrap().uid());
+        let command =
+            format!("setpriv --reuid={user} --regid={user} --clear-groups prlimit --pid={pid} --nproc={processes}:");
+        let changed = Command::new("sh").args(["-c", &command]).status().unwrap();
+        assert!(changed.success());
+    };
+    limit(1);
+    until("it is not ready", async || {
+        let (code, told) = server.health().await;
+        code == 503 && told.starts_with("Error: This simulation server can't start a thread: ")
+    })
+    .await;
+    limit(200);
+    until("it is ready", async || server.health().await.0 == 200).await;
 }

@@ -145,6 +145,26 @@ async fn what_a_killed_server_has_left_is_removed_at_the_next_start() {
 }
 
 #[actix_rt::test]
+async fn a_guardian_that_was_stopped_is_continued_and_ends_with_the_server() {
+    let mut server = demo_server(1).set("isolation", "none").start().await;
+    let pid = server.guardian();
+    let state = move || {
+        procfs::process::Process::new(pid)
+            .and_then(|one| one.stat())
+            .map(|stat| stat.state)
+    };
+    let stop = move || kill(Pid::from_raw(pid), Signal::SIGSTOP).unwrap();
+    stop();
+    until("it is continued", async || {
+        server.log().contains("a program has stopped the guardian") && state().is_ok_and(|now| now == 'S')
+    })
+    .await;
+    stop();
+    server.stops().await;
+    until("it has ended", async || !state().is_ok_and(|now| now != 'Z')).await;
+}
+
+#[actix_rt::test]
 async fn a_client_is_told_how_webots_ended() {
     let table = [
         ("exit 0", "loading: Webots has ended"),

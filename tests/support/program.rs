@@ -328,6 +328,11 @@ impl Server {
         (answer.status.as_u16(), answer.text())
     }
 
+    /// Its exit code, once the server has ended.
+    pub fn exit_code(&mut self) -> Option<i32> {
+        self.child.try_wait().unwrap()?.code()
+    }
+
     /// Waits until the server has ended; returns its exit code.
     pub async fn ended(&mut self) -> Option<i32> {
         let ends = holds_soon(async || self.child.try_wait().unwrap().is_some()).await;

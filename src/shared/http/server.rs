@@ -17,6 +17,7 @@ use actix_http::{HttpService, Request, Response};
 use actix_service::{IntoServiceFactory, ServiceFactory, ServiceFactoryExt, fn_service, map_config};
 use actix_web::dev::{AppConfig, Server};
 use actix_web::rt::net::TcpStream;
+use actix_web::rt::task::JoinError;
 use socket2::{Domain, SockRef, Socket, TcpKeepalive, Type};
 
 use super::client_stream::ClientStream;
@@ -100,6 +101,16 @@ where
         fn_service(move |tcp| ready(accept(tcp, &connections, &options))).and_then(http)
     })?;
     Ok(server.run())
+}
+
+/// Why a server that was not told to stop has ended, for example because the system starts no more threads.
+pub fn fault(ended: Result<io::Result<()>, JoinError>) -> String {
+    let why = match ended {
+        Ok(Ok(())) => "nobody has stopped it".to_owned(),
+        Ok(Err(error)) => error.to_string(),
+        Err(panic) => panic.to_string(),
+    };
+    format!("the web server has ended: {why}")
 }
 
 /// Counts a connection and sets its options. An address with too many connections is refused.

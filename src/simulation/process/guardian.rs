@@ -7,15 +7,21 @@
 //! orderly stop there is nothing left to do.
 //!
 //! A child that the server has just forked holds that end as well, until `execve`, and has the mark from then on: one
-//! pass is enough. The guardian is not supervised: if it exits before the server, the next start of the server does its
-//! work.
+//! pass is enough. A guardian that exits before the server is not replaced: the next start of the server does its work.
+//!
+//! At level `none` the simulations have the guardian's user, and can signal it. The server continues one that is
+//! stopped, at most a second later.
 
+use std::convert::Infallible;
+use std::future::pending;
 use std::io::PipeWriter;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
+use std::time::Duration;
 
-use nix::sys::signal::{SigSet, Signal};
-use nix::unistd::setsid;
+use nix::sys::signal::{SigSet, Signal, kill};
+use nix::sys::wait::{Id, WaitPidFlag, WaitStatus, waitid};
+use nix::unistd::{Pid, setsid};
 
 use super::{instance_dir, process_tree};
 
@@ -29,9 +35,12 @@ pub struct Arguments {
     pub containers: Option<String>,
 }
 
+/// Interval between two looks at the guardian.
+const LOOK: Duration = Duration::from_secs(1);
+
 /// A running guardian. It acts when this handle is dropped.
 pub struct Guardian {
-    _child: Child,
+    pid: Pid,
     _lifeline: PipeWriter,
 }
 
@@ -53,9 +62,41 @@ impl Guardian {
             .stderr(Stdio::null())
             .spawn()?;
         Ok(Self {
-            _child: child,
+            pid: Pid::from_raw(child.id().cast_signed()),
             _lifeline: lifeline,
         })
+    }
+
+    /// Continues the guardian whenever a program has stopped it, and logs that, or its end.
+    pub async fn watch(&self) -> Infallible {
+        // It remains a zombie, so that its process id is not given to another process.
+        let look = WaitPidFlag::WSTOPPED | WaitPidFlag::WEXITED | WaitPidFlag::WNOHANG | WaitPidFlag::WNOWAIT;
+        loop {
+            actix_rt::time::sleep(LOOK).await;
+            match waitid(Id::Pid(self.pid), look) {
+                Ok(WaitStatus::Stopped(..)) => {
+                    log::error!("a program has stopped the guardian of the simulations; it is continued");
+                    self.go_on();
+                }
+                Ok(WaitStatus::Exited(..) | WaitStatus::Signaled(..)) => {
+                    log::error!(
+                        "the guardian of the simulations has ended: if this server is killed, they live on until its next start"
+                    );
+                    return pending().await;
+                }
+                _ => {}
+            }
+        }
+    }
+
+    fn go_on(&self) {
+        kill(self.pid, Signal::SIGCONT).ok();
+    }
+}
+
+impl Drop for Guardian {
+    fn drop(&mut self) {
+        self.go_on();
     }
 }
 
