@@ -37,6 +37,7 @@ use serde_json::Value;
 use crate::shared::domain::{Blame, Failure, Reason, Retry};
 use crate::shared::text::{client_text, without_paths};
 use crate::simulation::sessions::Token;
+use crate::simulation::snapshot::SceneKind;
 
 /// The requests in a message, of which only one takes effect; unknown fields are ignored.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Deserialize)]
@@ -82,25 +83,6 @@ pub enum Mode {
     W3d,
     /// A video.
     Mjpeg,
-}
-
-/// The 3D scene that a Webots streams. It does not answer a viewer that requests the other.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum SceneKind {
-    /// Until R2023b.
-    X3d,
-    /// Since R2025a.
-    W3d,
-}
-
-impl SceneKind {
-    /// The message with which a viewer requests it.
-    pub fn request(self) -> &'static str {
-        match self {
-            Self::X3d => "x3d",
-            Self::W3d => "w3d",
-        }
-    }
 }
 
 /// Why a message is invalid. The message is for the client.

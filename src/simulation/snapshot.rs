@@ -7,8 +7,26 @@ use serde::Serialize;
 use crate::shared::domain::{Instances, ProjectUrl};
 use crate::shared::run::seconds_since_1970;
 use crate::simulation::client_identity::ClientIdentity;
-use crate::simulation::protocol::SceneKind;
 use crate::simulation::simulation_id::SimulationId;
+
+/// The 3D scene that a Webots streams. It does not answer a viewer that requests the other.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum SceneKind {
+    /// Until R2023b.
+    X3d,
+    /// Since R2025a.
+    W3d,
+}
+
+impl SceneKind {
+    /// The message with which a viewer requests it.
+    pub fn request(self) -> &'static str {
+        match self {
+            Self::X3d => "x3d",
+            Self::W3d => "w3d",
+        }
+    }
+}
 
 /// The states of a simulation, as pages and programs see them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]

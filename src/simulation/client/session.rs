@@ -16,10 +16,11 @@ use crate::shared::run::closing;
 use crate::simulation::checkout::Project;
 use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::ends::{StopReason, lost};
-use crate::simulation::protocol::{self, Mode, SceneKind};
+use crate::simulation::protocol::{self, Mode};
 use crate::simulation::sessions::{ClientAction, Connection, ToClient, Token};
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::slots::{Slot, SlotEvent, SlotLease};
+use crate::simulation::snapshot::SceneKind;
 use crate::simulation::state::AppState;
 use crate::simulation::webots::{Keep, Stop, Webots, WebotsEvent};
 

@@ -11,9 +11,10 @@ use crate::shared::domain::{Blame, Failure, ProjectUrl, Reason, ReservationId};
 use crate::shared::http::Peer;
 use crate::simulation::checkout::Project;
 use crate::simulation::machine::sensors::Gpu;
-use crate::simulation::protocol::{self, Mode, SceneKind, Start};
+use crate::simulation::protocol::{self, Mode, Start};
 use crate::simulation::readiness;
 use crate::simulation::slots::{Slot, SlotLease};
+use crate::simulation::snapshot::SceneKind;
 use crate::simulation::state::AppState;
 use crate::simulation::webots::{LaunchSpec, Release, Webots, WebotsEvent};
 

@@ -12,14 +12,14 @@ use super::build_plan::{BuildPlan, ImageBuild, PROJECT_PATH, participant_folder}
 use super::built_image::export;
 use super::compose_project::{ComposeProject, ContainerRequest};
 use super::docker::{Docker, daemon_fault};
-use super::failures::{of_project, on_thread};
+use super::failures::{of_project, on_thread, refused_by_docker};
 use super::image::Images;
 use super::network;
 use super::owned_resources::{ProjectGuard, ResourceOwner, sweep_all};
 use super::packet_filter;
 use super::simulation_containers::SimulationContainers;
 use super::webots_yml::ProjectKind;
-use crate::shared::domain::{Failure, Reason};
+use crate::shared::domain::Failure;
 use crate::simulation::checkout::OnProgress;
 use crate::simulation::config::SimulationConfig;
 
@@ -174,15 +174,4 @@ pub fn check(config: &SimulationConfig) -> Result<String, String> {
         "it answers; worlds run in {}, or the image of their project's Dockerfile",
         config.container.image
     ))
-}
-
-/// Docker refuses the containers of a simulation, although it works. `is_projects`: whether the project has defined one of
-/// their images, which is the cause then.
-pub fn refused_by_docker(is_projects: bool) -> Failure {
-    let reason = if is_projects {
-        Reason::InvalidProject
-    } else {
-        Reason::LaunchFailed
-    };
-    Failure::new(reason, "Docker can't start the containers of this simulation")
 }

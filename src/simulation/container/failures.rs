@@ -9,6 +9,17 @@ pub fn of_project(why: impl Into<String>) -> Failure {
     Failure::new(Reason::InvalidProject, why)
 }
 
+/// Docker refuses the containers of a simulation, although it works. `is_projects`: whether the project has defined one of
+/// their images, which is the cause then.
+pub fn refused_by_docker(is_projects: bool) -> Failure {
+    let reason = if is_projects {
+        Reason::InvalidProject
+    } else {
+        Reason::LaunchFailed
+    };
+    Failure::new(reason, "Docker can't start the containers of this simulation")
+}
+
 /// Runs blocking work on the blocking thread pool.
 ///
 /// # Errors

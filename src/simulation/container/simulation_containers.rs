@@ -8,8 +8,8 @@ use tokio::sync::Notify;
 use tokio_util::task::AbortOnDropHandle;
 
 use super::compose_project::{CONTROLLER, WEBOTS, container_of};
-use super::container_service::refused_by_docker;
 use super::docker::{Docker, DockerError, SHORT_TIMEOUT, daemon_fault};
+use super::failures::refused_by_docker;
 use super::owned_resources::ProjectGuard;
 use crate::shared::domain::{Failure, Reason};
 use crate::simulation::process::{ExitReason, SpawnSpec};

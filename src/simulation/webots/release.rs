@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use crate::simulation::protocol::SceneKind;
+use crate::simulation::snapshot::SceneKind;
 
 /// A release of Webots, such as `R2025a`. Releases are ordered by their age, the oldest first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
