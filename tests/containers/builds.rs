@@ -2,7 +2,9 @@
 
 use webots_fleet::simulation::container::ResourceOwner;
 
-use super::daemon::{ask, containers, docker, dockerfile, of_service, running, server, server_built, server_with};
+use super::daemon::{
+    ask, containers, docker, dockerfile, of_service, refused, running, server, server_built, server_with,
+};
 use super::image::NAME;
 use crate::support::{Client, WORLD, arm, arm_at, is_told, until};
 
@@ -185,6 +187,39 @@ async fn builds_without_end_by_one_address_leave_a_builder_to_others() {
     }
     let mut other = Client::start_from(&server, "192.0.2.3", &arm()).await;
     other.patiently("webots:").await;
+}
+
+#[actix_rt::test]
+async fn an_image_that_is_too_large_is_told_and_removed() {
+    let Some(_docker) = docker().await else { return };
+    let base: u64 = ask(&["image", "inspect", "--format", "{{.Size}}", NAME])
+        .parse()
+        .unwrap();
+    let server = server(1).set("container", serde_json::json!({ "imageSize": (base >> 20) + 20 }));
+    for (branch, size) in [("small", "10M"), ("large", "40M")] {
+        let line = format!("RUN head -c {size} /dev/zero >/usr/local/file");
+        server
+            .forge()
+            .commit("lab/arm", branch, &[("Dockerfile", &dockerfile(&line))]);
+    }
+    let server = server.start().await;
+    let owner = ResourceOwner::of(&server.cache());
+    let images = || {
+        ask(&["image", "ls", "--quiet", &format!("webots-fleet/{}", owner.0)])
+            .lines()
+            .count()
+    };
+    // The second time too, although Docker has kept the layers.
+    for _ in 0..2 {
+        let (told, code) = refused(&server, &arm_at("large")).await;
+        assert!(told.contains("container.imageSize"), "{told}");
+        assert_eq!((code, images()), (Some(1000), 0));
+    }
+    Client::start(&server, &arm_at("small"))
+        .await
+        .patiently("webots:")
+        .await;
+    assert_eq!(images(), 1);
 }
 
 #[actix_rt::test]

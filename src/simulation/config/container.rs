@@ -36,6 +36,9 @@ pub struct ContainerSettings {
     /// Images that are built or pulled at a time; for one address one less, if there are several. Default: 3.
     #[serde(deserialize_with = "whole::<1, 1000, _, _>")]
     pub builds: usize = 3,
+    /// Maximum size of a project's image with the image that it begins with, in MiB. Default: 16384.
+    #[serde(deserialize_with = "whole::<1, 100_000_000, _, _>")]
+    pub image_size: u64 = 16_384,
     /// Days after which an image that this server has built is removed, unless a container uses it. Default: 14.
     #[serde(deserialize_with = "whole::<1, 10_000, _, _>")]
     pub images_age: u64 = 14,

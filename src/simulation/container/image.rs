@@ -35,9 +35,10 @@ pub struct Images {
 
 /// How a Dockerfile names the image of the world's version of Webots.
 const DEFAULT_BASE: [&str; 2] = ["$WEBOTS_DEFAULT_IMAGE", "${WEBOTS_DEFAULT_IMAGE}"];
-/// Formats of `docker image inspect`: the id, which differs from those of later images of the same name, and the
-/// configuration of the image's programs.
+/// Formats of `docker image inspect`: the id, which differs from those of later images of the same name, the size in
+/// bytes, and the configuration of the image's programs.
 const ID: &str = "{{.Id}}";
+const SIZE: &str = "{{.Size}}";
 const CONFIG: &str = "{{json .Config}}";
 /// The longest version of a world that has an image.
 const MAX_VERSION: usize = 50;
@@ -126,12 +127,13 @@ impl Images {
         let name = format!("webots-fleet/{}:{}", self.owner.0, digest(parts.join("\0").as_bytes()));
         let (this, project, tag) = (Arc::clone(self), Arc::clone(project), name.clone());
         let job = move |sender: watch::Sender<String>| async move {
-            // A build without steps of a project takes seconds.
-            let _builder = match build.folder {
-                Some(_) => Some(this.builder(address, &sender).await?),
-                None => None,
-            };
-            this.build_now(&tag, &project, build, sender).await
+            // A build without steps of a project takes seconds, and is as large as the image of Webots.
+            if build.folder.is_none() {
+                return this.build_now(&tag, &project, build, sender).await;
+            }
+            let _builder = this.builder(address, &sender).await?;
+            this.build_now(&tag, &project, build, sender).await?;
+            this.check_size(&tag).await
         };
         let config = self.made(&name, CONFIG, progress, job).await?;
         BuiltImage::read(name, &config).map_err(of_project)
@@ -217,6 +219,18 @@ impl Images {
             Ok(()) => Ok(()),
             Err(error) => Err(self.not_built(&bases, &step, error).await),
         }
+    }
+
+    /// Checks the size of an image that was built for a project, and removes the image if it is too large.
+    async fn check_size(&self, name: &str) -> Result<(), Failure> {
+        let limit = self.config.container.image_size;
+        let size = self.inspect(name, SIZE).await?;
+        if size.is_none_or(|size| size.parse().is_ok_and(|size: u64| size <= limit << 20)) {
+            return Ok(());
+        }
+        self.docker.run(&["image", "rm", name], SHORT_TIMEOUT).await?;
+        let message = format!("The image of this project is larger than {limit} MiB (container.imageSize)");
+        Err(Failure::new(Reason::ImageTooLarge, message))
     }
 
     /// Waits until the disk of Docker has less than `diskReserve` left.
