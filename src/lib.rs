@@ -87,7 +87,7 @@
 //! [`simulation::webots::Webots`] holds its process group, its instance directory and the lease of its slot in
 //! guards. Dropping it frees all three, whatever its state, even after a panic. When the simulation server exits, for
 //! whatever reason, its [`simulation::process::guardian`] process ends everything that the server has started.
-//! One `simulation::isolation::Watcher` enforces what the kernel does not: how much simulations write. One thread copies
+//! One `simulation::isolation::DiskMonitor` enforces what the kernel does not: how much simulations write. One thread copies
 //! all relayed streams except those of watchers; the server exits if that thread panics.
 //!
 //! # What ends, and what restarts

@@ -24,7 +24,7 @@ use crate::shared::run::{
 };
 use crate::simulation::checkout::{CacheDir, CheckoutService};
 use crate::simulation::container::ContainerService;
-use crate::simulation::isolation::{Launcher, Watcher};
+use crate::simulation::isolation::{DiskMonitor, Launcher};
 use crate::simulation::machine::{LoadMonitor, Spread, UsageMonitor};
 use crate::simulation::process::{Guardian, RunDir};
 use crate::simulation::relay::{StreamThread, Upstream};
@@ -227,7 +227,7 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
     let (load_monitor, readings) = LoadMonitor::new(slots.clone(), run.path(), csv, spread.clone())?;
     let load_monitor = LoadMonitor::start_in_arbiter(&thread()?, |_| load_monitor);
     announcer::start(&config);
-    let watcher = Watcher::start(run.path().to_owned(), config.disk_reserve)?;
+    let disk_monitor = DiskMonitor::start(run.path().to_owned(), config.disk_reserve)?;
     let starts = metrics.counter(
         "webots_simulation_starts_total",
         "Simulations that were asked for",
@@ -272,7 +272,7 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
         live: LiveUpdates::default(),
         administrators: LiveUpdates::default(),
         usage: UsageMonitor::default(),
-        watcher,
+        disk_monitor,
         started: Instant::now(),
         config,
     })

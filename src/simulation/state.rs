@@ -18,7 +18,7 @@ use crate::shared::http::{AddressQuota, BasicAuth, ConnectionLimiter, LiveUpdate
 use crate::shared::run::Phase;
 use crate::simulation::checkout::CheckoutService;
 use crate::simulation::container::ContainerService;
-use crate::simulation::isolation::{Launcher, Watcher};
+use crate::simulation::isolation::{DiskMonitor, Launcher};
 use crate::simulation::machine::{LoadMonitor, Readings, Spread, UsageMonitor};
 use crate::simulation::process::RunDir;
 
@@ -49,7 +49,7 @@ pub struct AppState {
     /// Launches simulations at a level of isolation.
     pub launcher: Arc<Launcher>,
     /// Monitors the limits of simulations.
-    pub watcher: Watcher,
+    pub disk_monitor: DiskMonitor,
     /// Creates the containers of simulations; `None` if they don't run in containers.
     pub containers: Option<Arc<ContainerService>>,
     /// Checks worlds out.

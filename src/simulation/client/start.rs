@@ -118,7 +118,7 @@ impl Session {
             config: Arc::clone(&self.server.config),
             containers: self.server.containers.clone(),
             launcher: Arc::clone(&self.server.launcher),
-            watcher: self.server.watcher.clone(),
+            disk_monitor: self.server.disk_monitor.clone(),
             program,
             assets: self.server.launcher.assets_of(&project.repository()),
             project,

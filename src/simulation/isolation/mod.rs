@@ -3,6 +3,7 @@
 mod assets;
 mod cgroup;
 mod disk;
+mod disk_monitor;
 mod display;
 mod launcher;
 mod mount;
@@ -10,11 +11,10 @@ mod names;
 mod network;
 mod sandbox;
 mod system_calls;
-mod watcher;
 
 pub use assets::RepositoryAssets;
 pub use cgroup::Cgroup;
 pub use disk::DiskUse;
+pub use disk_monitor::DiskMonitor;
 pub use display::Display;
 pub use launcher::Launcher;
-pub use watcher::Watcher;

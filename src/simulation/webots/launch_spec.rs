@@ -16,7 +16,7 @@ use crate::shared::http::Peer;
 use crate::simulation::checkout::Project;
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::container::{ContainerRequest, ContainerService};
-use crate::simulation::isolation::{Cgroup, DiskUse, Display, Launcher, RepositoryAssets, Watcher};
+use crate::simulation::isolation::{Cgroup, DiskMonitor, DiskUse, Display, Launcher, RepositoryAssets};
 use crate::simulation::machine::sensors::Gpu;
 use crate::simulation::process::SpawnSpec;
 use crate::simulation::protocol::Mode;
@@ -34,7 +34,7 @@ pub struct LaunchSpec {
     /// Launches simulations.
     pub launcher: Arc<Launcher>,
     /// Monitors its limits.
-    pub watcher: Watcher,
+    pub disk_monitor: DiskMonitor,
     /// The program to start.
     pub program: PathBuf,
     /// The project that was checked out.
@@ -132,7 +132,7 @@ impl LaunchSpec {
     pub fn until_too_much(&self, root: i32) -> impl Future<Output = String> + use<> {
         let folder = self.project.instance.path().to_owned();
         let disk = DiskUse::new(root, folder, self.project.size, self.config.limits.disk);
-        self.watcher.clone().until_too_much(disk)
+        self.disk_monitor.clone().until_too_much(disk)
     }
 
     /// The address at which this server reaches it.

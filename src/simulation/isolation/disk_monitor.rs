@@ -19,7 +19,7 @@ use super::disk::{Disk, DiskUse};
 
 /// Monitors simulations. Its thread ends when the last clone is dropped.
 #[derive(Debug, Clone)]
-pub struct Watcher(Sender<DiskUse>);
+pub struct DiskMonitor(Sender<DiskUse>);
 
 /// The shortest time between two ticks.
 const SHORTEST: Duration = Duration::from_secs(1);
@@ -35,7 +35,7 @@ const COUNT: Duration = Duration::from_secs(1);
 const COUNT_AT_RESERVE: Duration = Duration::from_millis(100);
 const COUNTS_AT_RESERVE: Duration = Duration::from_millis(300);
 
-impl Watcher {
+impl DiskMonitor {
     /// Starts the thread. `run` is the directory with the directories of all instances, `reserve` is `diskReserve`.
     ///
     /// # Errors
@@ -47,7 +47,7 @@ impl Watcher {
             all: Vec::new(),
         };
         std::thread::Builder::new()
-            .name("watcher".to_owned())
+            .name("disk-monitor".to_owned())
             .spawn(move || table.run(&receiver))?;
         Ok(Self(watches))
     }
