@@ -91,8 +91,13 @@ pub struct AppState {
 impl AppState {
     /// Returns the thread for the Webots with this port.
     pub fn webots_thread(&self, port: u16) -> &ArbiterHandle {
-        let [first, others @ ..] = &self.webots_threads;
-        others.get(usize::from(port) % WEBOTS_THREADS).unwrap_or(first)
+        let [first, second, third, fourth] = &self.webots_threads;
+        match port % 4 {
+            0 => first,
+            1 => second,
+            2 => third,
+            _ => fourth,
+        }
     }
 
     /// Returns the load to report: 100 % while the server is draining or can't start simulations.

@@ -7,7 +7,7 @@ import { showTimes } from './times.js';
 /** Gets the numbers of an event, and whether events may have been missed before. @typedef {(sample: number[], fresh: boolean) => void} Listener */
 /** A row of a table, as the server renders it. @typedef {{ key: string, html: string }} Row */
 /** An event: parts by the ids of elements, tables by those of their bodies.
- * @typedef {{ version?: string, parts?: Record<string, string>, tables?: Record<string, Row[]>, sample?: string[] }} Update
+ * @typedef {{ version?: string, parts?: Record<string, string>, tables?: Record<string, Row[]>, sample?: number[] }} Update
  */
 
 /** @type {Listener[]} */
@@ -238,7 +238,7 @@ function take(event) {
   }
   if (sample.length && sample.join() !== lastSample) {
     lastSample = sample.join();
-    listeners.forEach((listener) => listener(sample.map(Number), fresh));
+    listeners.forEach((listener) => listener(sample, fresh));
     fresh = false;
   }
 }

@@ -40,7 +40,7 @@ pub struct PageView {
     /// The rows of table bodies, by the body's `id`.
     pub tables: BTreeMap<&'static str, Vec<TableRow>>,
     /// Numbers for the page's charts.
-    pub sample: Vec<String>,
+    pub sample: Vec<f64>,
 }
 
 /// A row of a table.

@@ -15,7 +15,7 @@ pub struct RotatedFile {
     /// Size from which it is rotated, in bytes.
     max_size: u64,
     /// The first line of each file.
-    heading: &'static str,
+    heading: String,
     file: File,
     size: u64,
 }
@@ -26,7 +26,7 @@ impl RotatedFile {
     ///
     /// # Errors
     /// When the directory can't be created, or the file can't be opened.
-    pub fn open(path: &Path, max_size: u64, heading: &'static str) -> io::Result<Self> {
+    pub fn open(path: &Path, max_size: u64, heading: impl Into<String>) -> io::Result<Self> {
         if let Some(folder) = path.parent() {
             std::fs::create_dir_all(folder)?;
         }
@@ -35,7 +35,7 @@ impl RotatedFile {
         Ok(Self {
             path: path.to_owned(),
             max_size,
-            heading,
+            heading: heading.into(),
             file,
             size,
         })
@@ -86,7 +86,7 @@ impl Write for RotatedFile {
             self.rotate()?;
         }
         if self.size == 0 {
-            self.add(self.heading.as_bytes())?;
+            self.add(self.heading.clone().as_bytes())?;
         }
         self.add(lines)?;
         Ok(lines.len())

@@ -15,7 +15,7 @@ use tokio::sync::watch;
 use super::gpus::{self, GpuReading};
 use super::sensors::{self, Gpu, Host, Machine, MachineSensor};
 use super::spread::Spread;
-use crate::shared::domain::Load;
+use crate::shared::domain::{Instances, Load};
 use crate::shared::run::{AppError, RotatedFile, seconds_since_1970};
 use crate::simulation::slots::SlotPool;
 
@@ -28,9 +28,59 @@ const KEPT: usize = 600;
 /// Size from which `monitor.csv` is rotated, in bytes: with the previous file it covers most of a day.
 const MAX_SIZE: u64 = 2_500_000;
 
-/// The first line of `monitor.csv`: the columns of the original.
-const HEADING: &str = "Timestamp, Webots running, Webots idle, CPU load, CPU memory, GPU load compute, GPU load memory, \
-                       GPU memory, Swap, Disk, Network sent, Network received\n";
+/// A column of `monitor.csv`, of `/history` and of the charts.
+struct Column {
+    heading: &'static str,
+    /// Number of decimal places that are kept.
+    decimals: u8,
+    value: fn(&Sample) -> f64,
+}
+
+/// What one line of `monitor.csv` is taken from.
+struct Sample<'a> {
+    /// In seconds since 1970.
+    at: u64,
+    instances: Instances,
+    machine: &'a Machine,
+    /// The GPU that the next simulation would get.
+    gpu: &'a Gpu,
+}
+
+/// The columns of the original.
+const COLUMNS: [Column; 12] = [
+    column("Timestamp", 0, |sample| whole(sample.at)),
+    column("Webots running", 0, |sample| sample.instances.running.into()),
+    column("Webots idle", 0, |sample| sample.instances.idle.into()),
+    column("CPU load", 1, |sample| sample.machine.cpu),
+    column("CPU memory", 1, |sample| sample.machine.memory),
+    column("GPU load compute", 0, |sample| sample.gpu.compute),
+    column("GPU load memory", 0, |sample| sample.gpu.memory_traffic),
+    column("GPU memory", 1, |sample| sample.gpu.memory),
+    column("Swap", 1, |sample| sample.machine.swap),
+    column("Disk", 1, |sample| sample.machine.disk),
+    column("Network sent", 6, |sample| sample.machine.network_sent),
+    column("Network received", 6, |sample| sample.machine.network_received),
+];
+
+const fn column(heading: &'static str, decimals: u8, value: fn(&Sample) -> f64) -> Column {
+    Column {
+        heading,
+        decimals,
+        value,
+    }
+}
+
+/// A number of seconds since 1970, exact until the year 2106.
+fn whole(seconds: u64) -> f64 {
+    u32::try_from(seconds).unwrap_or(u32::MAX).into()
+}
+
+impl Column {
+    fn rounded(&self, sample: &Sample) -> f64 {
+        let scale = 10_f64.powi(self.decimals.into());
+        ((self.value)(sample) * scale).round() / scale
+    }
+}
 
 /// The newest readings of the machine, and its load.
 #[derive(Debug, Clone, Default)]
@@ -47,16 +97,19 @@ pub struct Readings {
     pub gpu_problem: Option<String>,
     /// The load of each of the last seconds, the oldest first.
     loads: VecDeque<Load>,
-    /// The newest line of `monitor.csv`: the values of its columns.
-    pub sample: Vec<String>,
-    /// The samples of the last ten minutes as numbers, the oldest first.
+    /// The values of the columns of `monitor.csv` in the last ten minutes, the oldest first.
     pub history: VecDeque<Vec<f64>>,
 }
 
 impl Readings {
-    /// The names of a sample's columns.
-    pub fn columns() -> &'static str {
-        HEADING.trim_end()
+    /// The headings of the columns of a sample, as in the first line of `monitor.csv`.
+    pub fn columns() -> String {
+        COLUMNS.map(|column| column.heading).join(", ")
+    }
+
+    /// The newest sample; empty before the first.
+    pub fn sample(&self) -> Vec<f64> {
+        self.history.back().cloned().unwrap_or_default()
     }
 }
 
@@ -103,10 +156,16 @@ impl LoadMonitor {
     fn publish(&self, machine: Machine) {
         let (gpus, gpu_problem) = gpus::current(self.gpus.borrow().as_ref());
         let gpu = self.spread.next(&gpus, Instant::now()).cloned().unwrap_or_default();
-        let sample = self.sample(&machine, &gpu);
+        let sample = Sample {
+            at: seconds_since_1970(),
+            instances: self.slots.instances(),
+            machine: &machine,
+            gpu: &gpu,
+        };
+        let values = COLUMNS.map(|column| column.rounded(&sample)).to_vec();
         if let Some(path) = &self.csv {
             // On a full disk, only these lines are lost.
-            append(path, &sample).ok();
+            append(path, &values).ok();
         }
         self.published.send_modify(|readings| {
             let readings = Arc::make_mut(readings);
@@ -116,39 +175,22 @@ impl LoadMonitor {
                 _ => {}
             }
             push(&mut readings.loads, MEAN_OF, sensors::load(&machine, &gpu));
-            push(
-                &mut readings.history,
-                KEPT,
-                sample.iter().filter_map(|text| text.parse().ok()).collect(),
-            );
+            push(&mut readings.history, KEPT, values);
             readings.load = Load::mean(readings.loads.iter().copied());
-            (readings.machine, readings.gpus, readings.gpu_problem) = (machine, gpus, gpu_problem);
-            readings.sample = sample;
+            readings.machine = machine;
+            readings.gpus = gpus;
+            readings.gpu_problem = gpu_problem;
         });
-    }
-
-    fn sample(&self, machine: &Machine, gpu: &Gpu) -> Vec<String> {
-        let instances = self.slots.instances();
-        vec![
-            seconds_since_1970().to_string(),
-            instances.running.to_string(),
-            instances.idle.to_string(),
-            format!("{:.1}", machine.cpu),
-            format!("{:.1}", machine.memory),
-            gpu.compute.to_string(),
-            gpu.memory_traffic.to_string(),
-            format!("{:.1}", gpu.memory),
-            format!("{:.1}", machine.swap),
-            format!("{:.1}", machine.disk),
-            format!("{:.6}", machine.network_sent),
-            format!("{:.6}", machine.network_received),
-        ]
     }
 }
 
-fn append(path: &Path, sample: &[String]) -> std::io::Result<()> {
-    let mut file = RotatedFile::open(path, MAX_SIZE, HEADING)?;
-    file.write_all(format!("{}\n", sample.join(", ")).as_bytes())
+fn append(path: &Path, values: &[f64]) -> std::io::Result<()> {
+    let mut file = RotatedFile::open(path, MAX_SIZE, Readings::columns() + "\n")?;
+    let texts = values
+        .iter()
+        .zip(&COLUMNS)
+        .map(|(value, column)| format!("{value:.0$}", usize::from(column.decimals)));
+    file.write_all((texts.collect::<Vec<_>>().join(", ") + "\n").as_bytes())
 }
 
 /// Appends a value, and keeps the last `kept` ones.

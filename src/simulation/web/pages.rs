@@ -117,7 +117,7 @@ pub fn view(
     Ok(PageView {
         parts,
         tables,
-        sample: readings.sample.clone(),
+        sample: readings.sample(),
     })
 }
 
