@@ -154,7 +154,7 @@ async fn the_time_limit_of_a_launch_includes_the_load() {
     }
 }
 
-/// Ends after a second in which it has listened, if its world contains `crash`; never listens, if it contains `never`.
+/// Ends three seconds after it began to listen, if its world contains `crash`; never listens, if it contains `never`.
 fn misbehaving() -> Webots {
     Webots::script(&format!(
         "for world; do case $world in --port=*) port=${{world#--port=}};; esac; done
@@ -162,7 +162,7 @@ fn misbehaving() -> Webots {
          {DEMO} \"$@\" & child=$!
          if grep -q crash \"$world\"; then
              until (exec 3<>/dev/tcp/127.0.0.1/$port) 2>/dev/null; do sleep 0.1; done
-             sleep 1; kill -KILL $child; exit 3
+             sleep 3; kill -KILL $child; exit 3
          fi
          wait $child"
     ))
@@ -183,7 +183,7 @@ async fn whether_webots_has_listened_decides_who_is_to_blame() {
         let builder = stage.builder(&webots, level).before(user);
         let server = builder
             .set("sandbox.network", network)
-            .set("timing.launch", 8)
+            .set("timing.launch", 25)
             .set("maxConnections", 6)
             .start()
             .await;
