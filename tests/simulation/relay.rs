@@ -402,7 +402,9 @@ async fn a_stream_that_the_server_ends_is_closed_with_1000_and_the_reason() {
     let (client, path) = start(&server).await;
     let (mut viewer, _) = tokio_tungstenite::connect_async(server.websocket(&path)).await.unwrap();
     assert_eq!(next(&mut viewer).await, Some(Message::text("an update")));
-    let all = server.simulations().await;
+    // Strangers see no process ids.
+    let status = get_with_password(&server.url("/status"), PASSWORD).await.json();
+    let all = status["simulations"].as_array().unwrap();
     let pid = all.iter().find(|one| one["id"] == client.id()).unwrap()["pid"]
         .as_i64()
         .unwrap();
