@@ -167,7 +167,7 @@ reasons! {
     ENDS {
         /// Its client has left.
         Left = "left", User, Here;
-        /// Its client was away for too long (`timing.absence`), or never opened its stream (`timing.arrival`).
+        /// Its client was away for too long (`timing.absence`).
         Away = "away", User, Here;
         /// Another connection of its client has taken it over.
         TakenOver = "taken-over", User, No;

@@ -44,9 +44,15 @@ pub fn children(pid: i32) -> Vec<i32> {
         .collect()
 }
 
-/// Whether something listens on this port in the network of the children of a process.
+/// Whether something listens on this port in a network of the children of a process. A child that is still in the
+/// machine's network does not count: pasta listens there.
 pub fn children_listen(pid: i32, port: u16) -> bool {
+    let network = |pid: &str| std::fs::read_link(format!("/proc/{pid}/ns/net")).ok();
+    let own = network("self");
     children(pid).into_iter().any(|child| {
+        if network(&child.to_string()).is_none_or(|network| Some(network) == own) {
+            return false;
+        }
         let Ok(child) = Process::new(child) else { return false };
         let sockets = child.tcp().into_iter().chain(child.tcp6()).flatten();
         let mut ports = sockets

@@ -225,7 +225,11 @@ impl Webots {
 
     fn become_ready(&mut self, ctx: &mut Context<Self>) {
         let process = match self.take_state() {
-            State::Launching(Launching { process, .. }) => process,
+            State::Launching(Launching { process, startup, .. }) => {
+                // A release that is ready by its heartbeat may never have been seen to listen.
+                startup.map(|startup| ctx.cancel_future(startup));
+                process
+            }
             // It was ready before, by its port or its first heartbeat; or it is ending.
             other => return self.state = other,
         };
