@@ -115,6 +115,24 @@ async fn whole_way(builder: Builder) {
 }
 
 #[actix_rt::test]
+async fn whoever_joins_through_the_server_while_another_world_is_downloaded_gets_its_scene() {
+    let builder = demo_server(1)
+        .set("streaming", "relay")
+        .set("adminPassword", "a secret");
+    let server = builder.start().await;
+    let files = [("worlds/a.wbt", WORLD), ("worlds/b.wbt", &*slow("download=3 load=0.5"))];
+    server.forge().commit("lab/arm", "two", &files);
+    let mut client = Client::start(&server, &arm_at("two")).await;
+    let url = client.until("webots:").await["webots:".len()..].to_owned();
+    let mut viewer = sees_the_scene(&client, &url).await;
+    viewer.send("load:worlds/b.wbt").await;
+    viewer.until("delete world").await;
+    let mut watcher = watch(&server, client.id()).await.unwrap();
+    sees_the_scene(&client, &url).await;
+    watcher.until("scene load completed").await;
+}
+
+#[actix_rt::test]
 async fn of_a_hundred_starts_none_crashes() {
     let server = demo_server(10).set("waitingLine", 100).start().await;
     let world = slow("download=0.1 load=0.1");

@@ -8,8 +8,12 @@ mod stream_thread;
 mod upstream;
 mod watcher;
 mod websocket;
+mod world;
 
 pub use path::parse_path;
 pub use stream_thread::StreamThread;
 pub use upstream::Upstream;
 pub use websocket::connect;
+#[cfg(test)]
+pub use world::REQUEST;
+pub use world::has_world;

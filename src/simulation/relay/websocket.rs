@@ -15,6 +15,7 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use super::stream::{Direction, Stream};
 use super::upstream::{Upstream, no_answer};
 use super::watcher;
+use super::world::until_world;
 use crate::shared::http::{upgrade, websocket};
 use crate::simulation::slots::StreamTarget;
 
@@ -26,7 +27,7 @@ const MAX_HEAD: usize = 8 * 1024;
 const SOCKET_BUFFER: usize = 256 * 1024;
 
 /// Connects a client to the WebSocket at this path of a simulation, or responds why it can't. It waits as long as the
-/// simulation lives: while Webots reads a world it answers nobody, and once it hangs it is ended. A client that is
+/// simulation lives: while Webots downloads or reads a world, and once it hangs it is ended. A client that is
 /// `read_only` can only request a kind of stream. `held` is dropped with the connection.
 pub async fn connect(
     upstream: &Upstream,
@@ -39,7 +40,7 @@ pub async fn connect(
         Ok(response) => response,
         Err(error) => return websocket::refuse(&error),
     };
-    let Ok((webots, from_webots)) = open(upstream, target.port, path, request).await else {
+    let Ok((webots, from_webots)) = open(upstream, &target, path, request).await else {
         return no_answer();
     };
     let upgraded = upgrade(request);
@@ -82,13 +83,21 @@ fn bound_buffers(tcp: &TcpStream) {
 
 /// Opens the WebSocket of a simulation with the key of its client's request. Returns the connection, and what was read
 /// from it after the handshake.
-async fn open(upstream: &Upstream, port: u16, path: &str, request: &HttpRequest) -> io::Result<(TcpStream, Bytes)> {
+async fn open(
+    upstream: &Upstream,
+    target: &StreamTarget,
+    path: &str,
+    request: &HttpRequest,
+) -> io::Result<(TcpStream, Bytes)> {
     let key = request
         .headers()
         .get(header::SEC_WEBSOCKET_KEY)
         .and_then(|key| key.to_str().ok());
     let key = key.ok_or(ErrorKind::InvalidInput)?;
-    let address = upstream.simulation(port);
+    let address = upstream.simulation(target.port);
+    if target.answers_controllers {
+        until_world(address).await?;
+    }
     let mut tcp = TcpStream::connect(address).await?;
     // Messages are small, and must not wait until the one before is acknowledged.
     tcp.set_nodelay(true)?;

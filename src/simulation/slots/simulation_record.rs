@@ -29,6 +29,8 @@ pub(super) struct SimulationRecord {
     pub client: Peer,
     /// The address and the user of its client, if their slots are limited, each with its limit.
     pub parties: Vec<(Party, usize)>,
+    /// Whether its Webots tells controllers if it has a world; known once it has a stream.
+    pub answers_controllers: bool,
     /// The valid tokens for its stream.
     pub accesses: Vec<Access>,
     /// Why the server ends it, once it does, as text for those at its streams.
@@ -127,6 +129,7 @@ impl SimulationRecord {
             simulation,
             client,
             parties: Vec::new(),
+            answers_controllers: false,
             accesses: Vec::new(),
             ending: Arc::default(),
             makes_room: false,

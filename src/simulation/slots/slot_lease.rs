@@ -82,11 +82,15 @@ impl SlotLease {
         });
     }
 
-    /// Opens the stream of the simulation, until its end is reported. Returns the token for its client.
-    pub fn open_stream(&self) -> Token {
+    /// Opens the stream of the simulation, until its end is reported. Returns the token for its
+    /// client. `answers_controllers`: its Webots tells controllers whether it has a world.
+    pub fn open_stream(&self, answers_controllers: bool) -> Token {
         let access = Access::new(Holder::Client);
         let token = access.token;
-        self.slots.change(self.id, |record| record.accesses.push(access));
+        self.slots.change(self.id, |record| {
+            record.answers_controllers = answers_controllers;
+            record.accesses.push(access);
+        });
         token
     }
 }

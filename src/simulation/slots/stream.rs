@@ -16,6 +16,8 @@ pub struct StreamTarget {
     pub simulation: SimulationId,
     /// Its port on this machine.
     pub port: u16,
+    /// Whether its Webots tells controllers if it has a world.
+    pub answers_controllers: bool,
     /// Whether the token is a watcher's, which may change nothing.
     pub read_only: bool,
     /// Limits the WebSockets with this token. Each of them holds a permit.
@@ -54,6 +56,7 @@ impl SlotPool {
             Some(StreamTarget {
                 simulation: record.simulation.id,
                 port: record.simulation.port?,
+                answers_controllers: record.answers_controllers,
                 read_only: access.holder != Holder::Client,
                 connections: Arc::clone(&access.connections),
                 ending: Arc::clone(&record.ending),

@@ -16,13 +16,13 @@ use std::time::{Duration, Instant};
 
 use actix::prelude::*;
 use futures_util::StreamExt;
-use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::sync::Notify;
 use tokio_tungstenite::connect_async;
 use tokio_tungstenite::tungstenite::Message as Frame;
 
 use crate::simulation::process::process_tree;
+use crate::simulation::relay::has_world;
 
 /// An event of the start of a Webots.
 #[derive(Message, Debug, Clone, PartialEq, Eq)]
@@ -36,11 +36,6 @@ pub enum StartupEvent {
     Ready,
 }
 
-/// The handshake of a controller for a robot that no world has. Its answer is `PROCESSING`, or another text once there
-/// is a world.
-const REQUEST: &[u8] = b"CTR\nRobot-Name: %2F\n\n";
-/// The beginning of `PROCESSING`. No other answer is shorter.
-const PROCESSING: [u8; 6] = *b"PROCES";
 /// Bounds of the pause between two requests.
 const PAUSE: (Duration, Duration) = (Duration::from_millis(5), Duration::from_millis(500));
 /// The pause is 1/`PART` of the time since the start, so that many starts on a busy machine don't poll all the time.
@@ -101,13 +96,6 @@ struct Startup {
     loaded: Notify,
 }
 
-/// An answer to a request.
-#[derive(PartialEq)]
-enum Answer {
-    Processing,
-    Ready,
-}
-
 impl Startup {
     /// Sends requests until the world is ready.
     async fn until_ready(&self) {
@@ -121,8 +109,8 @@ impl Startup {
                 self.request().await
             };
             match answer {
-                Ok(Answer::Ready) => return,
-                Ok(Answer::Processing) => self.processing.notify_one(),
+                Ok(true) => return,
+                Ok(false) => self.processing.notify_one(),
                 Err(_) => {}
             }
             actix_rt::time::timeout(self.pause(), self.loaded.notified()).await.ok();
@@ -151,20 +139,15 @@ impl Startup {
         (self.begin.elapsed() / PART).clamp(PAUSE.0, PAUSE.1)
     }
 
-    async fn request(&self) -> io::Result<Answer> {
+    /// Asks Webots whether it has a world.
+    async fn request(&self) -> io::Result<bool> {
         let mut stream = TcpStream::connect(self.address).await?;
         if self.sign == ListenSign::Accepts {
             self.listens();
         }
-        stream.write_all(REQUEST).await?;
-        let mut answer = PROCESSING;
-        stream.read_exact(&mut answer).await?;
+        let has_world = has_world(&mut stream).await?;
         self.listens();
-        Ok(if answer == PROCESSING {
-            Answer::Processing
-        } else {
-            Answer::Ready
-        })
+        Ok(has_world)
     }
 
     fn listens(&self) {
@@ -207,10 +190,12 @@ mod tests {
     use std::net::Ipv4Addr;
 
     use futures_util::SinkExt;
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
     use tokio::net::TcpListener;
     use tokio::sync::mpsc;
 
     use super::*;
+    use crate::simulation::relay::REQUEST;
 
     struct Listener(mpsc::UnboundedSender<StartupEvent>);
 

@@ -244,7 +244,7 @@ impl Webots {
         self.send(WebotsEvent::Ready {
             started,
             port: self.spec.slot.port,
-            stream: self.spec.slot.lease.open_stream(),
+            stream: self.spec.slot.lease.open_stream(!self.spec.is_ready_by_heartbeat()),
         });
         ctx.run_interval(self.spec.config.timing.heartbeat, Self::check_heartbeat);
         self.used(ctx);
