@@ -56,6 +56,14 @@ fn main() {
             panics::a_client_leaves_nothing_in_any_state,
         ),
         run(
+            "panics::a_session_leaves_nothing_in_any_state",
+            panics::a_session_leaves_nothing_in_any_state,
+        ),
+        run(
+            "panics::a_webots_leaves_nothing_and_its_client_is_told",
+            panics::a_webots_leaves_nothing_and_its_client_is_told,
+        ),
+        run(
             "panics::an_actor_that_must_live_ends_the_server",
             panics::an_actor_that_must_live_ends_the_server,
         ),

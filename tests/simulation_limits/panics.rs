@@ -8,8 +8,11 @@ use actix_web::{App, HttpRequest, HttpResponse, HttpServer, web};
 use actix_web_actors::ws::WsResponseBuilder;
 use tokio::sync::mpsc::{UnboundedSender, unbounded_channel};
 use webots_fleet::shared::http::ConnectionKind;
-use webots_fleet::simulation::client::WebClient;
+use webots_fleet::simulation::client::{Session, WebClient};
+use webots_fleet::simulation::client_identity::ClientIdentity;
 use webots_fleet::simulation::machine::LoadMonitor;
+use webots_fleet::simulation::protocol::Start;
+use webots_fleet::simulation::sessions::{Connection, ToClient};
 use webots_fleet::simulation::snapshot::Stage;
 use webots_fleet::simulation::state::AppState;
 
@@ -35,7 +38,7 @@ macro_rules! panics {
     };
 }
 
-panics!(WebClient, LoadMonitor);
+panics!(WebClient, Session, LoadMonitor);
 
 /// Opens a WebSocket as the server does, and sends the address of its actor to the test.
 async fn gate(
@@ -107,6 +110,77 @@ pub async fn a_client_leaves_nothing_in_any_state() {
         handle.stop(true).await;
         inside.stop().await;
     }
+}
+
+/// Stands for the connection of a client, and ignores what is sent to it.
+struct Ignored;
+
+impl Actor for Ignored {
+    type Context = Context<Self>;
+}
+
+impl Handler<ToClient> for Ignored {
+    type Result = ();
+
+    fn handle(&mut self, _: ToClient, _: &mut Self::Context) {}
+}
+
+pub async fn a_session_leaves_nothing_in_any_state() {
+    for stage in [
+        Stage::Queued,
+        Stage::CheckingOut,
+        Stage::Launching,
+        Stage::Idle,
+        Stage::Running,
+    ] {
+        let inside = Inside::new(stage, |_| ()).await;
+        let mut first = None;
+        if stage == Stage::Queued {
+            first = Some(inside.client().await);
+            inside.until(Stage::Idle).await;
+        }
+        let (actions, receiver) = unbounded_channel();
+        let connection = Connection {
+            peer: inside
+                .server
+                .config
+                .trusted_proxies
+                .of_connection([127, 0, 0, 1].into()),
+            client: Ignored.start().recipient(),
+            actions: receiver,
+        };
+        let start = Start {
+            url: arm(),
+            mode: None,
+            resumable: Some(true),
+            name: None,
+            pass: None,
+        };
+        let identity = ClientIdentity::new(None, None);
+        let session = Session::open(Arc::clone(&inside.server), identity, connection, &start).unwrap();
+        inside.until(stage).await;
+        session.do_send(Panic);
+        // By this a client's connection notices that its session is gone.
+        actix_rt::time::timeout(crate::support::SOON, actions.closed())
+            .await
+            .unwrap();
+        if let Some(first) = first {
+            crate::support::until("the line is empty", async || inside.stages() == [Stage::Idle]).await;
+            first.leave().await;
+        }
+        inside.until_nothing_is_left().await;
+        inside.stop().await;
+    }
+}
+
+/// The configuration allows no such time; the actor panics when it computes the end of the pause.
+pub async fn a_webots_leaves_nothing_and_its_client_is_told() {
+    let inside = Inside::new(Stage::Idle, |config| config.idle_timeout = 1e300).await;
+    let mut client = inside.client().await;
+    assert_eq!(client.closed().await, Some(1011));
+    assert_eq!(client.reason()["code"], "lost");
+    inside.until_nothing_is_left().await;
+    inside.stop().await;
 }
 
 pub async fn an_actor_that_must_live_ends_the_server() {

@@ -148,16 +148,25 @@ impl State {
 }
 
 impl Session {
-    /// Opens the session of a client that requests a simulation; or tells it why it gets none.
-    pub fn open(server: Arc<AppState>, identity: ClientIdentity, connection: Connection, request: &protocol::Start) {
+    /// Opens the session of a client that requests a simulation, and returns its address; or tells the client why it gets
+    /// none.
+    pub fn open(
+        server: Arc<AppState>,
+        identity: ClientIdentity,
+        connection: Connection,
+        request: &protocol::Start,
+    ) -> Option<Addr<Self>> {
         let (world, reservation) = match Self::admit(&server, connection.peer, request) {
             Ok(admitted) => admitted,
-            Err(failure) => return connection.client.do_send(ToClient::End(failure)),
+            Err(failure) => {
+                connection.client.do_send(ToClient::End(failure));
+                return None;
+            }
         };
         let id = SimulationId::next();
         let peer = connection.peer;
         log::info!("{id}: client {peer}: asks for {world}{identity}");
-        Self::create(|ctx| {
+        Some(Self::create(|ctx| {
             let me = ctx.address().recipient();
             let state = match SlotLease::acquire(&server.slots, id, me, &world, (peer, identity), reservation) {
                 Ok(lease) => State::Waiting { world, lease },
@@ -180,7 +189,7 @@ impl Session {
                 ctx.stop();
             }
             session
-        });
+        }))
     }
 
     pub(super) fn name(&self) -> String {
