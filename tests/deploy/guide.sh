@@ -191,7 +191,7 @@ comes_back() {
 upgrade() {
     local old length renewal
     simulate https://github.com/your-lab/arm/blob/main/worlds/arm.wbt &
-    eventually grep --quiet --text 'webots:wss://fleet.lab.example/2001' "$WORK/client.log"
+    eventually grep --quiet --text 'webots:wss://fleet.lab.example/2000/stream/' "$WORK/client.log"
     in_machine sh -c 'rm ~lab/webots-fleet/target/debian/* && cp /mnt/packages/2.deb ~lab/webots-fleet/target/debian/webots-fleet_2.deb'
     old=$(property webots-simulation@main MainPID)
     length=$(stat --format=%s "$WORK/client.log")

@@ -104,7 +104,7 @@ main() {
     echo 'runs a simulation within the limits of the unit'
     simulate https://github.com/cyberbotics/demo/blob/main/worlds/a.wbt &
     eventually runs demo-simulator
-    eventually grep --quiet --text 'webots:ws://localhost:2001' "$WORK/client.log"
+    eventually grep --quiet --text 'webots:ws://localhost:2000/stream/' "$WORK/client.log"
 
     echo 'reloads, and comes back after a crash'
     in_machine sed -i 's/"localhost:2000"/"localhost:2000", "localhost:2200"/' /etc/webots-fleet/session/main.json

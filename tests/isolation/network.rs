@@ -263,10 +263,8 @@ async fn how_a_program_has_ended_is_told_from_its_own_network() {
     let Some(user) = ordinary() else { return };
     let stage = Stage::new();
     for (script, words) in [
-        (
-            "echo LAST; exit 7",
-            "Webots ended with exit code 7. Its last output: LAST",
-        ),
+        ("exit 7", "Webots ended with exit code 7. "),
+        ("echo LAST; exit 7", ". Its last output: LAST"),
         ("kill -SEGV $$", "Webots was ended by the signal SIGSEGV"),
     ] {
         let webots = Webots::script(script);

@@ -174,7 +174,7 @@ async fn each_kind_of_end_is_told_as_such() {
     let mut nowhere = Client::start(&server, &world("lab/arm", "main", "worlds/none.wbt")).await;
     nowhere.until("loading: Error:").await;
     let line_of_it = line(&server, nowhere.id()).await;
-    assert_eq!(line_of_it[8..], ["", "", "world-not-found", "", ""], "{line_of_it:?}");
+    assert_eq!(line_of_it[8..13], ["", "", "world-not-found", "", ""], "{line_of_it:?}");
     let output = server.url(&format!("/output?id={}", nowhere.id()));
     assert_eq!(http::get(&output).await.status.as_u16(), 404);
     // The server stops while one client waits and another's simulation runs.

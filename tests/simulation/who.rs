@@ -69,13 +69,13 @@ async fn a_name_is_for_administrators_alone_and_never_markup() {
     until("it is in simulations.csv", async || csv().contains(&id)).await;
     let line = csv().lines().find(|line| line.starts_with(&id)).unwrap().to_owned();
     let written = "\"<b>anna@lab</b>\",\"\"\"<script>alert(1)</script>\u{fffd} =1+1,x;'=2\"";
-    assert!(line.ends_with(written), "{line}");
+    assert!(line.contains(written), "{line}");
     assert!(
         csv()
             .lines()
             .next()
             .unwrap()
-            .ends_with(",reason,user,label (unverified)")
+            .contains(",reason,user,label (unverified),")
     );
     let log = server.log();
     assert!(

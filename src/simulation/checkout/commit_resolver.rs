@@ -12,7 +12,7 @@ use super::repository_cache::{COMMITS, HISTORY, RepositoryCache};
 use super::revision::{self, Revision, TrustSource};
 use super::single_flight::{OnProgress, SingleFlight};
 use super::{redirect, steps};
-use crate::shared::domain::{AdmissionRules, ProjectUrl, Reason};
+use crate::shared::domain::{AdmissionRules, Failure, ProjectUrl, Reason};
 use crate::simulation::config::{Remote, SimulationConfig};
 
 /// Resolves commits; one for the whole server.
@@ -233,7 +233,8 @@ impl Search<'_> {
             return Ok(true);
         }
         let name = format!("{} with its history", self.world.repository());
-        self.fetch(&history, revision::fetch_history(), &name).await?;
+        let fetched = self.fetch(&history, revision::fetch_history(), &name).await;
+        fetched.map_err(of_history)?;
         is_reachable(&history, commit).await
     }
 
@@ -241,6 +242,17 @@ impl Search<'_> {
     async fn fetch(self, into: &Arc<Repository>, arguments: Vec<String>, name: &str) -> Result<(), CheckoutError> {
         let on_line = |line: String| (self.progress)(steps::fetching(name, &line));
         into.fetch(arguments, &on_line).await
+    }
+}
+
+/// Says that it is the history that is too large: the project may be small.
+fn of_history(error: CheckoutError) -> CheckoutError {
+    match error {
+        CheckoutError::OfRepository(failure) if failure.reason == Reason::ProjectTooLarge => {
+            let message = format!("with its history {}", failure.message);
+            CheckoutError::OfRepository(Failure { message, ..failure })
+        }
+        other => other,
     }
 }
 
