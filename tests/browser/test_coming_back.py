@@ -185,7 +185,7 @@ class InLine(Running):
             expect(page.tab.locator("#notice-text")).to_have_text("All servers are busy.")
             expect(page.tab).to_have_title(re.compile(rf"^\({ahead + 1}\) "))
             line.append(page)
-        words = ["you are next", "one client is ahead of you", "2 clients are ahead of you"]
+        words = ["you are next", "1 client is ahead of you", "2 clients are ahead of you"]
         for page, word in zip(line, words, strict=False):
             expect(page.tab.locator("#step-session small")).to_contain_text(word)
             # Screen readers hear it.
