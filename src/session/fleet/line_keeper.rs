@@ -158,15 +158,12 @@ impl LineKeeper {
         self.serve(servers, Some(&server));
     }
 
-    /// A server has reported.
-    pub(super) fn reported(&mut self, servers: &mut ServerTable, server: &PublicAddress) {
+    /// A server has reported. What follows for those who wait is worked out once for all servers, with the next tick.
+    pub(super) fn reported(&mut self, servers: &ServerTable, server: &PublicAddress) {
         let record = servers.records.get(server);
         let report = record.and_then(|record| record.state.report());
         if let Some(instances) = report.and_then(|report| report.instances) {
             self.dispatcher.count_freed(server, instances.freed, Instant::now());
-        }
-        if !self.dispatcher.is_empty() {
-            self.serve(servers, Some(server));
         }
     }
 

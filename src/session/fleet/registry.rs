@@ -132,7 +132,7 @@ impl Registry {
         if let Some(change) = change {
             self.changes.add(change);
         }
-        self.line.reported(&mut self.servers, server);
+        self.line.reported(&self.servers, server);
     }
 
     /// Chooses a server for a client of this address.

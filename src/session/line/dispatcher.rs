@@ -602,6 +602,18 @@ mod tests {
         }
     }
 
+    /// A client that wants a world of this owner.
+    fn entry(owner: usize, number: u64) -> Entry<u64> {
+        let world = format!("https://github.com/{}/a/blob/main/worlds/a.wbt", OWNERS[owner]);
+        Entry {
+            world: ProjectUrl::parse(&world).unwrap(),
+            client: number,
+            connection: number,
+            address: None,
+            user: None,
+        }
+    }
+
     impl Fleet {
         fn new(servers: &[(&'static [usize], bool, u32)]) -> Self {
             let server = |&(owners, reserves, slots)| FakeServer {
@@ -668,18 +680,9 @@ mod tests {
         }
 
         fn enter(&mut self, owner: usize, ticket: Option<Ticket>, number: u64) -> Entered<usize, u64> {
-            let entry = Entry {
-                world: ProjectUrl::parse(&format!(
-                    "https://github.com/{}/a/blob/main/worlds/a.wbt",
-                    OWNERS[owner]
-                ))
-                .unwrap(),
-                client: number,
-                connection: number,
-                address: None,
-                user: None,
-            };
-            let entered = self.dispatcher.enter(ticket, entry, number, |_| true, self.now);
+            let entered = self
+                .dispatcher
+                .enter(ticket, entry(owner, number), number, |_| true, self.now);
             if let Entered::Waits(place, _) = entered {
                 self.waiting.insert((place, owner));
             }
@@ -969,18 +972,9 @@ mod tests {
         for number in 1..=5_000 {
             fleet.pass_time(Duration::from_millis(1));
             let owner = usize::from(number % 2 == 0);
-            let entry = Entry {
-                world: ProjectUrl::parse(&format!(
-                    "https://github.com/{}/a/blob/main/worlds/a.wbt",
-                    OWNERS[owner]
-                ))
-                .unwrap(),
-                client: number,
-                connection: number,
-                address: None,
-                user: None,
-            };
-            fleet.dispatcher.enter(None, entry, number, |_| true, fleet.now);
+            fleet
+                .dispatcher
+                .enter(None, entry(owner, number), number, |_| true, fleet.now);
         }
         let accepts = accepts(&fleet.servers);
         fleet.dispatcher.news(&[0, 1], &accepts, fleet.now.instant);

@@ -78,12 +78,16 @@ impl AssetCache {
         Ok(assets)
     }
 
-    /// Copies what Webots has downloaded into this home, then evicts what exceeds the limit. Blocks.
+    /// Copies what Webots has downloaded into this home. If there was something new, evicts what exceeds the limit.
+    /// Blocks.
     pub fn adopt(&self, assets: &RepositoryAssets, home: &Path) {
+        let before = files_of(&assets.folder).len();
         if let Err(error) = self.copy_new(assets, home) {
             log::debug!("not all assets in {} are kept: {error}", home.display());
         }
-        self.shrink();
+        if files_of(&assets.folder).len() > before {
+            self.shrink();
+        }
     }
 
     /// Copies regular files with the name of an asset. What a world's program has left may be anything else: symlinks

@@ -21,7 +21,7 @@ use crate::simulation::ends::Ends;
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::snapshot::{Simulation, Snapshot, Stage};
 
-/// The slots of this server, and the simulations that have one or wait for record.
+/// The slots of this server, and the simulations that have one or wait for one.
 pub struct SlotPool(pub(super) Mutex<Slots>);
 
 pub(super) struct Slots {
@@ -176,7 +176,7 @@ impl SlotPool {
         self.change(id, |record| change(&mut record.simulation));
     }
 
-    /// Stops the simulation with this id; `why` is the text for its client. Returns whether there is record.
+    /// Stops the simulation with this id; `why` is the text for its client. Returns whether there is one.
     pub fn stop(&self, id: &str, why: String) -> bool {
         let slots = self.0.lock();
         let found = slots
