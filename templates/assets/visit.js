@@ -59,8 +59,9 @@ import { helpsToWait } from './reasons.js';
 
 /** @typedef {Target & { is: 'connecting', place: { is: 'opening' } | { is: 'asked' } | { is: 'queued', ahead: number } }} Connecting */
 /** @typedef {Target & { is: 'starting', phase: 'checkout' | 'launch', progress?: Extract<Message, { is: 'progress' }> | undefined, facts: Facts }} Starting */
-/** `heardAt`: the last sign of life of the server or the simulator.
- * @typedef {Target & { is: 'running', address: string, scene: Scene, facts: Facts, heardAt: number, resumption?: Resumption | undefined }} Running
+/** `heardAt`: the last sign of life of the server or the simulator; `tickedAt`: the last tick.
+ * @typedef {Target & { is: 'running', address: string, scene: Scene, facts: Facts, heardAt: number, tickedAt: number,
+ *   resumption?: Resumption | undefined }} Running
  */
 /** The simulation waits for this page, which tries to return. `wasShown`: the page still shows its scene;
  * `refusedSince`: since when its server refuses all attempts although the session server answers.
@@ -482,6 +483,7 @@ function run({ goal, server, isRestored }, { address, kind }, facts, isBack, now
       address,
       facts,
       heardAt: now,
+      tickedAt: now,
       resumption,
       scene: { is: 'connecting' },
     },
@@ -536,14 +538,17 @@ function whileRunning(state, event, { now }) {
  * @returns {Transition}
  */
 function runOn(state, now) {
-  const { scene, resumption } = state;
+  const { scene, resumption, heardAt, tickedAt } = state;
   const isStreamLost = scene.is === 'closed' && now >= scene.until;
-  if (resumption && (isStreamLost || now - state.heardAt >= SILENCE)) {
+  // A page that was blocked, for example while it read a large scene, may tick before it gets the messages that have
+  // come meanwhile: these are there before the next tick.
+  const isSilent = now - heardAt >= SILENCE && tickedAt - heardAt >= SILENCE - SECOND;
+  if (resumption && (isStreamLost || isSilent)) {
     return lose(state, resumption, now);
   }
   // If a controller has started the simulation, only its server still takes it for paused.
   const isKept = state.facts.idleEndsAt !== undefined && scene.is === 'shown' && scene.runs;
-  return { to: state, effects: isKept ? [{ do: 'send', message: { keep: true } }] : [] };
+  return { to: { ...state, tickedAt: now }, effects: isKept ? [{ do: 'send', message: { keep: true } }] : [] };
 }
 
 /**

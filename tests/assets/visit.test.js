@@ -433,6 +433,35 @@ test('a server that hangs is noticed by its silence, and one attempt is under wa
   assert.deepEqual(visit.did(), ['connect']);
 });
 
+test('a page that was blocked does not take that for the silence of its server', () => {
+  const visit = running().take({ type: 'scene', scene: { is: 'framed' } });
+  for (let time = 0; time < 3; ++time) {
+    // The tick comes late, and before the messages that have come meanwhile.
+    visit.now += 20_000;
+    visit.take({ type: 'tick' });
+    assert.equal(visit.state.is, 'running');
+    visit.receive('absence: 60', '.').pass(1);
+  }
+  visit.now += 20_000;
+  visit.take({ type: 'tick' });
+  assert.equal(visit.state.is, 'running');
+  visit.pass(1);
+  assert.equal(visit.state.is, 'lost', 'nothing came meanwhile');
+});
+
+test('a page whose ticks are rare notices a silent server while its simulation waits', () => {
+  for (const period of [1, 2, 25, 60]) {
+    const visit = running();
+    const begin = visit.now;
+    while (visit.state.is === 'running') {
+      visit.now += 1000 * period;
+      visit.take({ type: 'tick' });
+    }
+    assert.ok(visit.now - begin <= Math.max(10_000, 2000 * period), `${visit.now - begin} ms`);
+    assert.deepEqual(visit.effects.at(-1), { do: 'connect', server: SERVER, request: { resume: TOKEN } });
+  }
+});
+
 test('who is away for too long, or comes back to nothing, is told', () => {
   const offline = running().take({ type: 'closed', code: 1006 });
   for (let second = 0; second < 125; ++second) {
