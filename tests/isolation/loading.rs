@@ -24,6 +24,9 @@ async fn sees_the_scene(client: &Client, url: &str) -> Client {
     let mut viewer = Client::connect(&format!("{url}/")).await;
     viewer.send(&format!("{};broadcast", kind.unwrap())).await;
     viewer.until("scene load completed").await;
+    // What was on the console comes after the scene, and before the next answer.
+    viewer.send("pause").await;
+    viewer.until("paused by client").await;
     let console = viewer.heard.iter().find(|text| text.starts_with("std"));
     assert_eq!(console, None);
     viewer
