@@ -55,13 +55,11 @@ fn main() {
 }
 
 fn rendering() {
-    let (fleet, urls) = (
-        fleet(),
-        ClientUrls {
-            ssl: false,
-            public: None,
-        },
-    );
+    let fleet = fleet();
+    let urls = ClientUrls {
+        ssl: false,
+        public: None,
+    };
     let render = || {
         let view = pages::view(&fleet, 1000, &urls, "").unwrap();
         Monitor {
@@ -136,7 +134,8 @@ fn fleet() -> FleetStatus {
 
 /// The demo's size: three simulation servers, one of which runs simulations that clients watch.
 async fn open_pages(time: Duration) {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let forge = Forge::with_arm();
+    let webots = Webots::launcher();
     let mut fleet = Vec::new();
     for _ in 0..3 {
         fleet.push(
@@ -224,7 +223,8 @@ async fn used(server: &Server, time: Duration) -> f64 {
         let stat = procfs::process::Process::new(server.pid()).unwrap().stat().unwrap();
         (stat.utime + stat.stime) as f64 / procfs::ticks_per_second() as f64
     };
-    let (before, begun) = (ticks(), Instant::now());
+    let before = ticks();
+    let begun = Instant::now();
     actix_rt::time::sleep(time).await;
     100.0 * (ticks() - before) / begun.elapsed().as_secs_f64()
 }
@@ -248,7 +248,8 @@ impl Listener {
         write!(socket, "GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n").unwrap();
         let mut stream = socket.try_clone().unwrap();
         let reader = std::thread::spawn(move || {
-            let (mut received, mut buffer) = (Received::default(), [0; 64 * 1024]);
+            let mut received = Received::default();
+            let mut buffer = [0; 64 * 1024];
             while let Ok(count @ 1..) = stream.read(&mut buffer) {
                 received.bytes += count;
                 // An event is one chunk. A read ends with it, unless the next event arrives at the same moment.

@@ -260,7 +260,8 @@ async fn an_export_is_streamed_as_it_stands_in_its_files_at_the_pace_of_its_anim
 #[actix_rt::test]
 async fn an_action_of_one_viewer_moves_the_world_of_all() {
     let simulator = Simulator::start();
-    let (mut one, mut other) = (simulator.spectator().await, simulator.spectator().await);
+    let mut one = simulator.spectator().await;
+    let mut other = simulator.spectator().await;
     one.send("pause").await;
     one.until("paused by client").await;
     for time in ["10", "20"] {

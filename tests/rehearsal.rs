@@ -208,7 +208,8 @@ async fn a_fleet_that_can_not_be_rehearsed_is_refused_in_one_line() {
 
 #[actix_rt::test]
 async fn a_fleet_behind_https_is_rehearsed() {
-    let (lab, other) = (Authority::new(), Authority::new());
+    let lab = Authority::new();
+    let other = Authority::new();
     let script = Script {
         session: vec!["wss://{}"],
         client: vec!["shutdownTimeout: 60", "webots:wss://{}/webots"],

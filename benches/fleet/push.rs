@@ -27,7 +27,8 @@ const TEXT: [u8; 2] = [0x81, 1];
 pub(crate) fn connect(port: u16) -> TcpStream {
     let mut stream = TcpStream::connect(("127.0.0.1", port)).expect("a client connects");
     stream.write_all(HANDSHAKE).expect("a client asks");
-    let (mut heard, mut piece) = (Vec::new(), [0; 512]);
+    let mut heard = Vec::new();
+    let mut piece = [0; 512];
     while !tells(&heard, b'1') {
         let length = stream.read(&mut piece).expect("a client hears");
         assert!(length > 0, "a client was sent away");
@@ -143,7 +144,8 @@ pub(crate) fn measure(verdict: &mut Verdict) {
     }
     let after = server.processor_time();
     let each = |after: Duration, before: Duration| 1000.0 * after.saturating_sub(before).as_secs_f64() / CHANGES as f64;
-    let (user, all) = (each(after.0, before.0), each(after.1, before.1));
+    let user = each(after.0, before.0);
+    let all = each(after.1, before.1);
     println!("  processor time of each change, on all cores together: {all:.0} ms, {user:.0} ms of it in user code");
     worst.sort_unstable_by(f64::total_cmp);
     let median = worst[CHANGES / 2];

@@ -39,8 +39,10 @@ impl StandIns {
             .iter()
             .map(|socket| socket.local_addr().expect("it is bound").to_string())
             .collect();
-        let (hung, end) = (Arc::new(AtomicBool::new(false)), Arc::new(Notify::new()));
-        let (seen, ended) = (Arc::clone(&hung), Arc::clone(&end));
+        let hung = Arc::new(AtomicBool::new(false));
+        let end = Arc::new(Notify::new());
+        let seen = Arc::clone(&hung);
+        let ended = Arc::clone(&end);
         std::thread::spawn(move || {
             let runtime = tokio::runtime::Builder::new_current_thread()
                 .enable_io()

@@ -26,7 +26,8 @@ fn storm(port: u16, path: &str) -> f64 {
 
 pub(crate) fn measure() {
     let fleet = StandIns::start(10);
-    let (server, bare) = (Server::start(&fleet.addresses), Bare::start());
+    let server = Server::start(&fleet.addresses);
+    let bare = Bare::start();
     let stormed = [
         ("a bare handler of actix", bare.port, "/bare"),
         ("/health", server.port, "/health"),

@@ -14,9 +14,11 @@ fn needs(servers: usize) -> (f64, f64) {
     let server = Server::start(&fleet.addresses);
     // The first probes open connections.
     std::thread::sleep(Duration::from_secs(3));
-    let (begin, before) = (Instant::now(), server.processor_time());
+    let begin = Instant::now();
+    let before = server.processor_time();
     std::thread::sleep(TIME);
-    let (elapsed, after) = (begin.elapsed(), server.processor_time());
+    let elapsed = begin.elapsed();
+    let after = server.processor_time();
     let percent = |used: Duration| 100.0 * used.as_secs_f64() / elapsed.as_secs_f64();
     (
         percent(after.0.saturating_sub(before.0)),
@@ -40,7 +42,8 @@ fn yardstick(servers: usize) -> f64 {
         (stat.utime + stat.stime) as f64 / procfs::ticks_per_second() as f64
     };
     let mut answer = [0; 2048];
-    let (before, mut exchanges) = (used(), 0.0);
+    let before = used();
+    let mut exchanges = 0.0;
     let begin = Instant::now();
     while begin.elapsed() < Duration::from_secs(3) {
         for stream in &mut streams {

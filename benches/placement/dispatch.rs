@@ -156,7 +156,8 @@ impl Dispatcher for Rival {
                 .min_by(|a, b| self.loads[**a].total_cmp(&self.loads[**b]))?,
             Rule::Random => self.any(),
             Rule::TwoChoices => {
-                let (one, other) = (self.any(), self.any());
+                let one = self.any();
+                let other = self.any();
                 if self.loads[other] < self.loads[one] {
                     other
                 } else {

@@ -142,7 +142,8 @@ fn exponential(random: &mut StdRng) -> f64 {
 
 /// Pareto with alpha 1.5, bounded at 100 times the least value, with mean 1.
 fn bounded_pareto(random: &mut StdRng) -> f64 {
-    let (alpha, span) = (1.5, 100.0_f64);
+    let alpha = 1.5;
+    let span = 100.0_f64;
     let tail = span.powf(-alpha);
     // The mean of the distribution whose least value is 1.
     let mean = alpha / (alpha - 1.0) * (1.0 - span.powf(1.0 - alpha)) / (1.0 - tail);

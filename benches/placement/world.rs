@@ -120,7 +120,8 @@ pub(crate) fn run(scenario: &Scenario, seed: u64, dispatcher: &mut impl Dispatch
     let mut events: BinaryHeap<Reverse<(u64, Step, usize, usize)>> = BinaryHeap::new();
     let mut next_client = 0;
     let mut next_sample = 1.0;
-    let (mut refused, mut failed) = (0_u32, 0_u32);
+    let mut refused = 0_u32;
+    let mut failed = 0_u32;
     let mut highest = 0.0_f64;
     loop {
         let next_report = scenario.refresh * (asked + 1) as f64 / machines.len() as f64;

@@ -37,12 +37,14 @@ pub async fn measure(verdict: &mut Verdict, levels: &[String], sizes: &[u16], ro
         let bare = Bare::observe(&server, forge.path().join("lab/arm")).await;
         for &size in sizes {
             let rounds = if size == 1 { 10 * rounds } else { rounds };
-            let (mut ours, mut theirs) = (Vec::new(), Vec::new());
+            let mut ours = Vec::new();
+            let mut theirs = Vec::new();
             for _ in 0..rounds {
                 ours.push(class(&server, size).await);
                 theirs.push(bare.class(size));
             }
-            let (ours, theirs) = (median(ours), median(theirs));
+            let ours = median(ours);
+            let theirs = median(theirs);
             let ratio = ours.as_secs_f64() / theirs.as_secs_f64();
             println!("  {level:<8}{size:>5}: {ours:>9.3?}, bare loop {theirs:>9.3?}, ratio {ratio:.2}");
             match size {
@@ -182,7 +184,8 @@ impl Bare {
         std::thread::scope(|scope| {
             let begin = Instant::now();
             for number in 0..size {
-                let (sender, end) = (sender.clone(), &end);
+                let sender = sender.clone();
+                let end = &end;
                 scope.spawn(move || {
                     if size == 1 {
                         self.find();

@@ -35,12 +35,14 @@ pub async fn measure(verdict: &mut Verdict, sizes: &[u16], rounds: usize) {
     first.leave().await;
     gone(&server).await;
     for &size in sizes {
-        let (mut ours, mut by_hand) = (Vec::new(), Vec::new());
+        let mut ours = Vec::new();
+        let mut by_hand = Vec::new();
         for _ in 0..rounds {
             by_hand.push(project.up(size));
             ours.push(started(&server, size).await);
         }
-        let (ours, by_hand) = (median(ours), median(by_hand));
+        let ours = median(ours);
+        let by_hand = median(by_hand);
         let what = format!("{size} at once, until the last is ready");
         let share = ours.as_secs_f64() / by_hand.as_secs_f64();
         println!("{what}: {ours:.2?}, by hand {by_hand:.2?}, {share:.2} times as long");
@@ -144,7 +146,8 @@ impl ByHand {
     }
 
     fn compose(&self, port: u16, words: &[&str]) -> Command {
-        let (instance, folder) = (self.instance(), self.instance().join("compose"));
+        let instance = self.instance();
+        let folder = self.instance().join("compose");
         let project = std::fs::read_dir(&instance).unwrap().flatten().map(|file| file.path());
         let project = project.into_iter().find(|path| path.join("worlds").is_dir()).unwrap();
         let mut command = compose();

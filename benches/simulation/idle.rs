@@ -87,7 +87,8 @@ async fn watch(server: &Server) -> actix_rt::task::JoinHandle<()> {
 
 /// The server's processor time, in percent of one core.
 async fn processor(server: &Server, time: Duration) -> f64 {
-    let (begin, before) = (Instant::now(), taken(server));
+    let begin = Instant::now();
+    let before = taken(server);
     actix_rt::time::sleep(time).await;
     100.0 * (taken(server) - before) / begin.elapsed().as_secs_f64()
 }

@@ -23,7 +23,8 @@ pub async fn measure(verdict: &mut Verdict, starts: usize) {
     let webots = Webots::script("exit 0");
     let server = simulation_server(&webots.path(), forge.path(), 4).start().await;
     let url = world("lab/arm", "main", "worlds/a.wbt");
-    let (mut ours, mut plain) = (Vec::new(), Vec::new());
+    let mut ours = Vec::new();
+    let mut plain = Vec::new();
     checkout(&server, &url).await;
     for _ in 0..starts {
         ours.push(checkout(&server, &url).await);
@@ -32,7 +33,8 @@ pub async fn measure(verdict: &mut Verdict, starts: usize) {
             &forge.path().join("lab/arm"),
         ));
     }
-    let (ours, plain) = (median(ours), median(plain));
+    let ours = median(ours);
+    let plain = median(plain);
     println!("cached start, from the wish to the end of the checkout: {ours:.1?} (median of {starts})");
     println!("the same three git commands by themselves:              {plain:.1?}");
     let over = ours.saturating_sub(plain);
@@ -104,14 +106,17 @@ pub async fn compare_levels(verdict: &mut Verdict, starts: usize) {
             .set("isolation", level)
             .start()
     };
-    let (none, sandbox) = (at("none").await, at("sandbox").await);
+    let none = at("none").await;
+    let sandbox = at("sandbox").await;
     let url = world("lab/arm", "main", "worlds/a.wbt");
-    let (mut without, mut within) = (Vec::new(), Vec::new());
+    let mut without = Vec::new();
+    let mut within = Vec::new();
     for _ in 0..starts {
         without.push(launch(&none, &url).await);
         within.push(launch(&sandbox, &url).await);
     }
-    let (without, within) = (median(without), median(within));
+    let without = median(without);
+    let within = median(within);
     println!("a program that does nothing, from its launch to its end: {without:.1?}, in a sandbox {within:.1?}");
     verdict.bound("for the sandbox", within.saturating_sub(without), BOUND);
 }

@@ -91,7 +91,9 @@ fn open(port: u16, path: &str) -> TcpStream {
 }
 
 fn echo(port: u16, time: Duration) -> Vec<Duration> {
-    let (mut stream, begin, mut times) = (open(port, "/echo"), Instant::now(), Vec::new());
+    let mut stream = open(port, "/echo");
+    let begin = Instant::now();
+    let mut times = Vec::new();
     let mut message = [7; MESSAGE];
     while begin.elapsed() < time {
         let sent = Instant::now();
@@ -104,7 +106,9 @@ fn echo(port: u16, time: Duration) -> Vec<Duration> {
 }
 
 fn zeros(port: u16, time: Duration) -> f64 {
-    let (mut stream, begin, mut sum) = (open(port, "/zeros"), Instant::now(), 0);
+    let mut stream = open(port, "/zeros");
+    let begin = Instant::now();
+    let mut sum = 0;
     let mut chunk = vec![0; 1 << 20];
     while begin.elapsed() < time {
         sum += stream.read(&mut chunk).unwrap();

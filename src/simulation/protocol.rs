@@ -305,7 +305,8 @@ mod tests {
                 ..ClientRequest::default()
             }
         };
-        let (nothing, file) = (ClientRequest::default(), Some("a/a.py".to_owned()));
+        let nothing = ClientRequest::default();
+        let file = Some("a/a.py".to_owned());
         let table = [
             (r#"{"start":{"url":"https://x"}}"#, start(None, None, None)),
             (

@@ -69,7 +69,9 @@ pub fn watch(
                 PERIOD
             };
             actix_rt::time::sleep(pause).await;
-            let (config, run, readings) = (Arc::clone(&config), run.clone(), Arc::clone(&readings.borrow()));
+            let config = Arc::clone(&config);
+            let run = run.clone();
+            let readings = Arc::clone(&readings.borrow());
             let (told, mut checked) = oneshot::channel();
             // A thread for each check, because simulations need new threads, too.
             let started = std::thread::Builder::new().name("readiness".to_owned()).spawn(move || {

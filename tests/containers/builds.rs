@@ -22,10 +22,8 @@ async fn a_projects_dockerfile_is_built_once_for_all_clients() {
         "main",
         &[("Dockerfile", &dockerfile), compose, (".env", "PORT=1\n")],
     );
-    let (mut one, mut two) = (
-        Client::start(&server, &arm()).await,
-        Client::start(&server, &arm()).await,
-    );
+    let mut one = Client::start(&server, &arm()).await;
+    let mut two = Client::start(&server, &arm()).await;
     for client in [&mut one, &mut two] {
         client.patiently("webots:").await;
         let heard = client.heard.join("\n");
@@ -306,7 +304,8 @@ fn load(folder: &std::path::Path, tag: &str, owner: &str, created: &str) {
         .args(["--utc", "+%FT%TZ", "--date", created])
         .output()
         .unwrap();
-    let (name, created) = (image(tag), String::from_utf8(time.stdout).unwrap().trim().to_owned());
+    let name = image(tag);
+    let created = String::from_utf8(time.stdout).unwrap().trim().to_owned();
     let files = folder.join("image");
     std::fs::create_dir_all(&files).unwrap();
     std::fs::write(files.join("layer.tar"), [0; 1024]).unwrap();
@@ -319,7 +318,8 @@ fn load(folder: &std::path::Path, tag: &str, owner: &str, created: &str) {
     std::fs::write(files.join("config.json"), config.to_string()).unwrap();
     let manifest = serde_json::json!([{"Config": "config.json", "RepoTags": [name], "Layers": ["layer.tar"]}]);
     std::fs::write(files.join("manifest.json"), manifest.to_string()).unwrap();
-    let (tar, archive) = (folder.join("image.tar"), ["manifest.json", "config.json", "layer.tar"]);
+    let tar = folder.join("image.tar");
+    let archive = ["manifest.json", "config.json", "layer.tar"];
     let made = std::process::Command::new("tar")
         .arg("-C")
         .arg(&files)

@@ -110,7 +110,8 @@ impl Daemon {
         // Left by a killed daemon.
         std::fs::remove_file(folder.join("pid")).ok();
         std::fs::remove_dir_all(folder.join("exec")).ok();
-        let (socket, log) = (self.socket(), std::fs::File::create(self.folder.join("log")).unwrap());
+        let socket = self.socket();
+        let log = std::fs::File::create(self.folder.join("log")).unwrap();
         // The kernel kills it with the thread that started it, so this thread lives as long as the process.
         std::thread::spawn(move || {
             let path = |name: &str| folder.join(name).display().to_string();
@@ -331,7 +332,8 @@ pub fn prefix(server: &Server) -> String {
 /// The running containers of one service of a server, as soon as there is one. Docker may list a container as running
 /// only after the container has printed something.
 pub fn of_service(server: &Server, service: &str) -> Vec<String> {
-    let (prefix, deadline) = (prefix(server), Instant::now() + SOON);
+    let prefix = prefix(server);
+    let deadline = Instant::now() + SOON;
     let filter = format!("label=com.docker.compose.service={service}");
     let format = "{{.Label \"com.docker.compose.project\"}} {{.ID}}";
     loop {

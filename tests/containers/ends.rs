@@ -54,7 +54,8 @@ async fn only_leftovers_of_this_server_are_removed() {
             "1000",
         ])
     };
-    let (mine, other) = (owner.project(2001), "webots-fleet-000000000000-2001-0".to_owned());
+    let mine = owner.project(2001);
+    let other = "webots-fleet-000000000000-2001-0".to_owned();
     // An image's label may have any text, and its containers inherit it.
     let containers = [
         (format!("{mine}-webots"), &mine),

@@ -38,7 +38,8 @@ async fn a_build_has_no_more_memory_than_a_simulation() {
 #[actix_rt::test]
 async fn folders_and_devices_of_an_image_are_its_projects_fault() {
     let Some(_docker) = docker().await else { return };
-    let (server, folder) = (server(1), tempfile::tempdir().unwrap());
+    let server = server(1);
+    let folder = tempfile::tempdir().unwrap();
     let replaced = |folder| (format!("rm -rf {folder} && touch {folder}"), "");
     // An ordinary user can't copy a device out of the image.
     let device = ("mknod /usr/local/webots-project/zero c 1 5".to_owned(), "not permitted");

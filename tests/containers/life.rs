@@ -123,7 +123,8 @@ async fn a_container_has_no_more_than_it_needs() {
         .set("timing", json!({ "heartbeat": 600, "launch": 90 }));
     let (server, _client) = running(server).await;
     let about: Value = serde_json::from_str(&ask(&["inspect", &of_service(&server, "webots")[0]])).unwrap();
-    let (host, config) = (&about[0]["HostConfig"], &about[0]["Config"]);
+    let host = &about[0]["HostConfig"];
+    let config = &about[0]["Config"];
     for (key, value) in [
         ("Privileged", json!(false)),
         ("ReadonlyRootfs", json!(true)),

@@ -54,7 +54,8 @@ fn a_participants_program_may_end_before_its_simulation() {
         (Some("if True print()"), "SyntaxError", "remote_controller_launcher"),
         (None, "There is no participant/participant.py", "Traceback"),
     ] {
-        let (file, calls) = (path("controllers/participant/participant.py"), path("calls"));
+        let file = path("controllers/participant/participant.py");
+        let calls = path("calls");
         std::fs::remove_file(&calls).ok();
         match program {
             Some(program) => std::fs::write(&file, format!("{note}{program}")).unwrap(),

@@ -255,11 +255,9 @@ fn the_servers_and_the_door_on_swarm_are_those_of_the_demo() {
             .map(str::to_owned)
             .collect()
     };
-    let (swarm, kubernetes, door) = (
-        "swarm/door.conf",
-        "kubernetes/base/config/fleet.conf",
-        "nginx-door.conf",
-    );
+    let swarm = "swarm/door.conf";
+    let kubernetes = "kubernetes/base/config/fleet.conf";
+    let door = "nginx-door.conf";
     let proxy = [
         "proxy_read_timeout ",
         "proxy_connect_timeout ",

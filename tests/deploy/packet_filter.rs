@@ -133,7 +133,9 @@ impl Network {
             return None;
         }
         let place = || Place::new().unwrap();
-        let (container, neighbour, closed) = (place(), place(), place());
+        let container = place();
+        let neighbour = place();
+        let closed = place();
         let network = Self {
             machine,
             container,

@@ -34,7 +34,8 @@ fn the_rules_forward_only_configured_ports() {
             .zip([port, 3000].iter().flat_map(|first| vec![first; each]))
         {
             // The simulation server has a rule of its own; an editor is at its Webots' port + 500.
-            let (webots, editors) = (first + 1..=first + places, first + 501..=first + places + 500);
+            let webots = first + 1..=first + places;
+            let editors = first + 501..=first + places + 500;
             assert_eq!(
                 matched(pattern),
                 webots.chain(editors).collect::<Vec<_>>(),

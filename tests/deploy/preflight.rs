@@ -28,7 +28,8 @@ pub fn check(keys: &Value, change: impl FnOnce(&mut Command)) -> (Value, String)
 
 #[test]
 fn nothing_is_warned_about_where_all_is_there() {
-    let (webots, programs) = (Webots::script("exit 0"), tempfile::tempdir().unwrap());
+    let webots = Webots::script("exit 0");
+    let programs = tempfile::tempdir().unwrap();
     let git = Webots::script("echo \"git version 2.39.5 $*\"");
     for (name, program) in [("git", &git), ("git-lfs", &git), ("Xvfb", &webots)] {
         symlink(program.path(), programs.path().join(name)).unwrap();

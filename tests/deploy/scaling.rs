@@ -50,7 +50,8 @@ fn the_commands_of_the_page_on_kubernetes_apply_what_is_there() {
     needs!("kubectl");
     let text = section(&page("scaling.md"), "## Kubernetes");
     let project = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let (programs, own) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let programs = tempfile::tempdir().unwrap();
+    let own = tempfile::tempdir().unwrap();
     make_program(&programs.path().join("docker"), DOCKER);
     make_program(&programs.path().join("kubectl"), KUBECTL);
     let files = own.path().join("webots-fleet");
@@ -70,7 +71,8 @@ fn the_commands_of_the_page_on_kubernetes_apply_what_is_there() {
         own.path().join("simulation.json"),
     )
     .unwrap();
-    let (authority, commands) = (Authority::new(), commands(&text));
+    let authority = Authority::new();
+    let commands = commands(&text);
     let certificate = authority.issue(&["fleet.lab.example"]);
     std::fs::copy(certificate.chain, own.path().join("tls.crt")).unwrap();
     std::fs::copy(certificate.key, own.path().join("tls.key")).unwrap();

@@ -238,13 +238,15 @@ impl Fleet {
 
     fn look_for_rests(&self) -> Result<(), String> {
         for (index, server) in self.servers.iter().enumerate() {
-            let (processes, held) = (instances_below(&self.site.folder(index)), self.held(index));
+            let processes = instances_below(&self.site.folder(index));
+            let held = self.held(index);
             if !processes.is_empty() || held != (0, 0) {
                 return Err(format!(
                     "server {index} has left {processes:?}, and folders and ports: {held:?}"
                 ));
             }
-            let (before, now) = (self.memory[index], memory(server.pid()));
+            let before = self.memory[index];
+            let now = memory(server.pid());
             if now > before + (24 << 20) {
                 return Err(format!(
                     "server {index} takes {} MiB, and took {}",

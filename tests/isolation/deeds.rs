@@ -120,7 +120,9 @@ fn shown(path: impl AsRef<Path>) -> String {
 
 /// Deeds with files, and whether they succeed at each level.
 fn files(stage: &Stage) -> Vec<(&'static str, String, [bool; 2])> {
-    let (folder, home, elsewhere) = (shown(&stage.folder), shown(&stage.home), shown(&stage.elsewhere));
+    let folder = shown(&stage.folder);
+    let home = shown(&stage.home);
+    let elsewhere = shown(&stage.elsewhere);
     vec![
         (
             "read and write the project",
@@ -212,8 +214,10 @@ fn system_calls() -> Vec<(&'static str, String, [bool; 2])> {
     let host = "python3 -c 'import socket; socket.socket(40, socket.SOCK_STREAM)'".to_owned();
     let namespaces = call(&format!("{unshare}, 0"), "== 0");
     // What such a kernel does not have can't be kept from worlds.
-    let (has_keyrings, has_io_uring) = (works(&keyring), works(&io_uring));
-    let (has_faults, has_host) = (works(&faults), works(&host));
+    let has_keyrings = works(&keyring);
+    let has_io_uring = works(&io_uring);
+    let has_faults = works(&faults);
+    let has_host = works(&host);
     vec![
         ("use a keyring", keyring, [has_keyrings, false]),
         ("use io_uring", io_uring, [has_io_uring, false]),
@@ -321,7 +325,8 @@ async fn temporary_folders_are_the_simulations_own_wherever_they_are() {
 #[actix_rt::test]
 async fn folders_are_shown_and_opened_by_keys() {
     let Some(stage) = Stage::apart() else { return };
-    let (home, elsewhere) = (shown(&stage.home), shown(&stage.elsewhere));
+    let home = shown(&stage.home);
+    let elsewhere = shown(&stage.elsewhere);
     let deeds = [
         ("read home", format!("grep secret {home}/secret")),
         ("write home", format!("touch {home}/new")),

@@ -22,7 +22,8 @@ fn with(builder: Builder, programs: &tempfile::TempDir, isolation: &str) -> Buil
 
 #[actix_rt::test]
 async fn a_required_level_that_is_missing_refuses_the_start() {
-    let (none, ends) = (programs(None), programs(Some("exit 1")));
+    let none = programs(None);
+    let ends = programs(Some("exit 1"));
     let denied = programs(Some("echo 'bwrap: setting up uid map: Permission denied' >&2; exit 1"));
     let hangs = programs(Some("exec sleep 1000"));
     let sandbox = |programs| with(demo_server(1), programs, "sandbox");

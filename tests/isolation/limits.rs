@@ -106,7 +106,8 @@ async fn a_flood_of_output_costs_no_more_than_a_tenth_of_a_core() {
         let webots = Webots::script(&format!("{DEMO} \"$@\" >/dev/null &\n{flood} & wait"));
         let server = server_of(webots, 1).set("isolation", level).start().await;
         let client = Client::ready(&server).await;
-        let (begin, before) = (Instant::now(), taken(&server));
+        let begin = Instant::now();
+        let before = taken(&server);
         let log = server.output_file(&client);
         let size = || -> u64 {
             let files = std::fs::read_dir(log.parent().unwrap()).unwrap().flatten();
@@ -219,7 +220,8 @@ fn folder_of_a_user() -> Option<TempDir> {
 #[actix_rt::test]
 async fn a_server_that_may_start_too_few_threads_serves_or_ends() {
     let cores = u32::try_from(std::thread::available_parallelism().unwrap().get()).unwrap();
-    let (mut served, mut log) = (false, String::new());
+    let mut served = false;
+    let mut log = String::new();
     for processes in 6..=cores + 16 {
         // The guardian of the one before may still be there.
         let Some(folder) = folder_of_a_user() else { return };
@@ -249,7 +251,8 @@ async fn a_server_that_can_start_no_more_threads_is_not_ready() {
     assert_eq!(server.health().await, (200, "ok".to_owned()));
     let limit = |processes: u32| {
         // As the server's user, and only the soft limit: who is root in a container may not change others' limits.
-        let (pid, user) = (server.pid(), folder.path().metadata().unwrap().uid());
+        let pid = server.pid();
+        let user = folder.path().metadata().unwrap().uid();
         let command =
             format!("setpriv --reuid={user} --regid={user} --clear-groups prlimit --pid={pid} --nproc={processes}:");
         let changed = Command::new("sh").args(["-c", &command]).status().unwrap();

@@ -81,10 +81,8 @@ async fn a_simulation_has_its_grace_time_at_each_level() {
     needs!("bwrap");
     for (level, user, network) in levels() {
         let stage = Stage::new();
-        let (open, written) = (
-            stage.elsewhere.path().to_str().unwrap(),
-            stage.elsewhere.path().join("written"),
-        );
+        let open = stage.elsewhere.path().to_str().unwrap();
+        let written = stage.elsewhere.path().join("written");
         // Like Webots' launcher: it forwards SIGTERM, and waits.
         let work = format!("sleep 0.3; echo saved > '{}'", written.display());
         let webots = Webots::script(&format!("trap \"{work}; exit 0\" TERM\n{DEMO} \"$@\" & wait"));
@@ -136,12 +134,14 @@ async fn a_simulation_that_ignores_sigterm_is_killed() {
 async fn the_folder_of_a_simulation_is_removed_once_there_is_room_for_processes_again() {
     // The limit does not apply to root.
     let Some(nobody) = as_nobody() else { return };
-    let (stage, webots) = (Stage::new(), Webots::launcher());
+    let stage = Stage::new();
+    let webots = Webots::launcher();
     let server = stage.builder(&webots, "none").before(nobody).start().await;
     let client = Client::ready(&server).await;
     let limit = |processes: &str| {
         // Root may lack the capability for processes of others.
-        let (pid, most) = (server.pid().to_string(), format!("--nproc={processes}:"));
+        let pid = server.pid().to_string();
+        let most = format!("--nproc={processes}:");
         let mut prlimit = Command::new("bash");
         prlimit.args(["-c", nobody, "prlimit", "--pid", &pid, &most]);
         assert!(prlimit.status().unwrap().success());

@@ -200,7 +200,8 @@ async fn whether_webots_has_listened_decides_who_is_to_blame() {
         ]
     });
     for (level, user, network) in levels() {
-        let (stage, webots) = (Stage::new(), misbehaving());
+        let stage = Stage::new();
+        let webots = misbehaving();
         let builder = stage.builder(&webots, level).before(user);
         let server = builder
             .set("sandbox.network", network)

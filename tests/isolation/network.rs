@@ -314,7 +314,8 @@ async fn which_network_simulations_have_is_told() {
             server.log()
         );
     }
-    let (stage, webots) = (Stage::new(), Webots::script("exit 1"));
+    let stage = Stage::new();
+    let webots = Webots::script("exit 1");
     let setpriv = user.replace("setpriv", "/usr/bin/setpriv");
     let told = server(&stage, &webots, &setpriv, "own")
         .env("PATH", &path(&none))
@@ -346,7 +347,8 @@ async fn a_machine_with_one_version_of_ip_has_own_networks() {
             return skip(&format!("no network: {}", String::from_utf8_lossy(&made.stderr)));
         }
         for streaming in ["direct", "relay"] {
-            let (stage, webots) = (Stage::new(), Webots::script(&format!("{DEMO} \"$@\" & wait")));
+            let stage = Stage::new();
+            let webots = Webots::script(&format!("{DEMO} \"$@\" & wait"));
             // `::` stands for the addresses of this namespace.
             let server = server(&stage, &webots, user, "own")
                 .set("streaming", streaming)

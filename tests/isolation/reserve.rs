@@ -48,7 +48,8 @@ struct Least(Arc<AtomicU64>);
 impl Least {
     /// Records until this value is dropped.
     fn of(folder: &Path) -> Self {
-        let (folder, least) = (folder.to_owned(), Self(Arc::new(AtomicU64::new(u64::MAX))));
+        let folder = folder.to_owned();
+        let least = Self(Arc::new(AtomicU64::new(u64::MAX)));
         let bytes = Arc::downgrade(&least.0);
         std::thread::spawn(move || {
             while let Some(bytes) = bytes.upgrade() {

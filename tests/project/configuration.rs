@@ -125,7 +125,8 @@ fn every_shipped_configuration_is_taken_without_a_warning() {
 #[test]
 fn the_page_names_every_key_once_with_its_default_and_no_other() {
     for kind in kinds() {
-        let (defaults, rows) = (kind.defaults(), kind.rows());
+        let defaults = kind.defaults();
+        let rows = kind.rows();
         let mut named: Vec<&str> = rows.iter().map(|(key, _)| key.as_str()).collect();
         named.sort_unstable();
         let known: Vec<&str> = defaults.keys().map(String::as_str).collect();

@@ -56,7 +56,8 @@ async fn the_demo_runs_from_its_start_to_its_stop() {
     needs!("bwrap");
     let project = Project::copy();
     let told = project.done(&["start", "demo"]).await;
-    let (session, simulation) = (project.session, project.simulation);
+    let session = project.session;
+    let simulation = project.simulation;
     for part in [
         format!("http://localhost:{session}/monitor"),
         format!("ws://localhost:{session}/session"),

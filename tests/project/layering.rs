@@ -162,7 +162,8 @@ fn no_file_has_what_its_place_forbids() {
         ),
     ];
     for (files, forbidden) in rules {
-        let (files, forbidden) = (Regex::new(files).unwrap(), Regex::new(forbidden).unwrap());
+        let files = Regex::new(files).unwrap();
+        let forbidden = Regex::new(forbidden).unwrap();
         for (path, text, shipped) in sources() {
             let head = text.lines().take_while(|line| line.starts_with("//!"));
             let is_meant = head.chain([path.as_str()]).any(|line| files.is_match(line));

@@ -44,9 +44,11 @@ impl Fleet {
     pub async fn start_with(rules: Rules, keys: impl Fn(Builder) -> Builder) -> Self {
         let authority = Authority::new();
         let certificate = authority.issue(&["localhost", "www.localhost"]);
-        let (http, https) = (ports::block(1), ports::block(1));
+        let http = ports::block(1);
+        let https = ports::block(1);
         let host = format!("localhost:{https}");
-        let (webots, forge) = (Webots::launcher(), Forge::with_arm());
+        let webots = Webots::launcher();
+        let forge = Forge::with_arm();
         forge.commit("lab/arm", "main", &[("worlds/textures/old wood.png", "a picture")]);
         let behind = |server: Builder| {
             let server = if rules.is_door() {
@@ -108,7 +110,9 @@ impl Fleet {
             host,
             plain: http,
         };
-        let (_authority, _webots, _forge) = (authority, webots, forge);
+        let _authority = authority;
+        let _webots = webots;
+        let _forge = forge;
         let fleet = Self {
             rules,
             browser,

@@ -53,7 +53,8 @@ async fn who_is_lost_comes_back_through_the_door() {
 }
 
 async fn leads_nowhere_else(fleet: &Fleet) {
-    let (private, port) = (private_service(), fleet.here.port);
+    let private = private_service();
+    let port = fleet.here.port;
     for path in [
         // Another host: this machine, one of its names, one on the internet.
         format!("/127.0.0.1/{private}/"),

@@ -17,12 +17,14 @@ async fn announce(session: &Server, order: &Value) -> u16 {
 #[actix_rt::test]
 async fn an_announcement_reaches_who_asks_for_it_in_time() {
     let session = session_server(&[]).set("adminPassword", PASSWORD).start().await;
-    let (mut viewer, mut old) = (Client::connect(&session.websocket(ASKS)).await, Vec::new());
+    let mut viewer = Client::connect(&session.websocket(ASKS)).await;
+    let mut old = Vec::new();
     for path in ["/", "/session", "/session?announcements=0"] {
         old.push(Client::connect(&session.websocket(path)).await);
     }
     viewer.until("0").await;
-    let (text, asked) = ("<b>Maintenance</b> & more\nat noon", Instant::now());
+    let text = "<b>Maintenance</b> & more\nat noon";
+    let asked = Instant::now();
     assert_eq!(announce(&session, &json!({"text": text})).await, 200);
     let told = viewer.until("announcement:").await;
     assert_eq!(
@@ -57,7 +59,8 @@ async fn an_announcement_reaches_who_asks_for_it_in_time() {
 #[actix_rt::test]
 async fn only_the_password_announces_something() {
     let session = session_server(&[]).set("adminPassword", PASSWORD).start().await;
-    let (url, order) = (session.url("/announcement"), r#"{"text": "hello"}"#);
+    let url = session.url("/announcement");
+    let order = r#"{"text": "hello"}"#;
     assert_eq!(post(&url, None, order).await, 401);
     assert_eq!(post(&url, Some("guess"), order).await, 401);
     let foreign = awc::Client::default().post(&url).basic_auth("admin", PASSWORD);

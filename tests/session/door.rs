@@ -142,7 +142,8 @@ async fn a_draining_server_is_offered_for_less_than_a_second_more() {
     server.signal(Signal::SIGUSR1);
     let drains = Instant::now();
     // If the machine is busy for a while, the requests of this test are late too: allow for that.
-    let (mut asked, mut held_up) = (drains, Duration::ZERO);
+    let mut asked = drains;
+    let mut held_up = Duration::ZERO;
     while offered().await {
         let last = asked;
         assert!(last.elapsed() < SOON, "it is offered for ever");

@@ -221,7 +221,8 @@ fn fleet(servers: &[&Server]) -> Builder {
 #[actix_rt::test]
 async fn on_a_quiet_machine_two_hundred_share_twenty_slots_in_order_whatever_happens() {
     const CLIENTS: usize = 200;
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let forge = Forge::with_arm();
+    let webots = Webots::launcher();
     forge.commit("school/arm", "main", &[("worlds/a.wbt", WORLD)]);
     let both: &[&str] = &["lab", "school"];
     let lab: &[&str] = &["lab"];

@@ -278,13 +278,12 @@ async fn a_test_mail_says_how_it_went() {
 async fn a_password_is_sent_to_a_trusted_server_only() {
     let folder = tempfile::tempdir().unwrap();
     let authority = folder.path().join("authority.pem").to_str().unwrap().to_owned();
-    let (right, wrong) = (
-        json!({"mailSenderPassword": "s3cret"}),
-        json!({"mailSenderPassword": "guess"}),
-    );
+    let right = json!({"mailSenderPassword": "s3cret"});
+    let wrong = json!({"mailSenderPassword": "guess"});
     let implicit = json!({"mailSenderPassword": "s3cret", "mailServerImplicitTls": true});
     let by_name = json!({"mailSenderPassword": "s3cret", "mailServer": "localhost"});
-    let (sent, untrusted) = (" took a test", "certificate is not trusted");
+    let sent = " took a test";
+    let untrusted = "certificate is not trusted";
     for (options, more, words, commands) in [
         (
             "starttls --authority",

@@ -36,7 +36,8 @@ fn connect(server: &Server) -> TcpStream {
 /// Sends these requests repeatedly, as many as the server accepts from each client.
 async fn fill(clients: &mut [TcpStream], requests: &[u8]) {
     // A server may keep accepting bytes that it ignores.
-    let (deadline, mut progress) = (Instant::now() + LONGEST, Instant::now());
+    let deadline = Instant::now() + LONGEST;
+    let mut progress = Instant::now();
     let mut sent = vec![0; clients.len()];
     while progress.elapsed() < Duration::from_secs(1) && Instant::now() < deadline {
         for (client, sent) in clients.iter_mut().zip(&mut sent) {

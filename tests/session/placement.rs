@@ -164,7 +164,8 @@ async fn somebody_who_only_asks_does_not_close_the_fleet() {
         .start()
         .await;
     until_states(&session, &["up"]).await;
-    let (url, client) = (session.url("/session"), awc::Client::default());
+    let url = session.url("/session");
+    let client = awc::Client::default();
     let ask = async || {
         let request = client.get(&url).insert_header(("X-Forwarded-For", "203.0.113.9"));
         request

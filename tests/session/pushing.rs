@@ -91,7 +91,8 @@ async fn a_silent_client_is_disconnected_in_time() {
     reader.until("0").await;
     let begin = std::time::Instant::now();
     // It receives everything, but answers no ping.
-    let (mut silent, mut rest) = (deaf(&session).await, Vec::new());
+    let mut silent = deaf(&session).await;
+    let mut rest = Vec::new();
     let closed = async {
         let end = actix_rt::time::timeout(Duration::from_secs(15), silent.read_to_end(&mut rest)).await;
         assert!(end.is_ok(), "its connection is still open");

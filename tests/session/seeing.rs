@@ -78,7 +78,8 @@ async fn status_and_metrics_have_what_an_alarm_needs() {
     );
     assert_eq!((&status["clients"], &status["load"]), (&json!(0), &json!(30.0)));
     assert!(status["uptime"].is_u64());
-    let (up, down) = (&status["servers"][0], &status["servers"][1]);
+    let up = &status["servers"][0];
+    let down = &status["servers"][1];
     assert_eq!(up["address"], servers[0].address());
     assert_eq!(
         (&up["load"], &up["effectiveLoad"], &up["inFlight"]),
@@ -109,7 +110,8 @@ async fn status_and_metrics_have_what_an_alarm_needs() {
     let answer = http::get(&session.url("/metrics")).await;
     assert!(answer.header("content-type").unwrap().starts_with("text/plain"));
     let text = answer.text();
-    let (up, down) = (servers[0].address(), servers[1].address());
+    let up = servers[0].address();
+    let down = servers[1].address();
     for line in [
         "available 1".to_owned(),
         "load_percent 30".to_owned(),

@@ -43,7 +43,8 @@ async fn errors_after_the_first(session: &Server, count: usize) -> Vec<String> {
 
 #[actix_rt::test]
 async fn a_certificate_that_is_not_trusted_is_named_with_the_reason() {
-    let (lab, other) = (Authority::new(), Authority::new());
+    let lab = Authority::new();
+    let other = Authority::new();
     let dated = |from: i32, until: i32| {
         move |params: &mut CertificateParams| {
             params.not_before = rcgen::date_time_ymd(from, 1, 1);
@@ -69,7 +70,8 @@ async fn a_certificate_that_is_not_trusted_is_named_with_the_reason() {
     servers.push(format!("localhost:{}/2000", plain.port));
     let session = watching(&servers, &lab.file()).start().await;
     let errors = errors_after_the_first(&session, 5).await;
-    let (page, log) = (session.monitor().await, session.log());
+    let page = session.monitor().await;
+    let log = session.log();
     for (error, (_, words)) in errors.iter().zip(&table) {
         // The time of the probe follows.
         let words = format!("{untrusted}{words}");
@@ -87,7 +89,9 @@ async fn a_certificate_that_is_not_trusted_is_named_with_the_reason() {
 async fn a_self_signed_certificate_in_the_trust_store_is_trusted() {
     let folder = tempfile::tempdir().unwrap();
     let signed = |name: &str, signs_others| Certificate::self_signed(folder.path(), name, signs_others);
-    let (own, other, authority) = (signed("own", false), signed("other", false), signed("authority", true));
+    let own = signed("own", false);
+    let other = signed("other", false);
+    let authority = signed("authority", true);
     let trusted = [&own, &authority].map(|certificate| std::fs::read_to_string(&certificate.chain).unwrap());
     std::fs::write(folder.path().join("trusted.pem"), trusted.concat()).unwrap();
     let servers = [&own, &other, &authority].map(simulation_server);
@@ -104,7 +108,8 @@ async fn a_self_signed_certificate_in_the_trust_store_is_trusted() {
 
 #[actix_rt::test]
 async fn authorities_that_cant_be_read_cost_only_their_servers() {
-    let (folder, lab) = (tempfile::tempdir().unwrap(), Authority::new());
+    let folder = tempfile::tempdir().unwrap();
+    let lab = Authority::new();
     let broken = folder.path().join("broken.pem");
     let good = std::fs::read_to_string(lab.file()).unwrap();
     let text = "-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n{}-----BEGIN CERTIFICATE-----\n*\n\

@@ -33,7 +33,8 @@ fn says_nothing_secret(session: &Server) {
 
 #[actix_rt::test]
 async fn the_notices_of_a_mail_are_one_message_and_need_no_mail() {
-    let (servers, receiver) = (fleet(), Receiver::start(None));
+    let servers = fleet();
+    let receiver = Receiver::start(None);
     let session = with_webhook(&servers, "http", receiver.port).start().await;
     let text = receiver.texts(1).await.remove(0);
     assert!(text.starts_with("Simulation servers: 3 not responding\n"), "{text}");
@@ -75,7 +76,9 @@ async fn the_notices_of_a_mail_are_one_message_and_need_no_mail() {
 
 #[actix_rt::test]
 async fn a_webhook_and_a_mail_are_retried_independently() {
-    let (servers, receiver, other) = (fleet(), Receiver::start(None), Receiver::start(None));
+    let servers = fleet();
+    let receiver = Receiver::start(None);
+    let other = Receiver::start(None);
     receiver.answer("503 Busy");
     let mut smtp = Smtp::start(&[]).await;
     let session = with_webhook(&servers, "http", receiver.port)
@@ -112,7 +115,8 @@ async fn a_webhook_and_a_mail_are_retried_independently() {
 
 #[actix_rt::test]
 async fn a_messenger_whose_certificate_is_not_trusted_is_told_nothing() {
-    let (lab, other) = (Authority::new(), Authority::new());
+    let lab = Authority::new();
+    let other = Authority::new();
     let receiver = Receiver::start(Some(&lab.issue(&["localhost"])));
     for (authority, trusted) in [(&other, false), (&lab, true)] {
         let servers = fleet();

@@ -14,7 +14,8 @@ use crate::support::{Client, Forge, Server, arm, is_told, outcome, server_of, si
 
 #[actix_rt::test]
 async fn the_cache_keeps_to_its_budget() {
-    let (forge, webots) = (Forge::new(), reader());
+    let forge = Forge::new();
+    let webots = reader();
     for name in ["lab/one", "lab/two", "lab/three"] {
         forge.commit(name, "main", &[("worlds/a.wbt", &world_text(name))]);
     }
@@ -129,7 +130,8 @@ fn cut_packs(repository: &Path) {
 
 #[actix_rt::test]
 async fn a_damaged_repository_costs_a_class_nothing() {
-    let (forge, webots) = (Forge::with_arm(), reader());
+    let forge = Forge::with_arm();
+    let webots = reader();
     forge.commit_noise("lab/arm", 4 << 20);
     let server = simulation_server(&webots.path(), forge.path(), 30).start().await;
     assert!(outcome(&server, &arm()).await.contains("opened"));
@@ -148,7 +150,9 @@ async fn a_damaged_repository_costs_a_class_nothing() {
 
 #[actix_rt::test]
 async fn a_lock_that_a_killed_git_has_left_does_not_stop_packing() {
-    let (forge, webots, folder) = (Forge::with_arm(), reader(), tempfile::tempdir().unwrap());
+    let forge = Forge::with_arm();
+    let webots = reader();
+    let folder = tempfile::tempdir().unwrap();
     let settings = folder.path().join("gitconfig");
     std::fs::write(&settings, "[gc]\n\tautoPackLimit = 2\n").unwrap();
     let builder = simulation_server(&webots.path(), forge.path(), 1);
@@ -167,7 +171,9 @@ async fn a_lock_that_a_killed_git_has_left_does_not_stop_packing() {
 
 #[actix_rt::test]
 async fn a_repository_in_use_is_evicted_after_its_last_user() {
-    let (forge, webots, marks) = (Forge::with_arm(), reader(), tempfile::tempdir().unwrap());
+    let forge = Forge::with_arm();
+    let webots = reader();
+    let marks = tempfile::tempdir().unwrap();
     forge.commit_noise("lab/arm", 2 << 20);
     forge.commit("lab/leg", "main", &[("worlds/a.wbt", &world_text("leg"))]);
     let wrapper = Wrapper::git(&format!(

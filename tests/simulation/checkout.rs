@@ -17,7 +17,8 @@ use crate::support::{
 
 #[actix_rt::test]
 async fn every_kind_of_url_opens_its_world() {
-    let (forge, webots) = (Forge::new(), reader());
+    let forge = Forge::new();
+    let webots = reader();
     let first = forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("root of main"))]);
     forge.tag("lab/arm", "v1.0", "main");
     forge.commit(
@@ -120,7 +121,8 @@ async fn every_kind_of_url_opens_its_world() {
 
 #[actix_rt::test]
 async fn a_world_runs_only_where_its_repository_is_allowed() {
-    let (forge, webots) = (Forge::with_arm(), reader());
+    let forge = Forge::with_arm();
+    let webots = reader();
     for name in ["lab-evil/arm", "lab/secret"] {
         forge.commit(name, "main", &[("worlds/a.wbt", &world_text(name))]);
     }
@@ -157,7 +159,8 @@ async fn a_world_runs_only_where_its_repository_is_allowed() {
 
 #[actix_rt::test]
 async fn what_is_not_there_or_no_world_is_told_in_words() {
-    let (forge, webots) = (Forge::with_arm(), reader());
+    let forge = Forge::with_arm();
+    let webots = reader();
     let work = forge.work_tree("lab/arm", "main");
     for (target, link) in [
         ("/etc/passwd", "passwd.wbt"),
@@ -241,7 +244,8 @@ async fn what_is_not_there_or_no_world_is_told_in_words() {
 
 #[actix_rt::test]
 async fn a_repository_can_run_nothing() {
-    let (forge, webots) = (Forge::with_arm(), reader());
+    let forge = Forge::with_arm();
+    let webots = reader();
     let trap = tempfile::tempdir().unwrap();
     let touch = |name: &str| format!("touch {}", trap.path().join(name).display());
     let work = forge.work_tree("lab/arm", "main");
@@ -354,7 +358,8 @@ async fn progress_moves_in_percent() {
 
 #[actix_rt::test]
 async fn a_kill_in_the_middle_of_a_fetch_harms_no_later_start() {
-    let (forge, webots) = (Forge::with_arm(), reader());
+    let forge = Forge::with_arm();
+    let webots = reader();
     forge.commit_noise("lab/arm", 3 << 20);
     let folder = tempfile::tempdir().unwrap();
     let start = || simulation_server(&webots.path(), forge.path(), 2).folder(folder.path());

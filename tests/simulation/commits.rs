@@ -7,7 +7,8 @@ use crate::support::{Forge, WORLD, arm_at, outcome, simulation_server};
 
 #[actix_rt::test]
 async fn any_commit_of_a_branch_or_tag_runs() {
-    let (forge, webots) = (Forge::new(), reader());
+    let forge = Forge::new();
+    let webots = reader();
     let commit = |branch: &str, text: &str| forge.commit("lab/arm", branch, &[("worlds/a.wbt", &world_text(text))]);
     let commits = [
         commit("main", "first"),
@@ -57,7 +58,8 @@ async fn any_commit_of_a_branch_or_tag_runs() {
 
 #[actix_rt::test]
 async fn a_commit_of_no_branch_or_tag_runs_only_with_any_commit() {
-    let (forge, webots) = (Forge::with_arm(), reader());
+    let forge = Forge::with_arm();
+    let webots = reader();
     let proposed = forge.commit(
         "lab/arm",
         "proposal",

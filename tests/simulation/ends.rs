@@ -10,7 +10,8 @@ use crate::support::{Client, DEMO, Forge, Server, Webots, arm, http, server_of, 
 /// A simulator that exits with the code in this file, once the file exists.
 fn ending(file: &Path) -> Webots {
     let begun = "printf 'begun\\nred \\033[31m text\\n\\377 no text\\n' >&2";
-    let (demo, file) = (format!("{DEMO} \"$@\" >/dev/null 2>&1 &"), file.display());
+    let demo = format!("{DEMO} \"$@\" >/dev/null 2>&1 &");
+    let file = file.display();
     let ended = format!("until [ -e {file} ]; do sleep 0.02; done\nprintf 'last words\\nwithout end'");
     Webots::script(&format!(
         "{begun}\n{demo}\n{ended}\nkill %1 2>/dev/null\nexit $(cat {file})"
@@ -125,7 +126,8 @@ async fn a_simulation_keeps_one_id() {
 #[actix_rt::test]
 async fn a_kept_output_stays_whatever_is_printed_afterwards() {
     // A process that outlives its Webots prints without end as soon as the output is kept, and for more than one file.
-    let (folder, forge) = (tempfile::tempdir().unwrap(), Forge::with_arm());
+    let folder = tempfile::tempdir().unwrap();
+    let forge = Forge::with_arm();
     let logs = folder.path().join("log/simulation");
     let flood = format!(
         "touch left; until ls {}/ended/*.log; do sleep 0.02; done 2>/dev/null >&2; exec yes 'a flood of lines'",
@@ -178,7 +180,8 @@ async fn each_kind_of_end_is_told_as_such() {
     let output = server.url(&format!("/output?id={}", nowhere.id()));
     assert_eq!(http::get(&output).await.status.as_u16(), 404);
     // The server stops while one client waits and another's simulation runs.
-    let (running, mut waiting) = (start().await, Client::start(&server, &arm()).await);
+    let running = start().await;
+    let mut waiting = Client::start(&server, &arm()).await;
     waiting.until("queue:").await;
     server.stops().await;
     let last = lines(&server);
@@ -214,7 +217,8 @@ async fn what_is_kept_needs_the_password_where_there_is_one() {
 async fn hidden_letters_in_a_worlds_name_are_shown() {
     let forge = Forge::new();
     let text = "#VRML_SIM R2025a utf8\n";
-    let (file, encoded) = ("a\u{202e}b\u{2028}\u{200b}.wbt", "c%E2%80%AEd%E2%80%A8.wbt");
+    let file = "a\u{202e}b\u{2028}\u{200b}.wbt";
+    let encoded = "c%E2%80%AEd%E2%80%A8.wbt";
     let decoded = "worlds/c\u{202e}d\u{2028}.wbt";
     forge.commit("lab/arm", "main", &[(&format!("worlds/{file}"), text), (decoded, text)]);
     let webots = Webots::launcher();

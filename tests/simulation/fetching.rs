@@ -29,8 +29,10 @@ fn commit(forge: &Forge, branch: &str) -> String {
 
 #[actix_rt::test]
 async fn a_fetch_that_hangs_delays_only_those_who_need_it() {
-    let (forge, webots) = (forge(&["main", "slow", "one"]), reader());
-    let (main, slow) = (commit(&forge, "main"), commit(&forge, "slow"));
+    let forge = forge(&["main", "slow", "one"]);
+    let webots = reader();
+    let main = commit(&forge, "main");
+    let slow = commit(&forge, "slow");
     git(&forge.path().join("lab/arm"), &["tag", "as-slow", "slow"]);
     let wrapper = Wrapper::git(&format!(
         "case \"$*\" in *fetch*+{slow}:*) while echo 'halted: 50%' >&2; do sleep 0.2; done;; esac"
@@ -85,7 +87,8 @@ async fn a_git_that_is_stopped_fails_once() {
     let forge = &forge(&["main"]);
     // One command of each kind: query, create the repository, fetch, list the files, check them out.
     let kinds = ["ls-remote", "init", "fetch", "ls-tree", "checkout"].map(|command| async move {
-        let (webots, marks) = (reader(), tempfile::tempdir().unwrap());
+        let webots = reader();
+        let marks = tempfile::tempdir().unwrap();
         let stop = format!(
             "case \" $* \" in *\" {command} \"*) mkdir {}/stopped 2>/dev/null && kill -STOP $$;; esac",
             marks.path().display()

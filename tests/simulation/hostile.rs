@@ -35,7 +35,8 @@ async fn failed_starts(server: &Server) -> u64 {
 
 #[actix_rt::test]
 async fn names_that_are_messages_of_a_broken_server_are_the_projects() {
-    let (forge, webots) = (Forge::with_arm(), reader());
+    let forge = Forge::with_arm();
+    let webots = reader();
     let long = "x".repeat(260);
     for (number, sentence) in SENTENCES.iter().enumerate() {
         // No file system takes a name as long as this.
@@ -75,7 +76,8 @@ async fn names_that_are_messages_of_a_broken_server_are_the_projects() {
 
 #[actix_rt::test]
 async fn what_a_remote_prints_does_not_decide() {
-    let (forge, webots) = (Forge::with_arm(), reader());
+    let forge = Forge::with_arm();
+    let webots = reader();
     let said = SENTENCES.map(|sentence| format!("echo 'fatal: {sentence}' >&2; echo 'remote: {sentence}' >&2;"));
     // Each query fails, with all sentences on its standard error.
     let wrapper = Wrapper::git(&format!(

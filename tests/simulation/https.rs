@@ -87,7 +87,8 @@ fn answer(request: &Request, root: &Path, elsewhere: &str) -> Option<(String, Ve
         .stderr(Stdio::null())
         .spawn()
         .unwrap();
-    let (mut input, body) = (backend.stdin.take().unwrap(), request.content.clone());
+    let mut input = backend.stdin.take().unwrap();
+    let body = request.content.clone();
     let fed = std::thread::spawn(move || input.write_all(&body));
     let output = backend.wait_with_output().unwrap().stdout;
     fed.join().unwrap().ok();
@@ -102,7 +103,8 @@ fn answer(request: &Request, root: &Path, elsewhere: &str) -> Option<(String, Ve
 
 #[actix_rt::test]
 async fn a_forge_is_asked_over_https_and_followed_nowhere_else() {
-    let (forge, webots) = (Forge::new(), reader());
+    let forge = Forge::new();
+    let webots = reader();
     let old = forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("old"))]);
     forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("new"))]);
     forge.commit("lab/dotted.git", "main", &[("worlds/a.wbt", &world_text("dotted"))]);
@@ -190,7 +192,9 @@ async fn a_forge_is_asked_over_https_and_followed_nowhere_else() {
 
 #[actix_rt::test]
 async fn git_uses_the_administrators_settings_only() {
-    let (forge, webots, home) = (Forge::new(), reader(), tempfile::tempdir().unwrap());
+    let forge = Forge::new();
+    let webots = reader();
+    let home = tempfile::tempdir().unwrap();
     forge.commit("lab/private", "main", &[("worlds/a.wbt", &world_text("private"))]);
     let https = Https::new(forge, String::new());
     let settings = "[credential]\n\thelper = \"!f() { echo username=u; echo password=p; }; f\"\n";

@@ -12,7 +12,8 @@ const POINTER: &str = "version https://git-lfs.github.com/spec/v1\noid sha256:00
 
 #[actix_rt::test]
 async fn a_world_whose_large_files_are_missing_opens_without_them() {
-    let (forge, webots) = (Forge::with_arm(), reader());
+    let forge = Forge::with_arm();
+    let webots = reader();
     forge.commit(
         "lab/arm",
         "main",
@@ -37,7 +38,8 @@ async fn a_world_whose_large_files_are_missing_opens_without_them() {
 
 #[actix_rt::test]
 async fn the_size_of_large_files_is_bounded() {
-    let (forge, webots) = (Forge::with_arm(), reader());
+    let forge = Forge::with_arm();
+    let webots = reader();
     forge.commit(
         "lab/arm",
         "main",

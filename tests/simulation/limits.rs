@@ -8,7 +8,8 @@ use crate::support::{Forge, WORLD, arm, arm_at, is_told, outcome, simulation_ser
 
 #[actix_rt::test]
 async fn sizes_are_limited() {
-    let (forge, webots) = (Forge::with_arm(), reader());
+    let forge = Forge::with_arm();
+    let webots = reader();
     let old = git(&forge.path().join("lab/arm"), &["rev-parse", "main"]);
     forge.commit_noise("lab/arm", 6 << 20);
     forge.commit(
@@ -84,7 +85,8 @@ async fn sizes_are_limited() {
 
 #[actix_rt::test]
 async fn git_is_bounded_in_memory_and_in_what_it_writes() {
-    let (forge, webots) = (Forge::with_arm(), reader());
+    let forge = Forge::with_arm();
+    let webots = reader();
     // Small in git's listing, four times as large when checked out.
     let text = "0123456789\n".repeat(50_000);
     let attributes = "*.txt working-tree-encoding=UTF-32LE\n";

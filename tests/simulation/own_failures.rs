@@ -85,7 +85,8 @@ async fn a_black_hole_takes_a_handful_of_clients_and_not_a_class() {
             .all(|one| one["state"] == "up")
     };
     until("both work", work).await;
-    let (mut running, mut failures) = (Vec::new(), 0_u64);
+    let mut running = Vec::new();
+    let mut failures = 0_u64;
     while running.len() < 10 {
         let given = http::get(&session.url("/session")).await.text();
         let mut client = Client::connect(&format!("{given}/client")).await.asking(&arm()).await;

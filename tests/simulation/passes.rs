@@ -103,7 +103,8 @@ async fn refused(server: &Server, world: &str, pass: &str) -> String {
 
 #[actix_rt::test]
 async fn a_pass_is_for_one_client_one_world_and_one_server() {
-    let (server, other) = (reserving().start().await, reserving().start().await);
+    let server = reserving().start().await;
+    let other = reserving().start().await;
     let mut link = Link::open(&server).await;
     link.want(&[(1, 0), (2, 0)]).await;
     let slots = link.slots().await;
@@ -166,8 +167,10 @@ async fn a_reservation_that_is_not_used_in_time_goes_to_the_next() {
 #[actix_rt::test]
 async fn the_order_of_arrival_holds_for_its_own_queue_and_all_session_servers() {
     let server = reserving().start().await;
-    let (mut one, mut two) = (Client::ready(&server).await, Client::ready(&server).await);
-    let (mut link, mut other) = (Link::open(&server).await, Link::open(&server).await);
+    let mut one = Client::ready(&server).await;
+    let mut two = Client::ready(&server).await;
+    let mut link = Link::open(&server).await;
+    let mut other = Link::open(&server).await;
     let mut own = Client::start(&server, &arm()).await;
     assert_eq!(own.until("queue: ").await, "queue: 0");
     // The first of each line came before it, the second of the other one later.

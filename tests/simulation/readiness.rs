@@ -13,7 +13,8 @@ async fn works(session: &Server) -> bool {
 
 #[actix_rt::test]
 async fn a_server_without_webots_is_not_offered() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let forge = Forge::with_arm();
+    let webots = Webots::launcher();
     let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
     let session = session_server(&[server.address()]).start().await;
     until("it works", async || works(&session).await).await;

@@ -65,7 +65,8 @@ async fn a_webots_that_hangs_is_told_and_ended() {
 
 #[actix_rt::test]
 async fn webots_is_given_the_documented_command_line_and_a_display() {
-    let (forge, webots) = (Forge::with_arm(), Webots::script("echo \"on [$DISPLAY]: $*\"\nexit 1"));
+    let forge = Forge::with_arm();
+    let webots = Webots::script("echo \"on [$DISPLAY]: $*\"\nexit 1");
     let hidden = "--minimize --no-rendering ";
     // The configured display, else that of the server's environment, else `:0`.
     for (configured, environment, display, mode, hidden, stream) in [
@@ -94,14 +95,16 @@ async fn webots_is_given_the_documented_command_line_and_a_display() {
 async fn paths_may_have_spaces_and_quotes() {
     needs!("Xvfb");
     let _alone = display::alone().await;
-    let (forge, folder) = (Forge::new(), tempfile::tempdir().unwrap());
+    let forge = Forge::new();
+    let folder = tempfile::tempdir().unwrap();
     forge.commit(
         "lab/arm",
         "main",
         &[("p q's/worlds/b  \"c\".wbt", &world_text("opened"))],
     );
     let script = "for last; do :; done\ntest -S /tmp/.X11-unix/X${DISPLAY#:} && echo 'with a display'\necho \"$PWD [$(sed -n 2p \"$last\")] $last\"\nexit 1";
-    let (reader, home) = (Webots::script(script), folder.path().join("my \"own\" webots"));
+    let reader = Webots::script(script);
+    let home = folder.path().join("my \"own\" webots");
     std::fs::create_dir(&home).unwrap();
     let program = home.join("webots");
     std::fs::copy(reader.path(), &program).unwrap();
@@ -160,8 +163,10 @@ async fn each_webots_gets_a_virtual_display_of_its_own() {
         .set("isolation", "none")
         .start()
         .await;
-    let (one, other) = (Client::ready(&server).await, Client::ready(&server).await);
-    let (first, second) = (display_of(&server, &one).await, display_of(&server, &other).await);
+    let one = Client::ready(&server).await;
+    let other = Client::ready(&server).await;
+    let first = display_of(&server, &one).await;
+    let second = display_of(&server, &other).await;
     assert_ne!(first, second);
     one.leave().await;
     other.leave().await;
@@ -174,7 +179,8 @@ async fn each_webots_gets_a_virtual_display_of_its_own() {
 #[actix_rt::test]
 async fn a_virtual_display_that_does_not_start_is_told() {
     needs!("bwrap");
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let forge = Forge::with_arm();
+    let webots = Webots::launcher();
     let without = programs(&["git", "bash", "env", "sh", "rm", "prlimit"]);
     let server = demo_server(1)
         .set("xvfb", true)

@@ -78,7 +78,8 @@ fn folders(folder: &Path) -> u64 {
 /// Starts and stops this many simulations; returns what the server used before and after. On a busy machine pools fill
 /// later, so all growth must stop within this many rounds, which a leak never does.
 pub async fn soak(starts: usize, rounds: usize) -> (Holdings, Holdings) {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let forge = Forge::with_arm();
+    let webots = Webots::launcher();
     let server = simulation_server(&webots.path(), forge.path(), AT_A_TIME as u16)
         .start()
         .await;

@@ -27,7 +27,8 @@ async fn stop(server: &Server, id: &str, body: &str) -> u16 {
 async fn a_simulation_is_stopped_in_any_state() {
     for state in &ALL[1..6] {
         let mut scene = Scene::new(state, with_password).await;
-        let (server, client) = (&scene.server, scene.client.as_mut().unwrap());
+        let server = &scene.server;
+        let client = scene.client.as_mut().unwrap();
         let id = client.id().to_owned();
         assert_eq!(
             stop(server, &id, r#"{"reason": "<b>Back to work"}"#).await,

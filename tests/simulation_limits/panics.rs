@@ -68,10 +68,8 @@ pub async fn a_client_leaves_nothing_in_any_state() {
     for stage in std::iter::once(None).chain(stages.map(Some)) {
         let inside = Inside::new(stage.unwrap_or(Stage::Idle), |_| ()).await;
         let (sender, mut clients) = unbounded_channel::<Addr<WebClient>>();
-        let (server, socket) = (
-            web::Data::from(Arc::clone(&inside.server)),
-            TcpListener::bind("127.0.0.1:0").unwrap(),
-        );
+        let server = web::Data::from(Arc::clone(&inside.server));
+        let socket = TcpListener::bind("127.0.0.1:0").unwrap();
         let port = socket.local_addr().unwrap().port();
         let app = move || {
             App::new()

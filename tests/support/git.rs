@@ -79,7 +79,8 @@ impl Forge {
 
     /// A checkout of a branch, to change before [`Forge::commit_work_tree`].
     pub fn work_tree(&self, repository: &str, branch: &str) -> PathBuf {
-        let (bare, work) = (self.bare(repository), self.folder.path().join(".work").join(repository));
+        let bare = self.bare(repository);
+        let work = self.folder.path().join(".work").join(repository);
         if !work.exists() {
             git(
                 self.folder.path(),

@@ -49,7 +49,8 @@ where
 {
     std::thread::spawn(move || {
         for connection in listener.incoming().flatten() {
-            let (certificate, answer) = (certificate.clone(), answer.clone());
+            let certificate = certificate.clone();
+            let answer = answer.clone();
             std::thread::spawn(move || match certificate {
                 None => exchange(&mut &connection, &answer),
                 Some(certificate) => {

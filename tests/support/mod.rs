@@ -94,7 +94,8 @@ pub fn shared_library(source: &str, name: &str) -> tempfile::TempDir {
 
 /// A folder with links to these programs only, for PATH.
 pub fn programs(names: &[&str]) -> tempfile::TempDir {
-    let (folder, paths) = (open_folder(), std::env::var_os("PATH").unwrap());
+    let folder = open_folder();
+    let paths = std::env::var_os("PATH").unwrap();
     for name in names {
         let real = std::env::split_paths(&paths)
             .map(|folder| folder.join(name))

@@ -17,7 +17,8 @@ pub fn section(page: &str, heading: &str) -> String {
 
 /// The code blocks of a page in this language, without the indentation of a surrounding list.
 pub fn blocks(page: &str, language: &str) -> Vec<String> {
-    let (mut blocks, mut inside) = (Vec::new(), None);
+    let mut blocks = Vec::new();
+    let mut inside = None;
     for line in page.lines() {
         let text = line.trim_start();
         inside = match (inside, text.strip_prefix("```")) {

@@ -34,7 +34,8 @@ impl Receiver {
             posted: Arc::default(),
             answer: Arc::new(Mutex::new("200 OK".to_owned())),
         };
-        let (posted, answer) = (Arc::clone(&receiver.posted), Arc::clone(&receiver.answer));
+        let posted = Arc::clone(&receiver.posted);
+        let answer = Arc::clone(&receiver.answer);
         serve(listener, certificate.map(Certificate::server), move |request| {
             assert_eq!(request.header("content-type"), "application/json");
             let line = request.head.lines().next().unwrap().to_owned();

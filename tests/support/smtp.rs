@@ -30,7 +30,8 @@ impl Smtp {
             .spawn()
             .expect("the SMTP server starts");
         let (sender, events) = unbounded_channel();
-        let (output, errors) = (child.stdout.take().unwrap(), child.stderr.take().unwrap());
+        let output = child.stdout.take().unwrap();
+        let errors = child.stderr.take().unwrap();
         tell_lines(output, sender.clone(), |line| serde_json::from_str(&line).unwrap());
         tell_lines(errors, sender, |line| json!({"stderr": line}));
         let mut server = Self {

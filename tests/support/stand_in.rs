@@ -59,10 +59,8 @@ impl StandIn {
 
     /// Starts a stand-in that is reachable only over TLS, with this certificate for `localhost`.
     pub async fn start_behind_tls(script: Script, certificate: &Certificate) -> Self {
-        let (listener, door) = (
-            TcpListener::bind("127.0.0.1:0").await.unwrap(),
-            TcpListener::bind("127.0.0.1:0").await.unwrap(),
-        );
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let door = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = format!("localhost:{}", door.local_addr().unwrap().port());
         let behind = listener.local_addr().unwrap();
         let acceptor = TlsAcceptor::from(certificate.server());

@@ -21,7 +21,8 @@ impl Wrapper {
             .map(|folder| folder.join(program))
             .find(|path| path.is_file())
             .unwrap();
-        let (real, log) = (real.display(), folder.path().join("calls"));
+        let real = real.display();
+        let log = folder.path().join("calls");
         let note = format!("REAL={real}\necho \"$*\" >> {}", log.display());
         make_program(
             &folder.path().join(program),

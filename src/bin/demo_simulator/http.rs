@@ -29,7 +29,8 @@ pub(crate) async fn serve(listener: TcpListener, simulation: Addr<Simulation>, p
             tokio::task::yield_now().await;
             continue;
         };
-        let (simulation, project) = (simulation.clone(), Rc::clone(&project));
+        let simulation = simulation.clone();
+        let project = Rc::clone(&project);
         actix_web::rt::spawn(async move {
             // The peer is gone.
             connect(stream, simulation, &project).await.ok();

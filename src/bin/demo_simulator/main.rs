@@ -60,6 +60,7 @@ fn main() {
 /// What `--sysinfo` prints: system, processor and cores.
 fn system_info() -> String {
     let cores = thread::available_parallelism().map_or(1, std::num::NonZero::get);
-    let (system, processor) = (env::consts::OS, env::consts::ARCH);
+    let system = env::consts::OS;
+    let processor = env::consts::ARCH;
     format!("System: {system}\nProcessor: {processor}\nNumber of cores: {cores}\nOpenGL: none (demo simulator)")
 }

@@ -263,7 +263,9 @@ impl<'class> Browser<'class> {
 
     /// Reads all messages and measures the pace, until the simulation ends. Returns why it ended.
     async fn look_on(&mut self, running: &mut Running) -> String {
-        let (mut since, mut first, mut last) = (Instant::now(), None, None);
+        let mut since = Instant::now();
+        let mut first = None;
+        let mut last = None;
         let mut period = actix_rt::time::interval(PACE_PERIOD);
         loop {
             tokio::select! {

@@ -198,7 +198,8 @@ impl StepLog {
 
     async fn see_the_scene(&mut self, arguments: &Arguments, stream: &mut Connection) -> Result<(), StepError> {
         let expected = "`world:`, `model:`, `application/json:`, `scene load completed`, the state, in this order";
-        let (mut order, mut model) = (Vec::new(), String::new());
+        let mut order = Vec::new();
+        let mut model = String::new();
         let deadline = limit(SCENE, arguments);
         let mut ended = stream.say(&arguments.viewer).await.err();
         let is_state = |text: &str| text.starts_with("pause:") || text == "real-time" || text == "fast";
@@ -246,7 +247,8 @@ impl StepLog {
     ) -> Result<(), StepError> {
         let deadline = limit(ANSWER, arguments);
         let mut came = stream.say(command).await.map(|()| String::new());
-        let (mut others, mut updates) = (Vec::new(), 0);
+        let mut others = Vec::new();
+        let mut updates = 0;
         while came.as_ref().is_ok_and(|text| text != answer) {
             came = stream.receive_by(deadline).await.and_then(unless_error);
             match &came {
@@ -309,7 +311,8 @@ impl StepLog {
         // The arrival time of buffered texts is unknown.
         let buffered = Deadline::within(BUFFERED);
         while lease.receive_by(buffered).await.is_ok() {}
-        let (began, deadline) = (Instant::now(), limit(HEARTBEAT, arguments));
+        let began = Instant::now();
+        let deadline = limit(HEARTBEAT, arguments);
         let mut last = lease.receive_by(deadline).await;
         while last.as_ref().is_ok_and(|text| text != ".") {
             last = lease.receive_by(deadline).await;

@@ -374,10 +374,8 @@ mod tests {
 
     #[test]
     fn the_most_frequent_reason_is_told() {
-        let (full, killed) = (
-            Outcome::Refused("full".to_owned()),
-            Outcome::BrokeOff("Webots was killed.".to_owned()),
-        );
+        let full = Outcome::Refused("full".to_owned());
+        let killed = Outcome::BrokeOff("Webots was killed.".to_owned());
         let all = |outcomes: &[&Outcome]| {
             let visits = (0..)
                 .zip(outcomes)

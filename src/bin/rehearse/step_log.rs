@@ -19,7 +19,8 @@ pub(crate) struct StepLog {
 impl StepLog {
     /// Begins now, and prints the heading of the table.
     pub(crate) fn begin(arguments: &Arguments) -> Self {
-        let (name, version) = (env!("CARGO_PKG_NAME"), env!("CARGO_PKG_VERSION"));
+        let name = env!("CARGO_PKG_NAME");
+        let version = env!("CARGO_PKG_VERSION");
         print(&format!("`rehearse {} --explain`, {name} {version}", arguments.fleet));
         print(&format!("World: {}\n", arguments.world));
         print("| step | at | took | expected | came | |\n|---|---|---|---|---|---|");
@@ -34,7 +35,8 @@ impl StepLog {
 
     /// Prints the result of a step, and begins the next.
     pub(crate) fn note(&mut self, name: &'static str, expected: &'static str, came: &str, agrees: bool) {
-        let (at, took) = (self.began.elapsed().as_secs_f64(), self.last.elapsed().as_secs_f64());
+        let at = self.began.elapsed().as_secs_f64();
+        let took = self.last.elapsed().as_secs_f64();
         self.last = Instant::now();
         self.steps += 1;
         if !agrees {

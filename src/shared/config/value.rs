@@ -152,7 +152,8 @@ fn between<'de, D: Deserializer<'de>>(
 ) -> Result<f64, D::Error> {
     let value = Value::deserialize(deserializer)?;
     let number = value.as_f64().filter(|number| range.contains(number));
-    let (least, most) = (range.start(), range.end());
+    let least = range.start();
+    let most = range.end();
     number.ok_or_else(|| not_allowed(&value, format_args!("a number of {unit} from {least} to {most}")))
 }
 

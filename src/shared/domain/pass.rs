@@ -69,13 +69,11 @@ mod tests {
 
     #[test]
     fn a_pass_is_valid_for_its_key_and_world() {
-        let (key, pass) = (
-            FleetKey::new("a secret of a fleet"),
-            Pass {
-                server: ServerRun(7),
-                reservation: ReservationId(u64::MAX),
-            },
-        );
+        let key = FleetKey::new("a secret of a fleet");
+        let pass = Pass {
+            server: ServerRun(7),
+            reservation: ReservationId(u64::MAX),
+        };
         let text = pass.write(&key, &world("a"));
         assert_eq!(Pass::read(&text, &key, &world("a")), Some(pass));
         assert_eq!(Pass::read(&text, &key, &world("b")), None);

@@ -89,7 +89,9 @@ where
     let stops = server.graceful_shutdown_signal();
     let server = server.listen("http", port, move || {
         let app = app().into_factory().map_err(|error| error.into().error_response());
-        let (connections, options, stops) = (connections.clone(), options.clone(), stops.clone());
+        let connections = connections.clone();
+        let options = options.clone();
+        let stops = stops.clone();
         let http = HttpService::build()
             // When the server stops, idle connections end at once.
             .graceful_shutdown_signal(move || {

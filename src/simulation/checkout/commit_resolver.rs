@@ -70,7 +70,8 @@ impl CommitResolver {
         world: &ProjectUrl,
         progress: OnProgress<'_>,
     ) -> Result<Arc<ResolvedCommit>, CheckoutError> {
-        let (this, wanted) = (Arc::clone(self), world.clone());
+        let this = Arc::clone(self);
+        let wanted = world.clone();
         let search = |sender| async move { this.search(&wanted, &sender).await.map(Arc::new) };
         self.searches.join(world.clone(), progress, search).await
     }

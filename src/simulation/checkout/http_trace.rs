@@ -69,7 +69,8 @@ mod tests {
     #[test]
     fn the_last_answer_counts() {
         let answer = |text| format!("06:13:23.194170 http.c:913              <= Recv header: {text}");
-        let (unauthorized, moved) = (answer("HTTP/1.1 401 Unauthorized"), answer("HTTP/2 301"));
+        let unauthorized = answer("HTTP/1.1 401 Unauthorized");
+        let moved = answer("HTTP/2 301");
         let location = answer("location: https://a/b");
         assert_eq!(read(&[ASK, &unauthorized]), (Some(401), None));
         assert_eq!(

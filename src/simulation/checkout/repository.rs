@@ -146,7 +146,8 @@ impl Repository {
         arguments: Vec<String>,
         progress: OnProgress<'_>,
     ) -> Result<(), CheckoutError> {
-        let (this, key) = (Arc::clone(self), arguments.clone());
+        let this = Arc::clone(self);
+        let key = arguments.clone();
         let fetch = |sender: watch::Sender<String>| async move {
             let guard = if let Ok(guard) = Arc::clone(&this.lock).try_lock_owned() {
                 guard

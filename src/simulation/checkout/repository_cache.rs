@@ -99,7 +99,8 @@ impl RepositoryCache {
             in_use.retain(|_, repository| repository.strong_count() > 0);
             let known = in_use.get(&path).and_then(Weak::upgrade);
             let repository = known.unwrap_or_else(|| {
-                let (git, growth) = (Arc::clone(&self.git), Arc::clone(&self.growth));
+                let git = Arc::clone(&self.git);
+                let growth = Arc::clone(&self.growth);
                 Arc::new(Repository::new(path.clone(), remote.clone(), git, growth))
             });
             in_use.insert(path.clone(), Arc::downgrade(&repository));

@@ -31,7 +31,8 @@ pub fn checkout_command(
     (scratch, into): (&Path, &Path),
     settings: &[String],
 ) -> io::Result<Run> {
-    let (list, reference) = (scratch.join("paths"), OsString::from(revision.reference()));
+    let list = scratch.join("paths");
+    let reference = OsString::from(revision.reference());
     std::fs::write(&list, paths)?;
     let words = [
         "checkout",

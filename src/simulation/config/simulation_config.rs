@@ -234,7 +234,8 @@ impl Configuration for SimulationConfig {
             self.isolation = IsolationSetting::Container;
         }
         self.docker = self.isolation == IsolationSetting::Container;
-        let (places, editors) = (self.max_connections, if self.docker { EDITOR_PORT } else { 0 });
+        let places = self.max_connections;
+        let editors = if self.docker { EDITOR_PORT } else { 0 };
         let last = u32::from(self.port) + u32::from(places) + u32::from(editors);
         require(
             u16::try_from(last).is_ok() && (!self.docker || places <= EDITOR_PORT),

@@ -103,7 +103,9 @@ impl ComposeProject {
 
     /// The services. An editor mounts only its directory of the project; a controller also the exchange with Webots.
     fn services(&self, paths: &ProjectPaths) -> BTreeMap<&'static str, Service> {
-        let (config, port, access) = (&self.config, self.request.port, GpuAccess::find());
+        let config = &self.config;
+        let port = self.request.port;
+        let access = GpuAccess::find();
         let mount = |folder: &Path, to: &str| format!("{}:{to}", folder.display());
         let published = |outside: u16, to: u16| json!([format!("{}:{outside}:{to}", config.bind_of_containers())]);
         // Webots up to R2023a uses the first path; later versions create directories per user and port in the second.
@@ -185,7 +187,8 @@ fn protected(
     mut volumes: Vec<String>,
     environment: &[(&'static str, String)],
 ) -> Service {
-    let (settings, limits) = (&config.container, &config.limits);
+    let settings = &config.container;
+    let limits = &config.limits;
     let memory = format!("{}m", limits.memory.unwrap_or(DEFAULT_MEMORY));
     // Programs have to write there.
     let in_memory = [("/tmp", limits.disk), ("/var/tmp", limits.disk), ("/run", 16)]

@@ -81,7 +81,8 @@ impl ContainerService {
         request: ContainerRequest,
         progress: OnProgress<'_>,
     ) -> Result<SimulationContainers, Failure> {
-        let (project, address) = (&request.project, request.address);
+        let project = &request.project;
+        let address = request.address;
         let docker = &self.docker;
         let folder = project.folder.clone();
         let owner = self.images.owner.clone();

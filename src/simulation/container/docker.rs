@@ -139,7 +139,8 @@ impl Docker {
 }
 
 async fn finish(run: Run, mut on_line: impl FnMut(&str)) -> Result<String, DockerError> {
-    let (name, mut reason) = (name_of(&run.spec.command), String::new());
+    let name = name_of(&run.spec.command);
+    let mut reason = String::new();
     let line = |line: String| {
         on_line(&line);
         note(&mut reason, &line);
@@ -154,7 +155,8 @@ async fn finish(run: Run, mut on_line: impl FnMut(&str)) -> Result<String, Docke
 /// When it fails or takes longer than the limit.
 pub fn blocking(arguments: &[&str], limit: Duration) -> Result<String, DockerError> {
     let command: Vec<OsString> = ["docker"].iter().chain(arguments).map(OsString::from).collect();
-    let (name, mut reason) = (name_of(&command), String::new());
+    let name = name_of(&command);
+    let mut reason = String::new();
     let ran = Run::new(command, Path::new("/"), limit).blocking(|line| note(&mut reason, &line));
     result(name, ran, reason)
 }

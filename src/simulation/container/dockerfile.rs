@@ -45,7 +45,8 @@ impl Dockerfile {
             text: String::new(),
             bases: Vec::new(),
         };
-        let (mut instruction, mut first) = (String::new(), 1);
+        let mut instruction = String::new();
+        let mut first = 1;
         for (number, line) in (1..).zip(text.trim_start_matches('\u{feff}').lines()) {
             found.text.push_str(line);
             found.text.push('\n');

@@ -76,7 +76,8 @@ impl Images {
         address: Option<IpAddr>,
         progress: OnProgress<'_>,
     ) -> Result<String, Failure> {
-        let (this, name) = (Arc::clone(self), image.to_owned());
+        let this = Arc::clone(self);
+        let name = image.to_owned();
         let pull = move |sender: watch::Sender<String>| async move {
             let _builder = this.builder(address, &sender).await?;
             let on_line = |line: &str| drop(sender.send(format!("Step 1/{STEPS} : fetching {name}: {line}")));
@@ -125,7 +126,9 @@ impl Images {
             });
         }
         let name = format!("webots-fleet/{}:{}", self.owner.0, digest(parts.join("\0").as_bytes()));
-        let (this, project, tag) = (Arc::clone(self), Arc::clone(project), name.clone());
+        let this = Arc::clone(self);
+        let project = Arc::clone(project);
+        let tag = name.clone();
         let job = move |sender: watch::Sender<String>| async move {
             // A build without steps of a project takes seconds, and is as large as the image of Webots.
             if build.folder.is_none() {

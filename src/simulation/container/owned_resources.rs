@@ -140,10 +140,8 @@ mod tests {
 
     #[test]
     fn the_names_of_projects_tell_whose_they_are_and_suit_compose() {
-        let (ours, theirs) = (
-            ResourceOwner::of(Path::new("/var/cache/a")),
-            ResourceOwner::of(Path::new("/var/cache/b")),
-        );
+        let ours = ResourceOwner::of(Path::new("/var/cache/a"));
+        let theirs = ResourceOwner::of(Path::new("/var/cache/b"));
         let name = ours.project(2001);
         assert!(
             name.starts_with(&ours.prefix()) && !name.starts_with(&theirs.prefix()),

@@ -295,7 +295,8 @@ mod tests {
     #[test]
     fn only_a_regular_file_of_the_project_is_read() {
         let folder = tempfile::tempdir().unwrap();
-        let (project, outside) = (folder.path().join("project"), folder.path().join("outside"));
+        let project = folder.path().join("project");
+        let outside = folder.path().join("outside");
         std::fs::create_dir(&project).unwrap();
         std::fs::write(&outside, "type: secret").unwrap();
         let told = || WebotsYml::read(&project);

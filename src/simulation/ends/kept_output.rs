@@ -36,7 +36,8 @@ pub fn output_file(logs: &Path, id: &str) -> Option<PathBuf> {
 /// When the file can't be written.
 pub(super) fn keep(logs: &Path, ended: &Ended) -> io::Result<()> {
     let name = format!("{}.log", ended.simulation.id);
-    let (log, kept) = (logs.join(FOLDER_OF_RUNNING).join(&name), logs.join(ENDED).join(&name));
+    let log = logs.join(FOLDER_OF_RUNNING).join(&name);
+    let kept = logs.join(ENDED).join(&name);
     fs::remove_file(log.with_extension("log.1")).ok();
     if !ended.has_output() {
         return Ok(());

@@ -115,7 +115,8 @@ impl Table {
     /// Ends the simulation that has grown most, if by at least `least` bytes. Returns false if none has: then another
     /// program fills the disk.
     fn end_grown_most(&mut self, least: u64) -> bool {
-        let (until, lost) = (Instant::now() + COUNTS_AT_RESERVE, self.disk.lost);
+        let until = Instant::now() + COUNTS_AT_RESERVE;
+        let lost = self.disk.lost;
         // The oldest counts are renewed first.
         self.all.sort_by_key(|one| one.counted);
         for one in &mut self.all {
@@ -138,7 +139,8 @@ impl Table {
 
     /// Counts what simulations have written, in a tick that began at this CPU time of the thread.
     fn count_folders(&mut self, begin: Duration) {
-        let (lost, time) = (self.disk.lost, self.disk.pause().min(COUNT));
+        let lost = self.disk.lost;
+        let time = self.disk.pause().min(COUNT);
         let mut due: Vec<&mut DiskUse> = self.all.iter_mut().filter(|one| one.is_due(lost)).collect();
         due.sort_by_key(|one| one.counted);
         for one in due {

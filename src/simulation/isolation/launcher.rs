@@ -158,7 +158,8 @@ impl Launcher {
                     .to_owned(),
             );
         }
-        let (controllers, limits) = (&self.controllers, &self.limits);
+        let controllers = &self.controllers;
+        let limits = &self.limits;
         for (key, controller, is_set) in [
             ("limits.memory", "memory", limits.memory.is_some()),
             ("limits.cores", "cpu", limits.cores.is_some()),

@@ -149,7 +149,8 @@ impl OwnNetwork {
             std::fs::write(instance.join(OWN_RESOLV_CONF), text)?;
         }
         command.extend(["--", "/bin/sh", "-c"].map(Into::into));
-        let (mut loader, mut rules) = (Path::new("sh"), PathBuf::new());
+        let mut loader = Path::new("sh");
+        let mut rules = PathBuf::new();
         if let Some(nft) = &self.nft {
             (loader, rules) = (nft, instance.join("network.nft"));
             std::fs::write(&rules, self.rules())?;

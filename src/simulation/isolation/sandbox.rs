@@ -157,7 +157,8 @@ impl Sandbox {
         }
         if self.network.is_some() {
             // In pasta's namespace the user is root.
-            let (user, group) = (nix::unistd::getuid().to_string(), nix::unistd::getgid().to_string());
+            let user = nix::unistd::getuid().to_string();
+            let group = nix::unistd::getgid().to_string();
             command.extend(["--uid".into(), user.into(), "--gid".into(), group.into()]);
         }
         command.extend(

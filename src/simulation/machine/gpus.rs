@@ -40,7 +40,8 @@ pub(super) fn follow() -> std::io::Result<watch::Receiver<Option<GpuReading>>> {
 }
 
 fn read(sender: &watch::Sender<Option<GpuReading>>) {
-    let (mut known, mut told) = (0, false);
+    let mut known = 0;
+    let mut told = false;
     while !sender.is_closed() {
         let opened = Instant::now();
         match Nvml::builder().lib_path(OsStr::new(LIBRARY)).init() {

@@ -135,7 +135,8 @@ impl LoadMonitor {
         csv: Option<PathBuf>,
         spread: Arc<Spread>,
     ) -> Result<(Self, watch::Receiver<Arc<Readings>>), AppError> {
-        let (sensor, gpus) = (MachineSensor::open(disk)?, gpus::follow()?);
+        let sensor = MachineSensor::open(disk)?;
+        let gpus = gpus::follow()?;
         let (published, readings) = watch::channel(Arc::new(Readings {
             host: sensor.host(),
             ..Readings::default()

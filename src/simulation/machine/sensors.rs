@@ -145,7 +145,8 @@ impl MachineSensor {
                 .filter_map(|one| Some(bytes(one).saturating_sub(bytes(before.get(&one.name)?))))
                 .sum()
         };
-        let (sent, received) = (passed(|one| one.sent_bytes), passed(|one| one.recv_bytes));
+        let sent = passed(|one| one.sent_bytes);
+        let received = passed(|one| one.recv_bytes);
         Machine {
             cpu: f64::from(self.system.global_cpu_usage()),
             memory: percent(self.system.used_memory(), self.system.total_memory()),

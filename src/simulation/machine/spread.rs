@@ -119,7 +119,8 @@ mod tests {
     #[test]
     fn equal_gpus_take_turns_however_slowly_simulations_start() {
         let mut now = Instant::now();
-        let (spread, four) = (Spread::default(), gpus(&[0.0; 4]));
+        let spread = Spread::default();
+        let four = gpus(&[0.0; 4]);
         let mut counts = [0; 4];
         for index in taken(&spread, &four, 30, now) {
             counts[index as usize] += 1;

@@ -82,7 +82,9 @@ fn all_by_parent() -> HashMap<i32, Vec<Stat>> {
 
 /// The usage of a process, its group and all its descendants.
 fn tree_sum(root: i32, below: &HashMap<i32, Vec<Stat>>) -> Usage {
-    let (mut seen, mut open, mut sum) = (HashSet::new(), vec![root], Usage::default());
+    let mut seen = HashSet::new();
+    let mut open = vec![root];
+    let mut sum = Usage::default();
     while let Some(pid) = open.pop() {
         for stat in below
             .get(&pid)

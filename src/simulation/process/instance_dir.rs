@@ -179,7 +179,8 @@ mod tests {
     #[test]
     fn links_are_removed_and_not_followed() {
         let place = tempfile::tempdir().unwrap();
-        let (folder, other) = (place.path().join("folder"), place.path().join("other"));
+        let folder = place.path().join("folder");
+        let other = place.path().join("other");
         std::fs::create_dir_all(folder.join("inside")).unwrap();
         std::fs::create_dir(&other).unwrap();
         std::fs::write(other.join("kept"), "").unwrap();

@@ -44,7 +44,8 @@ mod tests {
             bytes in prop::collection::vec(prop_oneof![3 => any::<u8>(), 1 => Just(b'\n'), 1 => Just(0x1b)], 0..4000),
             size in 1_usize..64,
         ) {
-            let (mut lines, mut told) = (Lines::default(), Vec::new());
+            let mut lines = Lines::default();
+            let mut told = Vec::new();
             bytes.chunks(size).for_each(|chunk| lines.feed(chunk, |line| told.push(line)));
             lines.end(|line| told.push(line));
             for line in &told {
@@ -60,7 +61,8 @@ mod tests {
         let long = "x".repeat(LONGEST);
         let text = format!("Step 1/2 : FROM a\r\n\x1b[31mred\n\n10%\r20%\n{long} and more\nlast");
         for size in 1..text.len() {
-            let (mut lines, mut told) = (Lines::default(), Vec::new());
+            let mut lines = Lines::default();
+            let mut told = Vec::new();
             text.as_bytes()
                 .chunks(size)
                 .for_each(|chunk| lines.feed(chunk, |line| told.push(line)));

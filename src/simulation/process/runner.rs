@@ -189,7 +189,8 @@ fn bound(leader: i32, limits: &[(Resource, u64)], niceness: i32) {
 
 /// Passes on each line, made printable; also lines that the program overwrites.
 async fn tell(mut said: impl AsyncRead + Unpin, mut told: impl FnMut(String)) {
-    let (mut lines, mut chunk) = (Lines::default(), vec![0; CHUNK.0]);
+    let mut lines = Lines::default();
+    let mut chunk = vec![0; CHUNK.0];
     while let Ok(length @ 1..) = said.read(&mut chunk).await {
         let mut pauses = u32::from(length == CHUNK.0) * LINES;
         lines.feed(chunk.get(..length).unwrap_or_default(), |line| {

@@ -59,7 +59,8 @@ async fn stop(
         Ok(order) => order,
         Err(refusal) => return Ok(refusal),
     };
-    let (id, reason) = (id.into_inner(), excerpt(reason.trim(), MAX_REASON_LENGTH));
+    let id = id.into_inner();
+    let reason = excerpt(reason.trim(), MAX_REASON_LENGTH);
     if !server.slots.stop(&id, protocol::stopped_by_teacher(&reason)) {
         return Err(ErrorNotFound("Error: there is no such simulation; it may have ended."));
     }

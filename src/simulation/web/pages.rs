@@ -101,7 +101,9 @@ pub fn view(
         })
     });
     let ends = ends.collect::<Result<Vec<TableRow>, askama::Error>>()?;
-    let (instances, load, problem) = (snapshot.instances, server.load().percent(), server.problem());
+    let instances = snapshot.instances;
+    let load = server.load().percent();
+    let problem = server.problem();
     let glance = Glance {
         server,
         readings: &readings,
@@ -110,10 +112,8 @@ pub fn view(
         problem,
     }
     .render()?;
-    let (parts, tables) = (
-        [("glance", glance)].into(),
-        [("simulations", rows), ("ends", ends)].into(),
-    );
+    let parts = [("glance", glance)].into();
+    let tables = [("simulations", rows), ("ends", ends)].into();
     Ok(PageView {
         parts,
         tables,
@@ -142,7 +142,8 @@ impl Monitor<'_> {
 
     /// What worlds' programs can do because isolation is incomplete, and why it is.
     fn shortcoming(&self) -> Option<(&'static str, &str)> {
-        let (launcher, containers) = (&self.server.launcher, self.server.containers.as_ref());
+        let launcher = &self.server.launcher;
+        let containers = self.server.containers.as_ref();
         let of_level = launcher
             .shortcoming
             .as_deref()

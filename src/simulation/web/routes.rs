@@ -35,7 +35,8 @@ async fn client(
     stream: web::Payload,
     server: web::Data<AppState>,
 ) -> actix_web::Result<HttpResponse> {
-    let (config, proxies) = (&server.config, &server.config.trusted_proxies);
+    let config = &server.config;
+    let proxies = &server.config.trusted_proxies;
     check_origin(&request, &config.allowed_origins)?;
     let peer = proxies.peer(&request);
     let permit = server.connections.admit(ConnectionKind::Client, peer)?;

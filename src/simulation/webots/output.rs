@@ -104,7 +104,8 @@ pub fn follow(
                 kept.push(line);
             }
         };
-        let (mut lines, mut chunk) = (Lines::default(), vec![0; CHUNK]);
+        let mut lines = Lines::default();
+        let mut chunk = vec![0; CHUNK];
         while let Ok(length @ 1..) = output.read(&mut chunk) {
             let mut cost = STEP + u64::try_from(length).unwrap_or_default();
             lines.feed(chunk.get(..length).unwrap_or_default(), |line| {
