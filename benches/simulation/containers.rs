@@ -26,7 +26,10 @@ pub async fn measure(verdict: &mut Verdict, sizes: &[u16], rounds: usize) {
     let most = *sizes.iter().max().unwrap();
     let server = daemon::server(most)
         .set("maxPlacesPerAddress", most)
-        .set("timing", serde_json::json!({ "launch": 300, "silence": 600 }))
+        .set(
+            "timing",
+            serde_json::json!({ "launch": 300, "silence": 600, "arrival": 0 }),
+        )
         .start()
         .await;
     let mut first = Client::start(&server, &arm()).await;

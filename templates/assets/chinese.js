@@ -178,6 +178,7 @@ export const words = {
     'server-fault': '服务器发生错误。',
     left: '您已离开仿真。',
     away: '您离开的时间过长：仿真已结束。',
+    'no-viewer': '没有人及时打开仿真的三维视图。',
     'taken-over': '仿真现在显示在别处。',
     finished: 'Webots 已自行退出。',
     'time-limit': '仿真的时间已用完。',

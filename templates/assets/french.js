@@ -184,6 +184,7 @@ export const words = {
     'server-fault': 'Une erreur s’est produite sur le serveur.',
     left: 'Vous avez quitté la simulation.',
     away: 'Vous êtes parti trop longtemps : la simulation est terminée.',
+    'no-viewer': 'Personne n’a ouvert la vue 3D de la simulation à temps.',
     'taken-over': 'La simulation est maintenant affichée ailleurs.',
     finished: 'Webots s’est terminé.',
     'time-limit': 'Le temps de la simulation est écoulé.',

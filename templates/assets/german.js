@@ -185,6 +185,7 @@ export const words = {
     'server-fault': 'Auf dem Server ist ein Fehler aufgetreten.',
     left: 'Du hast die Simulation verlassen.',
     away: 'Du warst zu lange weg: Die Simulation ist beendet.',
+    'no-viewer': 'Niemand hat die 3D-Ansicht der Simulation rechtzeitig geöffnet.',
     'taken-over': 'Die Simulation wird jetzt anderswo gezeigt.',
     finished: 'Webots hat sich beendet.',
     'time-limit': 'Die Zeit der Simulation ist um.',

@@ -46,6 +46,7 @@ export const ADVICE = {
   'server-fault': 'administrator',
   left: 'again',
   away: 'again',
+  'no-viewer': 'again',
   'taken-over': 'takenOver',
   finished: 'again',
   'time-limit': 'again',

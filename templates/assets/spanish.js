@@ -184,6 +184,7 @@ export const words = {
     'server-fault': 'Se ha producido un error en el servidor.',
     left: 'Has salido de la simulación.',
     away: 'Estuviste fuera demasiado tiempo: la simulación ha terminado.',
+    'no-viewer': 'Nadie abrió a tiempo la vista 3D de la simulación.',
     'taken-over': 'La simulación se muestra ahora en otro sitio.',
     finished: 'Webots ha terminado.',
     'time-limit': 'El tiempo de la simulación se ha agotado.',

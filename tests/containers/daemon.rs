@@ -244,7 +244,10 @@ pub fn server(places: u16) -> Builder {
         .set("isolation", "container")
         .set("webots", serde_json::Value::Null)
         // A test's client reads nothing, not even pings, while the test waits for the image of another simulation.
-        .set("timing", serde_json::json!({ "heartbeat": 0.5, "silence": 300 }))
+        .set(
+            "timing",
+            serde_json::json!({ "heartbeat": 0.5, "silence": 300, "arrival": 0 }),
+        )
         .env("DOCKER_HOST", &host())
         .env("DOCKER_CONFIG", &daemon().folder.display().to_string())
 }

@@ -120,7 +120,7 @@ async fn a_container_has_no_more_than_it_needs() {
     let limits = json!({ "memory": 300, "cores": 1, "processes": 77, "openFiles": 2048 });
     let server = server(1)
         .set("limits", limits)
-        .set("timing", json!({ "heartbeat": 600, "launch": 90 }));
+        .set("timing", json!({ "heartbeat": 600, "launch": 90, "arrival": 0 }));
     let (server, _client) = running(server).await;
     let about: Value = serde_json::from_str(&ask(&["inspect", &of_service(&server, "webots")[0]])).unwrap();
     let host = &about[0]["HostConfig"];

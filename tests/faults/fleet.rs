@@ -92,7 +92,9 @@ impl Site {
 
     /// A simulation server.
     pub fn server(&self, index: usize) -> Builder {
-        let timing = json!({"grace": 1, "heartbeat": 0.5, "ping": 2, "silence": 6, "launch": 20, "checkout": 40});
+        let timing = json!({
+            "grace": 1, "heartbeat": 0.5, "ping": 2, "silence": 6, "launch": 20, "checkout": 40, "arrival": 0,
+        });
         let builder = simulation_server(&self.webots.path(), self.forge.path(), PLACES).set("timing", timing);
         std::fs::create_dir_all(self.folder(index)).unwrap();
         // The small disk has less room than the default reserve.

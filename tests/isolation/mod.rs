@@ -1,7 +1,7 @@
 //! What a world's program may do at each level of isolation.
 
 mod assets;
-mod deeds;
+pub mod deeds;
 mod display;
 mod level;
 mod limits;

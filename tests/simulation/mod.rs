@@ -1,5 +1,6 @@
 //! The simulation server as a black box: the built program, real git, real processes, a stand-in for Webots.
 
+mod arrival;
 mod cache;
 mod checkout;
 mod commits;

@@ -56,6 +56,8 @@ pub fn simulation_server(webots: &Path, repositories: &Path, places: u16) -> Bui
         "server": "localhost", "ssl": false, "portRewrite": false, "bind": "127.0.0.1", "port": port, "debug": true,
         "webots": webots, "maxConnections": places, "allowedRepositories": ["https://github.com/lab"],
         "gitMirrors": {"https://github.com/": format!("file:{}", repositories.display())},
+        // Most tests don't open the stream of a simulation that they keep.
+        "timing": {"arrival": 0},
         // The demo simulator may be in a home, which sandboxes hide.
         "environment": ["DEMO_SIMULATOR_BIND"], "sandbox": {"readable": [env!("CARGO_BIN_EXE_demo-simulator")]},
     });

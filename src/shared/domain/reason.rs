@@ -99,12 +99,12 @@ reasons! {
         /// The client's address or user has as many slots and waits for as many as it may.
         ShareUsed = "share-used", User, Later;
         /// The pass of a client in the line is forged, or for another world or server.
-    InvalidPass = "invalid-pass", User, Later;
-    /// The pass was used already.
-    UsedPass = "used-pass", User, Later;
-    /// The pass was not used in time (`timing.pass`).
-    ExpiredPass = "expired-pass", User, Later;
-    /// The server takes no new clients, because it is about to end.
+        InvalidPass = "invalid-pass", User, Later;
+        /// The pass was used already.
+        UsedPass = "used-pass", User, Later;
+        /// The pass was not used in time (`timing.pass`).
+        ExpiredPass = "expired-pass", User, Later;
+        /// The server takes no new clients, because it is about to end.
         Draining = "draining", Server, Elsewhere;
         /// The server can start no simulation: Webots, its display, its disk or its Docker is missing or fails.
         NotReady = "not-ready", Server, Elsewhere;
@@ -169,6 +169,8 @@ reasons! {
         Left = "left", User, Here;
         /// Its client was away for too long (`timing.absence`).
         Away = "away", User, Here;
+        /// Nobody has opened its stream in time (`timing.arrival`).
+        NoViewer = "no-viewer", User, Here;
         /// Another connection of its client has taken it over.
         TakenOver = "taken-over", User, No;
         /// Webots has ended by itself, without an error.

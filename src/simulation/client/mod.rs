@@ -1,5 +1,6 @@
 //! A web client, and the session of its simulation from the request for it to its end.
 
+mod arrival;
 mod resume;
 mod session;
 mod slot_link;

@@ -117,6 +117,7 @@ impl Handler<Resume> for Session {
             *token = token.map(Token::next);
         }
         self.show_away(None);
+        self.await_viewer_again(ctx);
         self.tell_again();
     }
 }

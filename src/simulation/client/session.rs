@@ -2,7 +2,8 @@
 //!
 //! Created by a web client that requests a simulation. Dropping it releases what it holds in its state: a position in
 //! the queue, a checkout in progress, a running Webots. It ends with its client's connection, or some time later if the
-//! client may return. `start` contains the way to a running Webots, `resume` the wait for the client.
+//! client may return. `start` contains the way to a running Webots, `resume` the wait for the client,
+//! `arrival` that for the first viewer.
 
 use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
@@ -94,6 +95,8 @@ pub(super) struct Ready {
     pub(super) launched: Launched,
     /// When Webots was started: the time limit counts from then.
     pub(super) started: Instant,
+    /// The port on which Webots listens.
+    pub(super) port: u16,
     /// The URL of Webots.
     pub(super) url: String,
     /// The last token that the client got; `None` if it can't return.
@@ -102,6 +105,15 @@ pub(super) struct Ready {
     pub(super) idle_end: Option<Instant>,
     /// Whether an administrator watches it.
     pub(super) is_watched: bool,
+    pub(super) arrival: Arrival,
+}
+
+/// The arrival of the first viewer.
+pub(super) enum Arrival {
+    /// Nobody is known to have opened the stream. This timer ends the simulation.
+    Awaited(SpawnHandle),
+    /// A viewer was there, or may come at any time.
+    Settled,
 }
 
 /// A running Webots. Dropping the handle stops it.
@@ -280,7 +292,7 @@ impl Session {
         restored.spawn(ctx);
     }
 
-    fn become_ready(&mut self, started: Instant, url: String, ctx: &mut Context<Self>) {
+    fn become_ready(&mut self, started: Instant, port: u16, url: String, ctx: &mut Context<Self>) {
         let launched = match std::mem::replace(&mut self.state, State::lost()) {
             State::Launching(launched) => launched,
             // It has ended meanwhile.
@@ -292,10 +304,12 @@ impl Session {
         self.state = State::Ready(Ready {
             launched,
             started,
+            port,
             url,
             token: self.resumable.then(register),
             idle_end: None,
             is_watched: false,
+            arrival: self.await_viewer(ctx),
         });
         self.offer();
         if self.resumable {
@@ -364,6 +378,7 @@ impl Handler<SlotEvent> for Session {
                 }
                 self.text(protocol::watched(is_watched));
             }
+            SlotEvent::Viewed => self.settle_arrival(ctx),
             SlotEvent::Stopped(why) => {
                 self.report(StopReason::Administrator);
                 self.finish(Failure::new(Reason::StoppedByAdministrator, why), ctx);
@@ -395,7 +410,7 @@ impl Handler<WebotsEvent> for Session {
             WebotsEvent::Started => self.text(protocol::shutdown_timeout(self.server.config.timeout)),
             WebotsEvent::Ready { started, port, stream } => {
                 let url = self.server.config.stream_url(port, &stream.reveal());
-                self.become_ready(started, url, ctx);
+                self.become_ready(started, port, url, ctx);
             }
             WebotsEvent::Heartbeat => self.hint(protocol::HEARTBEAT.to_owned()),
             WebotsEvent::Hanging(seconds) => self.hint(protocol::hanging(seconds)),

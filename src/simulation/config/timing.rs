@@ -36,6 +36,10 @@ pub struct Timing {
     /// Time for which a simulation waits for a disconnected client; 0: not at all. Default: 60.
     #[serde(with = "seconds_or_zero")]
     pub absence: Duration = Duration::from_mins(1),
+    /// Time in which a viewer must open the stream of a simulation that is ready, else it ends; 0: it may take any time.
+    /// Default: 60.
+    #[serde(with = "seconds_or_zero")]
+    pub arrival: Duration = Duration::from_mins(1),
     /// Time for which a slot is reserved for a client with a pass, whose turn it is in the line. Default: 10.
     #[serde(with = "seconds")]
     pub pass: Duration = Duration::from_secs(10),

@@ -11,7 +11,7 @@ use tokio_util::task::AbortOnDropHandle;
 use super::build_plan::{BuildPlan, ImageBuild, PROJECT_PATH, participant_folder};
 use super::built_image::export;
 use super::compose_project::{ComposeProject, ContainerRequest};
-use super::docker::{Docker, daemon_fault};
+use super::docker::{Docker, SHORT_TIMEOUT, daemon_fault};
 use super::failures::{of_project, on_thread, refused_by_docker};
 use super::image::Images;
 use super::network;
@@ -159,6 +159,22 @@ impl ContainerService {
             warnings: yml.warnings,
             restart: None,
         })
+    }
+
+    /// The root processes of the running containers of the simulation on this port; none if Docker does not tell.
+    pub async fn processes_of(&self, port: u16) -> Vec<i32> {
+        let name = format!("name=^{}", self.run.prefix_of(port));
+        let Ok(ids) = self
+            .docker
+            .run(&["ps", "--quiet", "--filter", &name], SHORT_TIMEOUT)
+            .await
+        else {
+            return Vec::new();
+        };
+        let inspect = ["inspect", "--format", "{{.State.Pid}}"];
+        let words: Vec<&str> = inspect.into_iter().chain(ids.split_whitespace()).collect();
+        let pids = self.docker.run(&words, SHORT_TIMEOUT).await.unwrap_or_default();
+        pids.split_whitespace().filter_map(|pid| pid.parse().ok()).collect()
     }
 }
 

@@ -52,7 +52,12 @@ impl ResourceOwner {
 
     /// A new name for the compose project of a simulation on this port.
     pub fn project(&self, port: u16) -> String {
-        format!("{}{port}-{:08x}", self.prefix(), rand::random::<u32>())
+        format!("{}{:08x}", self.prefix_of(port), rand::random::<u32>())
+    }
+
+    /// The beginning of the names of the compose projects of simulations on this port.
+    pub fn prefix_of(&self, port: u16) -> String {
+        format!("{}{port}-", self.prefix())
     }
 
     /// The port of the simulation with this container; `None` if it has another owner.

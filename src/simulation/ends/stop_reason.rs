@@ -11,6 +11,8 @@ pub enum StopReason {
     Away,
     /// Its client is away, as are others of its address, and others wait for a slot.
     MakesRoom,
+    /// Nobody has opened its stream in time.
+    NoViewer,
     /// An administrator has asked for it.
     Administrator,
     /// The server stops.
@@ -29,6 +31,7 @@ impl From<StopReason> for Failure {
                 Reason::Away,
                 "Others wait for a place, and your address has left several simulations behind",
             ),
+            StopReason::NoViewer => Self::new(Reason::NoViewer, "Nobody has opened its 3D view"),
             StopReason::Administrator => Self::new(Reason::StoppedByAdministrator, "The administrator has stopped it"),
             StopReason::ServerStopped => Self::new(Reason::ServerStopped, "The server was stopped"),
             StopReason::SessionLost => lost(),

@@ -53,13 +53,28 @@ pub fn children_listen(pid: i32, port: u16) -> bool {
         if network(&child.to_string()).is_none_or(|network| Some(network) == own) {
             return false;
         }
-        let Ok(child) = Process::new(child) else { return false };
-        let sockets = child.tcp().into_iter().chain(child.tcp6()).flatten();
-        let mut ports = sockets
-            .filter(|socket| socket.state == TcpState::Listen)
-            .map(|socket| socket.local_address.port());
-        ports.any(|listening| listening == port)
+        has_socket(child, port, &TcpState::Listen).unwrap_or_default()
     })
+}
+
+/// Whether a connection to this port is open in the network of a process; `None` if that network can't be read.
+pub fn has_connection(pid: i32, port: u16) -> Option<bool> {
+    has_socket(pid, port, &TcpState::Established)
+}
+
+/// Whether the network of a process has a TCP socket with this local port in this state; `None` if it can't be read.
+fn has_socket(pid: i32, port: u16, state: &TcpState) -> Option<bool> {
+    let process = Process::new(pid).ok()?;
+    // A machine may be without IPv6.
+    let sockets = process
+        .tcp()
+        .ok()?
+        .into_iter()
+        .chain(process.tcp6().into_iter().flatten());
+    let mut ports = sockets
+        .filter(|socket| socket.state == *state)
+        .map(|socket| socket.local_address.port());
+    Some(ports.any(|local| local == port))
 }
 
 /// Kills every process that has the mark of an instance below `folder`, and the groups that such processes lead.

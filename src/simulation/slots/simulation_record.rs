@@ -52,6 +52,8 @@ pub enum SlotEvent {
     Granted(u16),
     /// The first administrator who watches the simulation connects, or the last one leaves.
     Watched(bool),
+    /// A viewer opens its stream through this server.
+    Viewed,
     /// The administrator stops the simulation; the text is for its client.
     Stopped(String),
     /// Another client waits for a slot, and too many simulations of the address wait for clients that are away.

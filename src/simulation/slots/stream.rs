@@ -64,6 +64,11 @@ impl SlotPool {
         })
     }
 
+    /// Notifies the session that a viewer opens its stream.
+    pub fn viewed(&self, simulation: SimulationId) {
+        self.change(simulation, |record| record.listener.do_send(SlotEvent::Viewed));
+    }
+
     /// Issues a token to watch a simulation; `None` if it has no stream.
     pub fn watch(&self, simulation: SimulationId) -> Option<Token> {
         let mut slots = self.0.lock();

@@ -49,6 +49,7 @@ async fn stream(request: HttpRequest, server: web::Data<AppState>) -> actix_web:
     };
     let held = (permit, connection);
     if !target.read_only {
+        server.slots.viewed(target.simulation);
         return Ok(relay::connect(upstream, target, &path, &request, held).await);
     }
     let watching = server.slots.start_watching(target.simulation, token);

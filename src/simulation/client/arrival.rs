@@ -1,0 +1,100 @@
+//! How a session waits for the first viewer of its simulation, and ends the simulation if none comes.
+//!
+//! A page may be left while its connection stays open. The relay reports a viewer; without it, viewers connect to the port
+//! of Webots, and the kernel is asked once, at the end of the wait.
+
+use actix::prelude::*;
+use actix_rt::task::spawn_blocking;
+use nix::unistd::getpid;
+
+use super::session::{Arrival, Client, Ready, Session, State};
+use crate::simulation::ends::StopReason;
+use crate::simulation::process::process_tree::has_connection;
+
+impl Session {
+    /// Starts the wait for the first viewer, unless it may take any time.
+    pub(super) fn await_viewer(&self, ctx: &mut Context<Self>) -> Arrival {
+        let limit = self.server.config.timing.arrival;
+        if limit.is_zero() {
+            return Arrival::Settled;
+        }
+        Arrival::Awaited(ctx.run_later(limit, Self::check_arrival))
+    }
+
+    /// Starts the wait anew for a client that has come back.
+    pub(super) fn await_viewer_again(&mut self, ctx: &mut Context<Self>) {
+        if let Some(timer) = self.awaited() {
+            ctx.cancel_future(timer);
+            let arrival = self.await_viewer(ctx);
+            self.set_arrival(arrival);
+        }
+    }
+
+    /// Ends the wait: a viewer is there.
+    pub(super) fn settle_arrival(&mut self, ctx: &mut Context<Self>) {
+        if let Some(timer) = self.awaited() {
+            ctx.cancel_future(timer);
+            self.set_arrival(Arrival::Settled);
+        }
+    }
+
+    /// The timer of the wait, if it waits.
+    fn awaited(&self) -> Option<SpawnHandle> {
+        match self.state {
+            State::Ready(Ready {
+                arrival: Arrival::Awaited(timer),
+                ..
+            }) => Some(timer),
+            _ => None,
+        }
+    }
+
+    fn set_arrival(&mut self, arrival: Arrival) {
+        if let State::Ready(ready) = &mut self.state {
+            ready.arrival = arrival;
+        }
+    }
+
+    /// Ends the simulation if no viewer is there. A client that is away has its own time limit.
+    fn check_arrival(&mut self, ctx: &mut Context<Self>) {
+        if self.awaited().is_none() || matches!(self.client, Client::Away(_)) {
+            return;
+        }
+        if !self.server.config.ports_are_public() {
+            return self.end_unviewed(ctx);
+        }
+        let State::Ready(ready) = &self.state else { return };
+        let port = ready.port;
+        let containers = self.server.containers.clone();
+        let seen = async move {
+            let processes = match containers {
+                None => vec![getpid().as_raw()],
+                Some(containers) => containers.processes_of(port).await,
+            };
+            let is_viewed = move || {
+                let seen: Vec<bool> = processes
+                    .into_iter()
+                    .filter_map(|process| has_connection(process, port))
+                    .collect();
+                // What can't be seen is no reason to end a simulation.
+                seen.is_empty() || seen.contains(&true)
+            };
+            spawn_blocking(is_viewed).await.unwrap_or(true)
+        };
+        let check = seen.into_actor(self).map(|is_viewed, this, ctx| {
+            if is_viewed {
+                this.settle_arrival(ctx);
+            } else {
+                this.end_unviewed(ctx);
+            }
+        });
+        ctx.spawn(check);
+    }
+
+    fn end_unviewed(&mut self, ctx: &mut Context<Self>) {
+        if self.awaited().is_some() {
+            self.report(StopReason::NoViewer);
+            self.finish(StopReason::NoViewer.into(), ctx);
+        }
+    }
+}
