@@ -8,7 +8,7 @@ use crate::behaviour::Behaviour;
 use crate::board::{Board, Stage};
 use crate::connection::{Connection, Ended, simulated_time, unless_error};
 use crate::returning::WayBack;
-use crate::session::Session;
+use crate::session_server::SessionServer;
 use crate::visit::{Outcome, Pace, Steps, Visit};
 use crate::words::line;
 
@@ -23,7 +23,7 @@ const LONGEST_PAUSE: Duration = Duration::from_secs(8);
 pub(crate) struct Browser<'class> {
     arguments: &'class Arguments,
     board: &'class Board,
-    session: &'class Session,
+    session_server: &'class SessionServer,
     behaviour: Behaviour,
     visit: Visit,
     /// Receives the visit at its end.
@@ -59,7 +59,7 @@ impl<'class> Browser<'class> {
     pub(crate) fn new(
         arguments: &'class Arguments,
         board: &'class Board,
-        session: &'class Session,
+        session_server: &'class SessionServer,
         visits: &'class RefCell<Vec<Visit>>,
         (client, behaviour): (u32, Behaviour),
     ) -> Self {
@@ -77,7 +77,7 @@ impl<'class> Browser<'class> {
         Self {
             arguments,
             board,
-            session,
+            session_server,
             behaviour,
             visit,
             visits,
@@ -171,8 +171,8 @@ impl<'class> Browser<'class> {
         loop {
             self.full
                 .get_or_insert_with(|| "no simulation server was available".to_owned());
-            self.session.until_available().await?;
-            match self.session.simulation_server(&self.arguments.world).await {
+            self.session_server.until_available().await?;
+            match self.session_server.simulation_server(&self.arguments.world).await {
                 Ok(server) => {
                     self.full = None;
                     return Ok(server);

@@ -12,7 +12,7 @@ use crate::board::Board;
 use crate::browser::Browser;
 use crate::interruption::interruption;
 use crate::servers::Servers;
-use crate::session::Session;
+use crate::session_server::SessionServer;
 use crate::visit::Visit;
 
 /// Pause between two visits of a client in a soak.
@@ -33,7 +33,7 @@ pub(crate) async fn play(arguments: &Arguments) -> Played {
     let class = Class {
         arguments,
         board: Board::new(),
-        session: Session::new(&arguments.fleet),
+        session_server: SessionServer::new(&arguments.fleet),
         servers: Servers::default(),
         draw: RefCell::new(Draw::new(arguments.misbehave.clone())),
         visits: RefCell::default(),
@@ -58,7 +58,7 @@ pub(crate) async fn play(arguments: &Arguments) -> Played {
 struct Class<'arguments> {
     arguments: &'arguments Arguments,
     board: Board,
-    session: Session,
+    session_server: SessionServer,
     servers: Servers,
     draw: RefCell<Draw>,
     visits: RefCell<Vec<Visit>>,
@@ -85,7 +85,7 @@ impl Class<'_> {
 
     async fn visit(&self, client: u32, behaviour: Behaviour) {
         let who = (client, behaviour);
-        let browser = Browser::new(self.arguments, &self.board, &self.session, &self.visits, who);
+        let browser = Browser::new(self.arguments, &self.board, &self.session_server, &self.visits, who);
         browser.visit(|server| self.servers.met(server)).await;
     }
 }

@@ -9,7 +9,7 @@ use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::tungstenite::{Error, Message};
 use tokio_tungstenite::{Connector, MaybeTlsStream, WebSocketStream, connect_async_tls_with_config};
 
-use crate::session::encryption;
+use crate::http::encryption;
 
 /// Timeout of connecting, and of sending a text.
 const CONNECT: Duration = Duration::from_secs(20);

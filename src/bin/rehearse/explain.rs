@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use crate::arguments::Arguments;
 use crate::connection::{Connection, Deadline, Ended, unless_error};
-use crate::session::Session;
+use crate::session_server::SessionServer;
 use crate::step_log::StepLog;
 use crate::words::{add, excerpt, over, told};
 
@@ -44,11 +44,11 @@ struct StepError;
 /// # Errors
 /// When the session server does not answer at all.
 pub(crate) async fn run(arguments: &Arguments) -> Result<bool, String> {
-    let session = Session::new(&arguments.fleet);
-    session.answers().await?;
+    let session_server = SessionServer::new(&arguments.fleet);
+    session_server.answers().await?;
     let mut walk = StepLog::begin(arguments);
     // The last printed step shows where it failed.
-    Box::pin(walk.go(arguments, &session)).await.ok();
+    Box::pin(walk.go(arguments, &session_server)).await.ok();
     Ok(walk.end())
 }
 
@@ -62,9 +62,9 @@ struct Start {
 }
 
 impl StepLog {
-    async fn go(&mut self, arguments: &Arguments, session: &Session) -> Result<(), StepError> {
-        self.ask_for_availability(arguments, session).await?;
-        let (mut lease, webots) = self.start(arguments, session).await?;
+    async fn go(&mut self, arguments: &Arguments, session_server: &SessionServer) -> Result<(), StepError> {
+        self.ask_for_availability(arguments, session_server).await?;
+        let (mut lease, webots) = self.start(arguments, session_server).await?;
         let address = format!("{}/", webots.trim_end_matches('/'));
         let opened = Connection::open_scene(&address).await;
         let came = opened
@@ -117,16 +117,20 @@ impl StepLog {
         Ok(())
     }
 
-    async fn ask_for_availability(&mut self, arguments: &Arguments, session: &Session) -> Result<(), StepError> {
+    async fn ask_for_availability(
+        &mut self,
+        arguments: &Arguments,
+        session_server: &SessionServer,
+    ) -> Result<(), StepError> {
         let expected = "`1` or `0` as the first text of the WebSocket `/`";
-        let first = match Connection::open(&session.availability_url()).await {
+        let first = match Connection::open(&session_server.availability_url()).await {
             Ok(mut availability) => availability.receive_by(limit(ANSWER, arguments)).await,
             Err(ended) => Err(ended),
         };
         let agrees = matches!(first.as_deref(), Ok("0" | "1"));
         self.note("availability", expected, &told(&first), agrees);
         first.map_err(|_| StepError)?;
-        let available = actix_rt::time::timeout(arguments.patience, session.until_available()).await;
+        let available = actix_rt::time::timeout(arguments.patience, session_server.until_available()).await;
         let came = match &available {
             Ok(Ok(())) => "`1`".to_owned(),
             Ok(Err(ended)) => over(ended),
@@ -143,8 +147,12 @@ impl StepLog {
     }
 
     /// Requests a simulation server and starts the world there. Returns the connection and the URL of Webots.
-    async fn start(&mut self, arguments: &Arguments, session: &Session) -> Result<(Connection, String), StepError> {
-        let server = session.simulation_server(&arguments.world).await;
+    async fn start(
+        &mut self,
+        arguments: &Arguments,
+        session_server: &SessionServer,
+    ) -> Result<(Connection, String), StepError> {
+        let server = session_server.simulation_server(&arguments.world).await;
         let came = excerpt(server.as_ref().map_or_else(Clone::clone, Clone::clone).as_str());
         self.note(
             "simulation server",

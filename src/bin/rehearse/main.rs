@@ -13,13 +13,14 @@ mod browser;
 mod class;
 mod connection;
 mod explain;
+mod http;
 mod interruption;
 mod localhost;
 mod real_time_factors;
 mod report;
 mod returning;
 mod servers;
-mod session;
+mod session_server;
 mod step_log;
 mod table;
 mod visit;
@@ -85,7 +86,7 @@ async fn explain(arguments: &Arguments) -> Result<u8, String> {
 /// # Errors
 /// When the fleet does not answer at all, or the JSON file can't be written.
 async fn rehearse(arguments: &Arguments) -> Result<u8, String> {
-    session::Session::new(&arguments.fleet).answers().await?;
+    session_server::SessionServer::new(&arguments.fleet).answers().await?;
     let Played {
         visits,
         peaks,

@@ -4,7 +4,7 @@ use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use crate::session::{client, get, to_http};
+use crate::http::{client, get};
 
 /// The simulation servers of the clients, by their WebSocket URL, and the highest load of each, in percent.
 #[derive(Default)]
@@ -31,7 +31,7 @@ impl Servers {
     }
 
     async fn ask(&self, http: &awc::Client, server: &str) {
-        let answer = get(http, &format!("{}/load", to_http(server))).await;
+        let answer = get(http, &format!("{}/load", server.replacen("ws", "http", 1))).await;
         // A server that is too busy to answer keeps its last load.
         let load = answer
             .ok()

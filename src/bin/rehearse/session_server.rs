@@ -1,32 +1,20 @@
 //! The session server as a web page uses it.
 
-use std::sync::{Arc, LazyLock};
-use std::time::Duration;
-
 use awc::Client;
-use awc::error::SendRequestError;
-use rustls::ClientConfig;
 use url::Url;
-use webots_fleet::shared::http::tls;
 
 use crate::connection::{Connection, Ended};
+use crate::http::{client, get};
 use crate::words::{excerpt, line};
-
-/// Timeout of an answer.
-const ANSWER: Duration = Duration::from_secs(20);
-/// Size limit of an answer, in bytes.
-const LONGEST_ANSWER: usize = 64 << 10;
-/// The TLS configuration of requests and WebSockets; the trust store is read once. `None` if TLS can't be set up.
-static TLS: LazyLock<Option<Arc<ClientConfig>>> = LazyLock::new(tls::client_config);
 
 /// A session server.
 #[derive(Clone)]
-pub(crate) struct Session {
+pub(crate) struct SessionServer {
     url: Url,
     http: Client,
 }
 
-impl Session {
+impl SessionServer {
     /// The session server at this URL.
     pub(crate) fn new(url: &Url) -> Self {
         Self {
@@ -72,7 +60,7 @@ impl Session {
 
     /// The URL of the WebSocket that sends the availability: in the original it is `/`.
     pub(crate) fn availability_url(&self) -> String {
-        format!("{}/", to_web_socket(&self.base()))
+        format!("{}/", self.base().replacen("http", "ws", 1))
     }
 
     /// Requests a simulation server for a world: `ws://HOST:PORT` or `wss://HOST/PORT`.
@@ -101,47 +89,4 @@ impl Session {
             .trim_end_matches("/session")
             .to_owned()
     }
-}
-
-/// The TLS configuration for `https://` and `wss://`.
-pub(crate) fn encryption() -> Option<Arc<ClientConfig>> {
-    TLS.clone()
-}
-
-/// A client for short answers, also from `https://` servers.
-pub(crate) fn client() -> Client {
-    let connector = awc::Connector::new();
-    let connector = match encryption() {
-        Some(config) => connector.rustls_0_23(config),
-        None => connector,
-    };
-    Client::builder().connector(connector).timeout(ANSWER).finish()
-}
-
-/// The body of an answer with any status: the page ignores the status too.
-///
-/// # Errors
-/// Why there is none.
-pub(crate) async fn get(http: &Client, url: &str) -> Result<String, String> {
-    let unreachable = |error: SendRequestError| {
-        let why = tls::reason(&error).unwrap_or_else(|| error.to_string());
-        format!("{url} can't be reached: {why}")
-    };
-    let mut answer = http.get(url).send().await.map_err(unreachable)?;
-    let body = answer
-        .body()
-        .limit(LONGEST_ANSWER)
-        .await
-        .map_err(|error| format!("{url} can't be read: {error}"))?;
-    Ok(String::from_utf8_lossy(&body).into_owned())
-}
-
-/// `ws://...` of `http://...`, `wss://...` of `https://...`.
-pub(crate) fn to_web_socket(url: &str) -> String {
-    url.replacen("http", "ws", 1)
-}
-
-/// `http://...` of `ws://...`, `https://...` of `wss://...`.
-pub(crate) fn to_http(url: &str) -> String {
-    url.replacen("ws", "http", 1)
 }
