@@ -1,5 +1,6 @@
 //! The slots that clients wait for: leases, the queue, and the limits per address and user; the streams of simulations.
 
+pub mod port;
 mod reservations;
 mod simulation_record;
 mod slot_lease;

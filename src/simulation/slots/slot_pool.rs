@@ -5,8 +5,7 @@
 //! that neither leaks in any state or after any panic.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
-use std::io::ErrorKind;
-use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, TcpListener};
+use std::net::IpAddr;
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -14,6 +13,7 @@ use std::time::{Duration, Instant};
 use actix::Recipient;
 use parking_lot::Mutex;
 
+use super::port;
 use super::reservations::{LinkId, Reservations, Reserved};
 use super::simulation_record::{Party, SimulationRecord, SlotEvent};
 use crate::shared::domain::{Failure, Instances, Reason, ReservationId, Wish, Wishes};
@@ -363,7 +363,9 @@ impl Slots {
     /// The lowest port that is neither leased nor reserved nor used by another program.
     fn free_port(&self) -> Option<u16> {
         let taken: HashSet<u16> = self.taken().collect();
-        self.ports.clone().find(|port| !taken.contains(port) && is_free(*port))
+        self.ports
+            .clone()
+            .find(|port| !taken.contains(port) && port::is_free(*port))
     }
 
     fn instances(&self) -> Instances {
@@ -411,11 +413,4 @@ fn parties(
 fn may_have(lent: &HashMap<Party, usize>, parties: &[(Party, usize)]) -> bool {
     let is_left = |(party, most): &(Party, usize)| lent.get(party).is_none_or(|slots| slots < most);
     parties.iter().all(is_left)
-}
-
-/// Whether no program listens on a port, over IPv4 or IPv6; a machine may have only one of them.
-fn is_free(port: u16) -> bool {
-    let is_taken = |error: std::io::Error| error.kind() == ErrorKind::AddrInUse;
-    TcpListener::bind((Ipv4Addr::UNSPECIFIED, port)).is_ok()
-        && !TcpListener::bind((Ipv6Addr::UNSPECIFIED, port)).is_err_and(is_taken)
 }

@@ -1,11 +1,9 @@
 //! The launch specification: everything that one Webots is started with.
 
 use std::ffi::OsString;
-use std::io::ErrorKind;
-use std::net::{SocketAddr, TcpStream};
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::time::Duration;
 
 use actix::prelude::*;
 
@@ -21,9 +19,6 @@ use crate::simulation::machine::sensors::Gpu;
 use crate::simulation::process::SpawnSpec;
 use crate::simulation::protocol::Mode;
 use crate::simulation::slots::Slot;
-
-/// If a connection is neither accepted nor refused in this time, a program has the port and does not respond.
-const SILENCE: Duration = Duration::from_millis(100);
 
 /// Everything that one Webots is started with.
 pub struct LaunchSpec {
@@ -142,13 +137,6 @@ impl LaunchSpec {
             .reached()
             .unwrap_or_else(|| self.config.address_of_simulations());
         (address, self.slot.port).into()
-    }
-
-    /// Whether another program listens at its port. Checked by a connection instead of `bind`: a process that
-    /// another thread is just starting would inherit the bound socket.
-    pub fn is_port_taken(&self) -> bool {
-        let connected = TcpStream::connect_timeout(&self.address(), SILENCE);
-        connected.map_or_else(|error| error.kind() == ErrorKind::TimedOut, |_| true)
     }
 
     /// Whether its first heartbeat shows that it is ready, because its release does not answer before that.

@@ -21,6 +21,7 @@ use crate::shared::run::seconds_since_1970;
 use crate::simulation::container::SimulationContainers;
 use crate::simulation::ends::{End, StopReason, lost};
 use crate::simulation::process::ProcessGroup;
+use crate::simulation::slots::port;
 use crate::simulation::snapshot::Stage;
 
 /// Requests Webots' end.
@@ -182,7 +183,7 @@ impl Webots {
         ctx: &mut Context<Self>,
     ) -> std::io::Result<Process> {
         // Another program may have taken the port during the checkout, and would be mistaken for Webots.
-        if self.spec.is_port_taken() {
+        if !port::is_free(self.spec.slot.port) {
             return Err(std::io::ErrorKind::AddrInUse.into());
         }
         let (launched, exit) = launched::launch(&self.spec, containers, ctx.address().recipient())?;
