@@ -23,7 +23,7 @@
 //! | [`simulation::ends`] | how simulations have ended: counter, table, their logs (`kept_output`); for which reasons an end can be requested (`stop_reason`) |
 //! | [`simulation::webots`] | one running Webots: its command line and GPU (`launch_spec`), its log (path and size in `launched`, its lines in `output`), the wait for its end (`launched`) |
 //! | [`simulation::client`] | a client's WebSocket (`web_client`), that of a session server that asks for slots (`slot_link`), the session of its simulation, which sends it nearly all messages (`session`; `start`: before Webots runs, with the choice of the GPU) |
-//! | [`simulation::sessions`] | how a connection is attached to its session, and how a client resumes it |
+//! | [`simulation::attachment`] | how a connection is attached to its session, and how a client resumes it |
 //! | [`simulation::slots`] | the slots that clients wait for: leases, the queue and the shares of addresses and users (`slot_pool`), those that are reserved for the line of session servers (`reservations`), the streams of simulations and the tokens that identify them (`stream`) |
 //! | `simulation::relay` | a stream between a client and the port of its Webots |
 //! | `simulation::web` | routes, pages, `/status` and Prometheus metrics of the simulation server (gauges in `metrics`, counters in `app` and `ends`) |

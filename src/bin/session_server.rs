@@ -50,7 +50,7 @@ fn test_mail(config: &SessionConfig) -> ExitCode {
     for channel in [mail, webhook].into_iter().flatten() {
         match channel.and_then(|channel| system.block_on(channel.test(config))) {
             // The reader may have closed the pipe.
-            Ok(how) => drop(writeln!(std::io::stdout(), "{how}")),
+            Ok(result) => drop(writeln!(std::io::stdout(), "{result}")),
             Err(error) => {
                 eprintln!("error: {error}");
                 code = ExitCode::from(start::FAILED);

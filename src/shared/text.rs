@@ -49,7 +49,7 @@ pub fn client_text(text: &str) -> String {
 ///
 /// Texts for web clients pass through this: the paths of a machine are of no use to them.
 pub fn without_paths(text: &str) -> String {
-    let mut shown = String::with_capacity(text.len());
+    let mut result = String::with_capacity(text.len());
     let mut rest = text;
     while let Some(at) = rest.find('/') {
         let (before, from) = rest.split_at(at);
@@ -61,18 +61,18 @@ pub fn without_paths(text: &str) -> String {
             .or_else(|| from.find(ends))
             .unwrap_or(from.len());
         let (path, after) = from.split_at(end);
-        shown.push_str(before);
+        result.push_str(before);
         let is_url = path.starts_with("//") && before.ends_with(':') && !before.ends_with("file:");
         let is_relative = before.ends_with(|letter: char| letter.is_alphanumeric() || ".-_~".contains(letter));
         if is_url || is_relative || path == "/" {
-            shown.push_str(path);
+            result.push_str(path);
         } else {
-            shown.push_str(path.trim_end_matches(['/', '.']).rsplit('/').next().unwrap_or_default());
-            shown.push_str(path.get(path.trim_end_matches('.').len()..).unwrap_or_default());
+            result.push_str(path.trim_end_matches(['/', '.']).rsplit('/').next().unwrap_or_default());
+            result.push_str(path.get(path.trim_end_matches('.').len()..).unwrap_or_default());
         }
         rest = after;
     }
-    shown + rest
+    result + rest
 }
 
 #[cfg(test)]

@@ -64,8 +64,8 @@ fn isolation(config: &SimulationConfig, launcher: &Launcher) -> Vec<(&'static st
 
 fn display(config: &SimulationConfig) -> Result<String, String> {
     if config.xvfb {
-        let how = "each Webots gets a virtual display of its own (xvfb), without the graphics card";
-        return readiness::find_xvfb().map(|_| how.to_owned());
+        let kind = "each Webots gets a virtual display of its own (xvfb), without the graphics card";
+        return readiness::find_xvfb().map(|_| kind.to_owned());
     }
     let displays = config.all_displays();
     displays.iter().try_for_each(|display| display::check(display))?;

@@ -36,7 +36,7 @@ use serde_json::Value;
 
 use crate::shared::domain::{Blame, Failure, Reason, Retry};
 use crate::shared::text::{client_text, without_paths};
-use crate::simulation::sessions::Token;
+use crate::simulation::attachment::Token;
 use crate::simulation::snapshot::SceneKind;
 
 /// The requests in a message, of which only one takes effect; unknown fields are ignored.
@@ -207,7 +207,7 @@ pub fn stopped_by_teacher(reason: &str) -> String {
 }
 
 /// The id of a simulation.
-pub fn session(id: impl std::fmt::Display) -> String {
+pub fn simulation_id(id: impl std::fmt::Display) -> String {
     format!("session: {id}")
 }
 

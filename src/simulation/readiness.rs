@@ -186,18 +186,18 @@ pub fn webots_program(config: &SimulationConfig) -> Result<PathBuf, String> {
     if config.docker {
         return Ok(PathBuf::from(&config.container.program));
     }
-    let how = "Its administrator can set webotsHome in the server's configuration, or the environment variable \
+    let remedy = "Its administrator can set webotsHome in the server's configuration, or the environment variable \
                WEBOTS_HOME";
     let in_home = config.webots_home.as_ref().map(|home| home.0.join("webots"));
     let Some(program) = config.webots.as_ref().map(|program| program.0.clone()).or(in_home) else {
         return Err(format!(
-            "This simulation server does not know where Webots is installed. {how}."
+            "This simulation server does not know where Webots is installed. {remedy}."
         ));
     };
     let program = std::path::absolute(&program).unwrap_or(program);
     which(&program).map_err(|_| {
         format!(
-            "This simulation server has no Webots that it can run at \"{}\". {how}.",
+            "This simulation server has no Webots that it can run at \"{}\". {remedy}.",
             program.display()
         )
     })

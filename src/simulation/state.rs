@@ -6,10 +6,10 @@ use std::time::Instant;
 use actix::{Addr, ArbiterHandle};
 use tokio::sync::watch;
 
+use super::attachment::ResumableSessions;
 use super::config::SimulationConfig;
 use super::ends::Ends;
 use super::readiness::FailedStarts;
-use super::sessions::Sessions;
 use super::slots::SlotPool;
 use crate::shared::domain::{
     AdmissionRules, Failure, FleetKey, Load, Pass, ProjectUrl, Reason, ReservationId, ServerRun,
@@ -39,7 +39,7 @@ pub struct AppState {
     /// Leases slots.
     pub slots: Arc<SlotPool>,
     /// The sessions that their clients can resume.
-    pub sessions: Arc<Sessions>,
+    pub sessions: Arc<ResumableSessions>,
     /// Measures the load of the machine.
     pub load_monitor: Addr<LoadMonitor>,
     /// The newest readings of the machine.

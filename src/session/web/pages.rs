@@ -49,8 +49,8 @@ struct ServerRow<'server> {
 /// The administrator's announcement.
 #[derive(Template)]
 #[template(path = "session/announcement.html")]
-struct Announced<'one> {
-    text: &'one str,
+struct Announced<'a> {
+    text: &'a str,
 }
 
 /// The last changes of state.
@@ -122,18 +122,18 @@ impl<'status> Glance<'status> {
         let instances: Vec<_> = status
             .servers
             .iter()
-            .filter_map(|one| one.record.state.report()?.instances)
+            .filter_map(|server| server.record.state.report()?.instances)
             .collect();
         // Numbers that another server reports may be arbitrarily large.
-        let sum = |part: fn(&Instances) -> u32| instances.iter().map(|one| u64::from(part(one))).sum();
+        let sum = |part: fn(&Instances) -> u32| instances.iter().map(|instances| u64::from(part(instances))).sum();
         Self {
             status,
             clients,
-            running: sum(|one| one.running),
-            idle: sum(|one| one.idle),
-            starting: sum(|one| one.starting),
-            queued: sum(|one| one.queued),
-            places: sum(|one| one.places),
+            running: sum(|instances| instances.running),
+            idle: sum(|instances| instances.idle),
+            starting: sum(|instances| instances.starting),
+            queued: sum(|instances| instances.queued),
+            places: sum(|instances| instances.places),
         }
     }
 }

@@ -16,7 +16,9 @@ const LOCKS: [&str; 4] = ["shallow.lock", "config.lock", "packed-refs.lock", "gc
 ///
 /// # Errors
 /// Those of `work`.
-pub async fn blocking<T: Send + 'static>(work: impl FnOnce() -> io::Result<T> + Send + 'static) -> io::Result<T> {
+pub async fn spawn_blocking_io<T: Send + 'static>(
+    work: impl FnOnce() -> io::Result<T> + Send + 'static,
+) -> io::Result<T> {
     actix_rt::task::spawn_blocking(work).await?
 }
 
@@ -52,7 +54,7 @@ pub async fn outgrown(folders: Vec<(PathBuf, u64)>) {
             let mut size = DiskUsage::new(measure, *most);
             !size.add_folder(folder) || size.total > *most
         };
-        if blocking(move || Ok(looked_at.iter().any(is_beyond)))
+        if spawn_blocking_io(move || Ok(looked_at.iter().any(is_beyond)))
             .await
             .is_ok_and(|is_one| is_one)
         {

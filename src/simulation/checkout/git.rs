@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use rustix::process::Resource;
 
-use super::disk::blocking;
+use super::disk::spawn_blocking_io;
 use super::http_trace::traced;
 use crate::shared::config::ExpandedPath;
 use crate::shared::domain::{Failure, Reason};
@@ -185,7 +185,7 @@ impl Git {
         let folder = self.mark.clone();
         let reserve = self.config.disk_reserve;
         let look = move || Ok(disk_fault(&folder, reserve).or_else(|| start_fault("git")));
-        blocking(look)
+        spawn_blocking_io(look)
             .await
             .unwrap_or_else(|error| Some(own_call_failed(&error)))
     }

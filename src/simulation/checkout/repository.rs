@@ -13,7 +13,7 @@ use parking_lot::Mutex;
 use rustix::process::Resource;
 use tokio::sync::{Notify, Semaphore, watch};
 
-use super::disk::{blocking, has_unfinished_pack, remove_leftovers};
+use super::disk::{has_unfinished_pack, remove_leftovers, spawn_blocking_io};
 use super::git::{Git, GitError, GitExit, LITTLE_MEMORY, stall_timeout};
 use super::http_trace::{HttpTrace, TRACE};
 use super::single_flight::{OnProgress, SingleFlight};
@@ -290,7 +290,7 @@ impl Repository {
     /// Creates a bare repository in this directory if there is none, otherwise removes what a killed git has left.
     async fn create(&self, folder: &Path) -> Result<(), CheckoutError> {
         let path = folder.to_owned();
-        let is_there = blocking(move || {
+        let is_there = spawn_blocking_io(move || {
             // The last directory that `git init` creates: without it, git was killed before.
             let is_there = path.join("objects/pack").is_dir();
             if is_there {
@@ -320,7 +320,7 @@ impl Repository {
         log::warn!("{} is damaged: it was fetched anew", self.path.display());
         let old = self.git.scratch()?;
         let path = self.path.clone();
-        blocking(move || {
+        spawn_blocking_io(move || {
             set_aside(&path, old.path())?;
             std::fs::rename(fresh.keep(), path)?;
             remove_tree(old.path())
@@ -342,12 +342,12 @@ impl Repository {
         }
         let old = self.git.scratch()?;
         let path = self.path.clone();
-        let old = blocking(move || set_aside(&path, old.path()).map(|()| old)).await?;
+        let old = spawn_blocking_io(move || set_aside(&path, old.path()).map(|()| old)).await?;
         let next = next_generation();
         self.generation.store(next, Relaxed);
         drop(guard);
         // Others need not wait for this.
-        blocking(move || remove_tree(old.path())).await?;
+        spawn_blocking_io(move || remove_tree(old.path())).await?;
         Ok(next)
     }
 }

@@ -12,7 +12,7 @@ use std::time::{Duration, Instant, SystemTime};
 use sha2::{Digest, Sha256};
 use tokio::sync::{Mutex, Notify};
 
-use super::disk::{blocking, sum};
+use super::disk::{spawn_blocking_io, sum};
 use super::git::Git;
 use super::repository::Repository;
 use crate::simulation::config::Remote;
@@ -108,7 +108,7 @@ impl RepositoryCache {
         };
         repository.remote.lock().clone_from(remote);
         let folder = self.folder.clone();
-        blocking(move || {
+        spawn_blocking_io(move || {
             std::fs::create_dir_all(folder)?;
             // It may not exist yet.
             File::open(&path)
@@ -174,11 +174,8 @@ fn folder_name(key: &str) -> String {
         .chars()
         .map(|letter| if letter.is_ascii_alphanumeric() { letter } else { '-' });
     let readable: String = readable.skip_while(|letter| *letter == '-').take(100).collect();
-    let hash = Sha256::digest(key)
-        .iter()
-        .take(8)
-        .fold(0, |hash: u64, byte| (hash << 8) | u64::from(*byte));
-    format!("{readable}-{hash:016x}")
+    let hash = hex::encode(Sha256::digest(key));
+    format!("{readable}-{hash:.16}")
 }
 
 #[cfg(test)]

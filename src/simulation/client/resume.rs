@@ -6,9 +6,9 @@ use futures_util::stream::{self, StreamExt};
 use super::session::{Attachment, Client, Ready, Session, State, seconds_until};
 use crate::shared::domain::Failure;
 use crate::shared::run::seconds_since_1970;
+use crate::simulation::attachment::{ClientAction, Connection, Resume, ToClient, Token};
 use crate::simulation::ends::StopReason;
 use crate::simulation::protocol;
-use crate::simulation::sessions::{ClientAction, Connection, Resume, ToClient, Token};
 
 impl Session {
     /// Waits for a client that may return; ends the session if it can't be resumed.
@@ -77,7 +77,7 @@ impl Session {
     /// Tells a client that has come back what it has missed.
     fn tell_again(&self) {
         let State::Ready(ready) = &self.state else { return };
-        self.text(protocol::session(self.id));
+        self.text(protocol::simulation_id(self.id));
         let rest = self
             .server
             .config
@@ -102,13 +102,13 @@ impl Handler<Resume> for Session {
         let peer = connection.peer;
         if let Some(refusal) = self.refusal(token) {
             log::info!("{}: client {peer} does not come back: {refusal}", self.name());
-            return connection.client.do_send(ToClient::End(refusal));
+            return connection.client.do_send(ToClient::Close(refusal));
         }
         log::info!("{}: goes on as client {peer}", self.name());
         self.peer = peer;
         let attached = Self::attached(connection, ctx);
         match std::mem::replace(&mut self.client, Client::Connected(attached)) {
-            Client::Connected(before) => before.client.do_send(ToClient::End(protocol::taken_over())),
+            Client::Connected(before) => before.client.do_send(ToClient::Close(protocol::taken_over())),
             Client::Away(deadline) => {
                 ctx.cancel_future(deadline);
             }

@@ -14,11 +14,11 @@ use futures_util::stream::AbortHandle;
 use crate::shared::domain::{Failure, ProjectUrl, Reason};
 use crate::shared::http::Peer;
 use crate::shared::run::closing;
+use crate::simulation::attachment::{ClientAction, Connection, ToClient, Token};
 use crate::simulation::checkout::Project;
 use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::ends::{StopReason, lost};
 use crate::simulation::protocol::{self, Mode};
-use crate::simulation::sessions::{ClientAction, Connection, ToClient, Token};
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::slots::{Slot, SlotEvent, SlotLease};
 use crate::simulation::snapshot::SceneKind;
@@ -171,7 +171,7 @@ impl Session {
         let (world, reservation) = match Self::admit(&server, connection.peer, request) {
             Ok(admitted) => admitted,
             Err(failure) => {
-                connection.client.do_send(ToClient::End(failure));
+                connection.client.do_send(ToClient::Close(failure));
                 return None;
             }
         };
@@ -194,7 +194,7 @@ impl Session {
                 mode: request.mode.unwrap_or_default(),
                 is_resetting: false,
             };
-            session.text(protocol::session(id));
+            session.text(protocol::simulation_id(id));
             if let State::Over { failure, .. } = &session.state {
                 session.count(failure.reason.code());
                 session.tell(failure);
@@ -236,7 +236,7 @@ impl Session {
     /// Sends the client the reason for a refusal, a failed start or an end.
     fn tell(&self, failure: &Failure) {
         log::info!("{}: {failure} ({})", self.name(), failure.reason);
-        self.send(ToClient::End(failure.clone()));
+        self.send(ToClient::Close(failure.clone()));
     }
 
     /// Releases everything, and sends the client the reason. A client that missed it receives it when it returns.

@@ -16,10 +16,10 @@ use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::websocket::wrong_message;
 use crate::shared::http::{ConnectionPermit, Peer};
 use crate::shared::run::closing;
+use crate::simulation::attachment::{ClientAction, Connection, Resume, ToClient, Token};
 use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::ends::lost;
 use crate::simulation::protocol::{self, ClientRequest};
-use crate::simulation::sessions::{ClientAction, Connection, Resume, ToClient, Token};
 use crate::simulation::state::AppState;
 
 /// The actor.
@@ -86,7 +86,7 @@ impl WebClient {
         // The session's earlier texts come first; after an end from the session, this actor has stopped.
         let gone = async move { attached.closed().await };
         gone.into_actor(self)
-            .map(move |(), _, ctx| ctx.address().do_send(ToClient::End(end)))
+            .map(move |(), _, ctx| ctx.address().do_send(ToClient::Close(end)))
             .spawn(ctx);
         self.session = Some(session);
         Connection {
@@ -215,7 +215,7 @@ impl Handler<ToClient> for WebClient {
     fn handle(&mut self, message: ToClient, ctx: &mut Self::Context) {
         match message {
             ToClient::Text(text) => ctx.text(text),
-            ToClient::End(failure) => Self::finish(&failure, protocol::close_code(failure.reason), ctx),
+            ToClient::Close(failure) => Self::finish(&failure, protocol::close_code(failure.reason), ctx),
         }
     }
 }

@@ -58,7 +58,7 @@ impl Docker {
     pub fn find(mark: &Path) -> Result<Self, String> {
         which("docker")
             .map_err(|_| "docker is not there; on Debian and Ubuntu the package docker.io has it".to_owned())?;
-        let compose: &[_] = if blocking(&["compose", "version"], SHORT_TIMEOUT).is_ok() {
+        let compose: &[_] = if docker_output(&["compose", "version"], SHORT_TIMEOUT).is_ok() {
             &["docker", "compose"]
         } else if which("docker-compose").is_ok() {
             &["docker-compose"]
@@ -153,18 +153,18 @@ async fn finish(run: Run, mut on_line: impl FnMut(&str)) -> Result<String, Docke
 ///
 /// # Errors
 /// When it fails or takes longer than the limit.
-pub fn blocking(arguments: &[&str], limit: Duration) -> Result<String, DockerError> {
+pub fn docker_output(arguments: &[&str], limit: Duration) -> Result<String, DockerError> {
     let command: Vec<OsString> = ["docker"].iter().chain(arguments).map(OsString::from).collect();
     let name = name_of(&command);
     let mut reason = String::new();
-    let ran = Run::new(command, Path::new("/"), limit).blocking(|line| note(&mut reason, &line));
+    let ran = Run::new(command, Path::new("/"), limit).run_blocking(|line| note(&mut reason, &line));
     result(name, ran, reason)
 }
 
 /// Why the daemon can't be used now, as text for clients and administrators. It is asked twice, because a busy one may
 /// answer once too late. Blocks for ten seconds at most.
 pub fn daemon_fault() -> Option<String> {
-    let ask = || blocking(&["version", "--format", "{{.Server.Version}}"], ANSWER_TIMEOUT);
+    let ask = || docker_output(&["version", "--format", "{{.Server.Version}}"], ANSWER_TIMEOUT);
     let error = ask().or_else(|_| ask()).err()?;
     Some(match error {
         DockerError::Failed { output, .. } => format!("Docker does not answer on this simulation server: {output}"),
@@ -191,7 +191,7 @@ pub fn data_folder() -> Option<PathBuf> {
         return None;
     }
     if FOLDER.get().is_none() {
-        let output = blocking(&["info", "--format", "{{.DockerRootDir}}"], ANSWER_TIMEOUT).ok()?;
+        let output = docker_output(&["info", "--format", "{{.DockerRootDir}}"], ANSWER_TIMEOUT).ok()?;
         let folder = Some(PathBuf::from(output.trim())).filter(|folder| folder.is_absolute() && folder.exists())?;
         // A concurrent check may have set it.
         FOLDER.set(folder).ok();

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use actix_rt::task::spawn_blocking;
+use sha2::{Digest, Sha256};
 use tokio::sync::watch;
 
 use super::build_plan::{self, ImageBuild};
@@ -17,7 +18,7 @@ use super::docker::{Docker, DockerError, SHORT_TIMEOUT, data_folder, docker_disk
 use super::dockerfile::{Dockerfile, LABEL};
 use super::engine;
 use super::failures::{of_project, on_thread};
-use super::owned_resources::{ResourceOwner, digest};
+use super::owned_resources::ResourceOwner;
 use crate::shared::domain::{Failure, Reason};
 use crate::simulation::checkout::{OnProgress, Project, SingleFlight};
 use crate::simulation::config::SimulationConfig;
@@ -125,7 +126,11 @@ impl Images {
                 self.inspect(base, ID).await?
             });
         }
-        let name = format!("webots-fleet/{}:{}", self.owner.0, digest(parts.join("\0").as_bytes()));
+        let name = format!(
+            "webots-fleet/{}:{}",
+            self.owner.0,
+            hex::encode(Sha256::digest(parts.join("\0")))
+        );
         let this = Arc::clone(self);
         let project = Arc::clone(project);
         let tag = name.clone();

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use serde::Deserialize;
 
-use super::docker::{Docker, DockerError, SHORT_TIMEOUT, blocking};
+use super::docker::{Docker, DockerError, SHORT_TIMEOUT, docker_output};
 use crate::shared::domain::{Failure, Reason};
 
 /// What Docker reports about a network.
@@ -52,7 +52,7 @@ pub async fn join(docker: &Docker, name: &str) -> Result<(), Failure> {
 /// # Errors
 /// What is wrong with it, as text for an administrator.
 pub fn check(name: &str) -> Result<(), String> {
-    match blocking(&inspect(name), SHORT_TIMEOUT) {
+    match docker_output(&inspect(name), SHORT_TIMEOUT) {
         Ok(found) => suits(name, &found),
         Err(DockerError::Failed { .. }) => Ok(()),
         Err(error) => Err(error.to_string()),

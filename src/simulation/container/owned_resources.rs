@@ -10,7 +10,7 @@ use actix_rt::task::spawn_blocking;
 use sha2::{Digest, Sha256};
 use tokio::runtime::Handle;
 
-use super::docker::{DockerError, SHORT_TIMEOUT, blocking};
+use super::docker::{DockerError, SHORT_TIMEOUT, docker_output};
 
 /// The owner of compose projects and images: a server, or one run of it. Their names contain the owner:
 /// 12 hexadecimal digits for a server, and `-` and 8 more for a run.
@@ -40,7 +40,7 @@ impl ResourceOwner {
     /// The server with this cache directory, which only one server uses.
     pub fn of(cache: &Path) -> Self {
         let cache = cache.canonicalize().unwrap_or_else(|_| cache.to_owned());
-        let mut name = digest(cache.as_os_str().as_encoded_bytes());
+        let mut name = hex::encode(Sha256::digest(cache.as_os_str().as_encoded_bytes()));
         name.truncate(12);
         Self(name)
     }
@@ -106,14 +106,6 @@ impl Drop for ProjectGuard {
     }
 }
 
-/// The SHA-256 of a text, in hexadecimal digits.
-pub fn digest(text: &[u8]) -> String {
-    let digest = Sha256::digest(text);
-    digest
-        .iter()
-        .fold(String::new(), |text, byte| format!("{text}{byte:02x}"))
-}
-
 /// Removes all containers of an owner. The next start removes what is left. Blocks.
 pub fn sweep_all(owner: &ResourceOwner) {
     sweep(&owner.prefix()).ok();
@@ -121,7 +113,7 @@ pub fn sweep_all(owner: &ResourceOwner) {
 
 /// Removes the containers whose names begin like this. Blocks.
 fn sweep(prefix: &str) -> Result<(), DockerError> {
-    let list = blocking(
+    let list = docker_output(
         &[
             "ps",
             "--all",
@@ -134,7 +126,7 @@ fn sweep(prefix: &str) -> Result<(), DockerError> {
     )?;
     let names: Vec<&str> = list.lines().filter(|name| name.starts_with(prefix)).collect();
     if !names.is_empty() {
-        blocking(&[&REMOVE, names.as_slice()].concat(), SHORT_TIMEOUT)?;
+        docker_output(&[&REMOVE, names.as_slice()].concat(), SHORT_TIMEOUT)?;
     }
     Ok(())
 }

@@ -47,7 +47,7 @@ fn list(table: &str) -> Result<(), String> {
 
 /// Whether a program exits with code 0, or why not.
 fn succeeds(command: &[&str]) -> Result<(), String> {
-    let why = match Run::new(command, Path::new("/"), TIMEOUT).blocking(drop) {
+    let why = match Run::new(command, Path::new("/"), TIMEOUT).run_blocking(drop) {
         Ok(Ran {
             ending: ExitReason::Code(0),
             ..

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::docker::{SHORT_TIMEOUT, blocking};
+use super::docker::{SHORT_TIMEOUT, docker_output};
 use super::owned_resources::ResourceOwner;
 use crate::simulation::machine::Usages;
 
@@ -11,7 +11,7 @@ use crate::simulation::machine::Usages;
 pub fn measure(owner: &ResourceOwner, roots: &BTreeMap<u16, i32>) -> Usages {
     let format = "{{.Name}}\t{{.CPUPerc}}\t{{.MemUsage}}";
     // Without names of containers: the whole command would fail if one of them had just ended.
-    let printed = blocking(&["stats", "--no-stream", "--format", format], SHORT_TIMEOUT);
+    let printed = docker_output(&["stats", "--no-stream", "--format", format], SHORT_TIMEOUT);
     let mut all = Usages::new();
     for (name, cpu, memory) in printed.unwrap_or_default().lines().filter_map(columns) {
         let Some(root) = owner.port_of(name).and_then(|port| roots.get(&port)) else {

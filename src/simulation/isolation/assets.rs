@@ -15,8 +15,6 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Weak};
 use std::time::SystemTime;
 
-use base64::Engine;
-use base64::engine::general_purpose::URL_SAFE_NO_PAD;
 use nix::dir::Dir;
 use nix::fcntl::{OFlag, openat};
 use nix::sys::stat::Mode;
@@ -65,7 +63,7 @@ impl AssetCache {
     /// # Errors
     /// When their directory can't be created.
     pub fn of(&self, repository: &str) -> io::Result<Arc<RepositoryAssets>> {
-        let folder = self.folder.join(URL_SAFE_NO_PAD.encode(Sha256::digest(repository)));
+        let folder = self.folder.join(hex::encode(Sha256::digest(repository)));
         let mut in_use = self.in_use.lock();
         in_use.retain(|_, assets| assets.strong_count() > 0);
         fs::create_dir_all(&folder)?;

@@ -84,9 +84,9 @@ impl Table {
                 watches.recv_timeout(left)
             };
             match come {
-                Ok(mut one) => {
-                    one.lost = self.disk.lost;
-                    self.all.push(one);
+                Ok(mut usage) => {
+                    usage.lost = self.disk.lost;
+                    self.all.push(usage);
                 }
                 Err(RecvTimeoutError::Timeout) => {}
                 Err(RecvTimeoutError::Disconnected) => return,
@@ -94,7 +94,7 @@ impl Table {
             // Its directory is removed. What others write meanwhile must not hide behind the room that this frees.
             for gone in self
                 .all
-                .extract_if(.., |one| one.end.as_ref().is_none_or(oneshot::Sender::is_closed))
+                .extract_if(.., |usage| usage.end.as_ref().is_none_or(oneshot::Sender::is_closed))
             {
                 self.disk.lost += gone.taken;
             }
@@ -118,19 +118,19 @@ impl Table {
         let until = Instant::now() + COUNTS_AT_RESERVE;
         let lost = self.disk.lost;
         // The oldest counts are renewed first.
-        self.all.sort_by_key(|one| one.counted);
-        for one in &mut self.all {
+        self.all.sort_by_key(|usage| usage.counted);
+        for usage in &mut self.all {
             if Instant::now() >= until {
                 break;
             }
-            if one.count(lost, COUNT_AT_RESERVE) {
+            if usage.count(lost, COUNT_AT_RESERVE) {
                 return true;
             }
         }
-        let grown = self.all.iter_mut().filter_map(|one| Some((one.growth()?, one)));
+        let grown = self.all.iter_mut().filter_map(|usage| Some((usage.growth()?, usage)));
         match grown.max_by_key(|(growth, _)| *growth) {
-            Some((growth, one)) if growth >= least => {
-                one.end_for_reserve(growth);
+            Some((growth, usage)) if growth >= least => {
+                usage.end_for_reserve(growth);
                 true
             }
             _ => false,
@@ -141,13 +141,13 @@ impl Table {
     fn count_folders(&mut self, begin: Duration) {
         let lost = self.disk.lost;
         let time = self.disk.pause().min(COUNT);
-        let mut due: Vec<&mut DiskUse> = self.all.iter_mut().filter(|one| one.is_due(lost)).collect();
-        due.sort_by_key(|one| one.counted);
-        for one in due {
+        let mut due: Vec<&mut DiskUse> = self.all.iter_mut().filter(|usage| usage.is_due(lost)).collect();
+        due.sort_by_key(|usage| usage.counted);
+        for usage in due {
             if processor_time().saturating_sub(begin) >= FOLDERS {
                 break;
             }
-            one.count(lost, time);
+            usage.count(lost, time);
         }
     }
 }

@@ -297,7 +297,7 @@ impl Sandbox {
         let mut command = self.command(&spec, port, &Display::Outside(String::new()), None)?;
         command.extend(["/bin/sh", "-c", "true"].map(Into::into));
         let mut complaint = String::new();
-        let ran = Run::new(command, instance.path(), TRIAL).blocking(|line| complaint = line);
+        let ran = Run::new(command, instance.path(), TRIAL).run_blocking(|line| complaint = line);
         match ran.map_err(io::Error::other)?.ending {
             ExitReason::Code(0) => Ok(()),
             _ => Err(io::Error::other(complaint)),

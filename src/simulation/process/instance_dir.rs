@@ -159,7 +159,7 @@ fn run(words: &[&str], folder: &Path) -> io::Result<()> {
     let command = words.iter().map(OsString::from).chain([folder.into()]);
     let mut complaint = String::new();
     // Its mark is not that of a run: ending a run does not kill it.
-    let ran = Run::new(command, Path::new("/"), LIMIT).blocking(|line| complaint = line);
+    let ran = Run::new(command, Path::new("/"), LIMIT).run_blocking(|line| complaint = line);
     let ran = ran.map_err(|error| io::Error::other(format!("{} {error}", words.join(" "))))?;
     if ran.ending == ExitReason::Code(0) {
         Ok(())

@@ -41,7 +41,7 @@ pub fn disk_fault(folder: &Path, reserve: u64) -> Option<Failure> {
 
 /// Why this program can't be started at this moment: it is missing, or the system starts no more processes. Blocks.
 pub fn start_fault(program: &str) -> Option<Failure> {
-    let why = match Run::new([program, "--version"], Path::new("/"), VERSION).blocking(drop) {
+    let why = match Run::new([program, "--version"], Path::new("/"), VERSION).run_blocking(drop) {
         Ok(Ran {
             ending: ExitReason::Code(0),
             ..

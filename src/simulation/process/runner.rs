@@ -80,7 +80,7 @@ impl Run {
     ///
     /// # Errors
     /// Those of `run`.
-    pub fn blocking(mut self, told: impl FnMut(String) + Send) -> Result<Ran, RunError> {
+    pub fn run_blocking(mut self, told: impl FnMut(String) + Send) -> Result<Ran, RunError> {
         self.may_block = true;
         let run = || {
             let runtime = Builder::new_current_thread().enable_all().build()?;
@@ -241,12 +241,12 @@ mod tests {
                 ["answer", "one", "two"].map(str::to_owned).to_vec()
             )
         );
-        let ran = std::thread::spawn(move || shell(script, LONG).blocking(drop))
+        let ran = std::thread::spawn(move || shell(script, LONG).run_blocking(drop))
             .join()
             .unwrap();
         assert_eq!(ran.unwrap().answer, b"answer\n");
         assert!(
-            shell(script, LONG).blocking(drop).is_ok(),
+            shell(script, LONG).run_blocking(drop).is_ok(),
             "also where there is a runtime"
         );
     }

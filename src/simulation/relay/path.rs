@@ -2,7 +2,7 @@
 
 use percent_encoding::percent_decode_str;
 
-use crate::simulation::sessions::Token;
+use crate::simulation::attachment::Token;
 
 /// Prefix of each stream's path.
 const PREFIX: &str = "/stream/";

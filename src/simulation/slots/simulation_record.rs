@@ -11,8 +11,8 @@ use crate::shared::domain::{Failure, Reason};
 use crate::shared::http::Peer;
 use crate::shared::run::{seconds_since_1970, timestamp};
 use crate::shared::text::{excerpt, without_paths};
+use crate::simulation::attachment::Token;
 use crate::simulation::ends::{End, Ended, lost};
-use crate::simulation::sessions::Token;
 use crate::simulation::snapshot::{Simulation, Stage};
 
 /// A simulation of this server.

@@ -8,9 +8,9 @@ use super::simulation_record::{Access, Holder, SimulationRecord, SlotEvent};
 use super::slot_pool::SlotPool;
 use crate::shared::domain::{Failure, ProjectUrl, ReservationId};
 use crate::shared::http::Peer;
+use crate::simulation::attachment::Token;
 use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::ends::End;
-use crate::simulation::sessions::Token;
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::snapshot::Simulation;
 

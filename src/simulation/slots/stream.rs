@@ -6,7 +6,7 @@ use tokio::sync::Semaphore;
 
 use super::simulation_record::{Access, Holder, SimulationRecord, SlotEvent};
 use super::slot_pool::SlotPool;
-use crate::simulation::sessions::Token;
+use crate::simulation::attachment::Token;
 use crate::simulation::simulation_id::SimulationId;
 
 /// The stream of a token.

@@ -36,8 +36,8 @@ const MAX_TAIL: u64 = 96 * 1024;
 /// The page `/watch`.
 #[derive(Template)]
 #[template(path = "simulation/watch.html")]
-struct Watch<'one> {
-    one: &'one Simulation,
+struct Watch<'a> {
+    simulation: &'a Simulation,
     /// The path of the stream, with a token for one connection.
     stream: String,
     /// Webots' own viewer, if this server has it.
@@ -191,12 +191,15 @@ async fn watch(
         return Ok(refusal);
     }
     let snapshot = server.slots.snapshot();
-    let one = snapshot.simulations.iter().find(|one| one.id.to_string() == which.id);
-    let found = one.and_then(|one| Some((one, server.slots.watch(one.id)?)));
-    let (one, token) = found.ok_or_else(|| ErrorNotFound("Error: this simulation does not stream."))?;
+    let simulation = snapshot
+        .simulations
+        .iter()
+        .find(|simulation| simulation.id.to_string() == which.id);
+    let found = simulation.and_then(|simulation| Some((simulation, server.slots.watch(simulation.id)?)));
+    let (simulation, token) = found.ok_or_else(|| ErrorNotFound("Error: this simulation does not stream."))?;
     let installed = webots_viewer::folder(&server.config).map(|_| webots_viewer::PATH);
     let page = Watch {
-        one,
+        simulation,
         stream: format!("stream/{}", token.reveal()),
         script: installed.filter(|_| which.viewer != "small"),
     };

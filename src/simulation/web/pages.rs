@@ -40,10 +40,10 @@ struct Glance<'server> {
 /// The cells of one simulation.
 #[derive(Template)]
 #[template(path = "simulation/row.html")]
-struct SimulationRow<'one> {
+struct SimulationRow<'a> {
     visitor: Visitor,
     shows_port: bool,
-    one: &'one Simulation,
+    simulation: &'a Simulation,
     usage: Usage,
     /// When its time limit ends, in seconds since 1970; 0 if it is not launched.
     ends: u64,
@@ -52,10 +52,10 @@ struct SimulationRow<'one> {
 /// The cells of one simulation that has ended.
 #[derive(Template)]
 #[template(path = "simulation/end.html")]
-struct EndRow<'one> {
+struct EndRow<'a> {
     visitor: Visitor,
-    record: &'one Ended,
-    one: &'one Simulation,
+    record: &'a Ended,
+    simulation: &'a Simulation,
 }
 
 /// The parts of `/monitor` that change.
@@ -70,19 +70,25 @@ pub fn view(
 ) -> Result<PageView, askama::Error> {
     let readings = server.readings.borrow().clone();
     let shows_port = visitor.sees_ports(&server.config);
-    let rows = snapshot.simulations.iter().map(|one| {
-        let usage = one.pid.and_then(|pid| usages.get(&pid)).copied().unwrap_or_default();
-        let ends = one.launched.map_or(0, |launched| launched + server.config.timeout);
+    let rows = snapshot.simulations.iter().map(|simulation| {
+        let usage = simulation
+            .pid
+            .and_then(|pid| usages.get(&pid))
+            .copied()
+            .unwrap_or_default();
+        let ends = simulation
+            .launched
+            .map_or(0, |launched| launched + server.config.timeout);
         let html = SimulationRow {
             visitor,
             shows_port,
-            one,
+            simulation,
             usage,
             ends,
         }
         .render()?;
         Ok(TableRow {
-            key: one.id.to_string(),
+            key: simulation.id.to_string(),
             html,
         })
     });
@@ -92,7 +98,7 @@ pub fn view(
         let html = EndRow {
             visitor,
             record,
-            one: &record.simulation,
+            simulation: &record.simulation,
         }
         .render()?;
         Ok(TableRow {
@@ -158,18 +164,18 @@ fn time(seconds_since_1970: u64) -> String {
 }
 
 /// The URL of a simulation's world as a link, with invisible and text-reversing characters escaped.
-pub fn link(one: &Simulation) -> String {
-    Url::parse(&one.world).map_or_else(|_| one_line(&one.world), String::from)
+pub fn link(simulation: &Simulation) -> String {
+    Url::parse(&simulation.world).map_or_else(|_| one_line(&simulation.world), String::from)
 }
 
 /// The repository of a simulation's world, without its scheme.
-pub fn repository(one: &Simulation) -> String {
-    one_line(one.repository.trim_start_matches("https://"))
+pub fn repository(simulation: &Simulation) -> String {
+    one_line(simulation.repository.trim_start_matches("https://"))
 }
 
 /// The name of a world's file.
-pub fn world(one: &Simulation) -> String {
-    one_line(one.world.rsplit('/').next().unwrap_or_default())
+pub fn world(simulation: &Simulation) -> String {
+    one_line(simulation.world.rsplit('/').next().unwrap_or_default())
 }
 
 /// A stage as text, and the CSS class of its color.
@@ -230,7 +236,7 @@ mod tests {
     fn what_a_client_names_is_only_text() {
         let world = ProjectUrl::parse("https://github.com/u/<i>\"'&/blob/main/worlds/<script>.wbt").unwrap();
         let identity = ClientIdentity::new(Some("<i>root</i>"), Some("<script>'\"&"));
-        let one = Simulation::new(SimulationId::next(), &world, identity);
+        let simulation = Simulation::new(SimulationId::next(), &world, identity);
         for (visitor, has_names) in [
             (Visitor::Anybody, false),
             (Visitor::Stranger, false),
@@ -239,7 +245,7 @@ mod tests {
             let html = SimulationRow {
                 visitor,
                 shows_port: true,
-                one: &one,
+                simulation: &simulation,
                 usage: Usage::default(),
                 ends: 0,
             }

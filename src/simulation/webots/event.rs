@@ -5,7 +5,7 @@ use std::time::Instant;
 use actix::prelude::*;
 
 use crate::shared::domain::Failure;
-use crate::simulation::sessions::Token;
+use crate::simulation::attachment::Token;
 
 /// An event of a running Webots.
 #[derive(Message, Debug, Clone, PartialEq, Eq)]

@@ -1,4 +1,5 @@
-//! The sessions that their clients can resume, and the messages between a connection and its session.
+//! How a connection is attached to the session of its simulation: the messages between them, and the registry in which a
+//! client that returns finds its session by a token.
 
 use std::collections::HashMap;
 use std::fmt;
@@ -28,7 +29,7 @@ pub enum ToClient {
     /// A text of the protocol.
     Text(String),
     /// Why there is nothing more to come. The connection then closes.
-    End(Failure),
+    Close(Failure),
 }
 
 /// An action of a client.
@@ -55,9 +56,9 @@ pub struct Resume {
 
 /// The registered sessions, by the number of their tokens.
 #[derive(Default)]
-pub struct Sessions(Mutex<HashMap<u64, Recipient<Resume>>>);
+pub struct ResumableSessions(Mutex<HashMap<u64, Recipient<Resume>>>);
 
-impl Sessions {
+impl ResumableSessions {
     /// Registers a session until it ends. Returns its first token.
     pub fn register(&self, session: Recipient<Resume>) -> Token {
         let token = Token::random();
@@ -78,7 +79,7 @@ impl Sessions {
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub struct Token {
     /// The same for all tokens of a session.
-    pub(super) number: u64,
+    number: u64,
     secret: u128,
 }
 
