@@ -27,7 +27,6 @@ export const words = {
     webots: 'Webots 自带的查看器',
     small: '小型查看器',
     connect: '连接',
-    disconnect: '断开',
     examples: '示例',
     keep: '保留',
     printed: '项目或仿真器的输出：',
@@ -63,7 +62,13 @@ export const words = {
     unreachable: ['没有连接', '到会话服务器。正在重试……'],
     lost: ['没有连接', '正在不断重试。'],
   },
-  buttons: { leave: '断开', stop: '停止等待' },
+  buttons: {
+    leave: '断开',
+    stop: '停止等待',
+    fullScreen: '全屏',
+    smallScreen: '退出全屏',
+  },
+  ready: '仿真已就绪。',
   stage: {
     clear: '仿真将显示在这里。',
     clearLeft: '您已离开仿真，仿真已结束。',

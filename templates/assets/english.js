@@ -32,7 +32,6 @@ export const words = {
     webots: 'Webots’ own viewer',
     small: 'the small viewer',
     connect: 'Connect',
-    disconnect: 'Disconnect',
     examples: 'Examples',
     keep: 'Keep it',
     printed: 'Printed by the project or the simulator:',
@@ -68,7 +67,13 @@ export const words = {
     unreachable: ['No connection', 'to the session server. Trying again …'],
     lost: ['No connection', 'It is tried again and again.'],
   },
-  buttons: { leave: 'Disconnect', stop: 'Stop waiting' },
+  buttons: {
+    leave: 'Disconnect',
+    stop: 'Stop waiting',
+    fullScreen: 'Full screen',
+    smallScreen: 'Leave full screen',
+  },
+  ready: 'The simulation is ready.',
   stage: {
     clear: 'The simulation appears here.',
     clearLeft: 'You have left the simulation; it has ended.',

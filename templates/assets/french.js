@@ -27,7 +27,6 @@ export const words = {
     webots: 'le visualiseur de Webots',
     small: 'le petit visualiseur',
     connect: 'Se connecter',
-    disconnect: 'Se déconnecter',
     examples: 'Exemples',
     keep: 'La garder',
     printed: 'Affiché par le projet ou le simulateur :',
@@ -63,7 +62,13 @@ export const words = {
     unreachable: ['Pas de connexion', 'au serveur de sessions. Nouvel essai…'],
     lost: ['Pas de connexion', 'De nouveaux essais sont en cours.'],
   },
-  buttons: { leave: 'Se déconnecter', stop: 'Ne plus attendre' },
+  buttons: {
+    leave: 'Se déconnecter',
+    stop: 'Ne plus attendre',
+    fullScreen: 'Plein écran',
+    smallScreen: 'Quitter le plein écran',
+  },
+  ready: 'La simulation est prête.',
   stage: {
     clear: 'La simulation apparaîtra ici.',
     clearLeft: 'Vous avez quitté la simulation ; elle est terminée.',

@@ -27,7 +27,6 @@ export const words = {
     webots: 'der Ansicht von Webots',
     small: 'der kleinen Ansicht',
     connect: 'Verbinden',
-    disconnect: 'Trennen',
     examples: 'Beispiele',
     keep: 'Behalten',
     printed: 'Ausgabe des Projekts oder des Simulators:',
@@ -63,7 +62,13 @@ export const words = {
     unreachable: ['Keine Verbindung', 'zum Sitzungsserver. Neuer Versuch …'],
     lost: ['Keine Verbindung', 'Es wird weiter versucht.'],
   },
-  buttons: { leave: 'Trennen', stop: 'Nicht länger warten' },
+  buttons: {
+    leave: 'Trennen',
+    stop: 'Nicht länger warten',
+    fullScreen: 'Vollbild',
+    smallScreen: 'Vollbild verlassen',
+  },
+  ready: 'Die Simulation ist bereit.',
   stage: {
     clear: 'Hier erscheint die Simulation.',
     clearLeft: 'Du hast die Simulation verlassen; sie ist beendet.',

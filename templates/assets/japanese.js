@@ -27,7 +27,6 @@ export const words = {
     webots: 'Webots のビューアー',
     small: '小型ビューアー',
     connect: '接続',
-    disconnect: '切断',
     examples: '例',
     keep: '続ける',
     printed: 'プロジェクトまたはシミュレーターの出力:',
@@ -63,7 +62,13 @@ export const words = {
     unreachable: ['接続がありません', 'セッションサーバーに再接続しています…'],
     lost: ['接続がありません', '再接続を繰り返しています。'],
   },
-  buttons: { leave: '切断', stop: '待つのをやめる' },
+  buttons: {
+    leave: '切断',
+    stop: '待つのをやめる',
+    fullScreen: '全画面',
+    smallScreen: '全画面を終了',
+  },
+  ready: 'シミュレーションの準備ができました。',
   stage: {
     clear: 'シミュレーションはここに表示されます。',
     clearLeft: 'シミュレーションを離れました。シミュレーションは終了しました。',

@@ -1,98 +1,90 @@
-// Stores the simulation of a tab while it runs, so that the page can resume it after a reload or a return. The store
-// ends with the tab, and no other page can read it.
+// What a tab keeps of one simulation, so that a page that is loaded again, or returned to, goes on: the world that its
+// visitor wants, the ticket for the place in the line, and how to resume the simulation. The store ends with the tab, and
+// no page of another site can read it.
 
 /** @typedef {import('./visit.js').Kept} Kept */
 
-const NAME = 'simulation';
-/** The page's own copy, if the browser stores nothing. @type {Kept | undefined} */
-let own;
-
-/**
- * The simulation of this tab, if it has one.
- * @returns {Kept | undefined}
+/** `named`: the world that the page names itself, which a visitor may have replaced; `ticket`: with the time when it came.
+ * @typedef {{ world: string, named: string, ticket?: { text: string, at: number } | undefined, simulation?: Kept | undefined }} Wish
  */
-export function kept() {
-  try {
-    return JSON.parse(sessionStorage.getItem(NAME) ?? 'null') ?? own;
-  } catch {
-    return own;
-  }
-}
 
-/**
- * Stores the simulation of this tab. Without the browser's store, it can't be resumed after a reload.
- * @param {Kept} simulation
- */
-export function keep(simulation) {
-  own = simulation;
-  try {
-    sessionStorage.setItem(NAME, JSON.stringify(simulation));
-  } catch {
-    // The page's own copy remains.
-  }
-}
-
-/** Removes the simulation: it has ended, was left, or belongs to another tab. */
-export function forget() {
-  own = undefined;
-  try {
-    sessionStorage.removeItem(NAME);
-  } catch {
-    // Nothing was stored.
-  }
-}
-
-/* the place in the line */
-
-const TICKET = 'ticket';
 /** How long a ticket is valid, in milliseconds: the session server sends it again and again. */
 const VALIDITY = 30_000;
-/** @type {{ world: string, ticket: string, at: number } | undefined} */
-let place;
 
-/**
- * Stores the ticket of this tab for its place in the line.
- * @param {string} world
- * @param {string} ticket
- */
-export function keepTicket(world, ticket) {
-  place = { world, ticket, at: Date.now() };
-  try {
-    sessionStorage.setItem(TICKET, JSON.stringify(place));
-  } catch {
-    // The page's own copy remains.
+export class Store {
+  #name;
+  /** The page's own copy, if the browser stores nothing. @type {Wish | undefined} */
+  #own;
+
+  /** @param {string} name of the simulation, among those of the tab */
+  constructor(name) {
+    this.#name = name;
   }
-}
 
-/**
- * The world that this tab waits for, and its ticket, if it is still valid.
- * @returns {{ world: string, ticket: string } | undefined}
- */
-export function keptTicket() {
-  let stored = place;
-  try {
-    stored = JSON.parse(sessionStorage.getItem(TICKET) ?? 'null') ?? place;
-  } catch {
-    // The page's own copy remains.
+  /**
+   * What is kept, if there is something.
+   * @returns {Wish | undefined}
+   */
+  get wish() {
+    try {
+      return JSON.parse(sessionStorage.getItem(this.#name) ?? 'null') ?? this.#own;
+    } catch {
+      return this.#own;
+    }
   }
-  return stored && Date.now() - stored.at < VALIDITY ? stored : undefined;
-}
 
-/**
- * The ticket for a world, if there is one.
- * @param {string} world
- */
-export function ticketFor(world) {
-  const stored = keptTicket();
-  return stored?.world === world ? stored.ticket : undefined;
-}
+  /**
+   * Without the browser's store, nothing is left after a reload.
+   * @param {Wish | undefined} wish
+   */
+  #write(wish) {
+    this.#own = wish;
+    try {
+      if (wish) {
+        sessionStorage.setItem(this.#name, JSON.stringify(wish));
+      } else {
+        sessionStorage.removeItem(this.#name);
+      }
+    } catch {
+      // The page's own copy remains.
+    }
+  }
 
-/** Removes the ticket: its turn is over, or the visitor waits no longer. */
-export function forgetTicket() {
-  place = undefined;
-  try {
-    sessionStorage.removeItem(TICKET);
-  } catch {
-    // Nothing was stored.
+  /**
+   * The visitor wants this world; the ticket for it remains.
+   * @param {string} world
+   * @param {string} named the world that the page names
+   */
+  want(world, named) {
+    const { wish } = this;
+    this.#write({ world, named, ticket: wish?.world === world ? wish.ticket : undefined });
+  }
+
+  /** @param {Kept} simulation */
+  keep(simulation) {
+    this.#write({ world: simulation.world, named: this.wish?.named ?? '', simulation });
+  }
+
+  /**
+   * @param {string} world
+   * @param {string} text
+   */
+  keepTicket(world, text) {
+    this.#write({ world, named: this.wish?.named ?? '', ticket: { text, at: Date.now() } });
+  }
+
+  /**
+   * The ticket for a world, if there is a valid one.
+   * @param {string} world
+   */
+  ticketFor(world) {
+    const { wish } = this;
+    const isValid = wish?.ticket && wish.world === world && Date.now() - wish.ticket.at < VALIDITY;
+    return isValid ? wish.ticket?.text : undefined;
+  }
+
+  /** It is over, or was left. */
+  forget() {
+    this.#write(undefined);
   }
 }

@@ -1,7 +1,7 @@
 // What the viewer page shows during a visit, derived from its state alone. No DOM.
 
 import { adviceFor } from './reasons.js';
-import { isConnected, reasonOf, resumptionOf, SHOWN_AFTER } from './visit.js';
+import { isConnected, reasonOf, SHOWN_AFTER } from './visit.js';
 
 /** @typedef {import('./language.js').Words} Words */
 /** @typedef {import('./visit.js').Going} Going */
@@ -24,19 +24,8 @@ export const STEPS = /** @type {const} */ (['session', 'server', 'place', 'check
  * What is shown. `sentence`: what the server said, if that is not the text. `idle`, `closes`: seconds left. `leave`: the label of the button that leaves, which is off without one.
  * @typedef {{ lamp: 'on' | 'off' | undefined, availability: string[], progress: Progress | undefined,
  *   notice: Notice | undefined, problem: (Notice & { sentence: string | undefined, output: string | undefined }) | undefined,
- *   idle: string | undefined, closes: string | undefined, isWatched: boolean, leave: string | undefined,
- *   opensTabs: boolean }} PageView
+ *   idle: string | undefined, closes: string | undefined, isWatched: boolean, leave: string | undefined }} PageView
  */
-
-/**
- * The title of the page while the visitor waits in the line; otherwise it is that of the page.
- * @param {State} state
- * @param {string} title
- */
-export function titleOf(state, title) {
-  const ahead = state.is === 'asking' ? state.line?.ahead : undefined;
-  return ahead === undefined ? title : `(${ahead + 1}) ${title}`;
-}
 
 /**
  * @param {Visit} visit
@@ -61,7 +50,6 @@ export function view({ fleet, state }, now, words) {
     closes: closes === undefined ? undefined : words.closes(closes),
     isWatched: facts?.isWatched ?? false,
     leave: leaveLabel(state, words),
-    opensTabs: resumptionOf(state) !== undefined,
   };
 }
 
@@ -130,7 +118,7 @@ function capitalized(sentence) {
  * @param {Problem} problem
  * @param {Words} words
  */
-function problemText(problem, words) {
+export function problemText(problem, words) {
   if ('sentence' in problem) {
     const known = new Map(Object.entries(words.reasons));
     return known.get(problem.reason?.code ?? '') ?? capitalized(problem.sentence);

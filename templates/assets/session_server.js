@@ -1,6 +1,5 @@
 // The WebSocket of the session server: whether a simulation server is free, announcements, and the line for a server.
 
-import { keepTicket, ticketFor } from './kept.js';
 import { FleetReader } from './messages.js';
 
 /** @typedef {import('./messages.js').Failure} Failure */
@@ -21,7 +20,10 @@ const RECONNECT = 2000;
  */
 
 export class SessionServer {
+  #base;
+  #store;
   #tell;
+  #isClosed = false;
   /** @type {WebSocket} */
   #socket;
   /** The request that is not answered yet: another one replaces it. @type {{ id: number, world: string } | undefined} */
@@ -29,25 +31,34 @@ export class SessionServer {
 
   /**
    * Connects, again and again.
+   * @param {string} base the URL of the session server
+   * @param {import('./kept.js').Store} store of tickets
    * @param {(event: FleetEvent) => void} tell
    */
-  constructor(tell) {
+  constructor(base, store, tell) {
+    this.#base = base;
+    this.#store = store;
     this.#tell = tell;
     this.#socket = this.#open();
   }
 
   #open() {
     const reader = new FleetReader();
-    const url = new URL('session?announcements=1', location.href);
+    const url = new URL('session?announcements=1', this.#base);
     url.protocol = url.protocol === 'https:' ? 'wss:' : 'ws:';
     const socket = new WebSocket(url);
     socket.addEventListener('open', () => this.#tell({ type: 'connected' }));
     socket.addEventListener('message', ({ data }) => this.#read(reader.read(String(data))));
     socket.addEventListener('close', () => {
       this.#asked = undefined;
+      if (this.#isClosed) {
+        return;
+      }
       this.#tell({ type: 'disconnected' });
       setTimeout(() => {
-        this.#socket = this.#open();
+        if (!this.#isClosed) {
+          this.#socket = this.#open();
+        }
       }, RECONNECT);
     });
     return socket;
@@ -64,7 +75,7 @@ export class SessionServer {
         break;
       case 'ticket':
         if (this.#asked) {
-          keepTicket(this.#asked.world, message.ticket);
+          this.#store.keepTicket(this.#asked.world, message.ticket);
         }
         break;
       case 'queued':
@@ -106,7 +117,7 @@ export class SessionServer {
       return;
     }
     this.#asked = { id, world };
-    this.#socket.send(JSON.stringify({ url: world, reason: true, wait: true, ticket: ticketFor(world) }));
+    this.#socket.send(JSON.stringify({ url: world, reason: true, wait: true, ticket: this.#store.ticketFor(world) }));
   }
 
   /** Gives up the place in the line. */
@@ -115,5 +126,11 @@ export class SessionServer {
     if (this.#socket.readyState === WebSocket.OPEN) {
       this.#socket.send(JSON.stringify({ wait: false }));
     }
+  }
+
+  /** Ends the connection, and with it the place in the line. */
+  close() {
+    this.#isClosed = true;
+    this.#socket.close();
   }
 }

@@ -12,11 +12,12 @@ import { Stream } from './stream.js';
 const LINES = 200;
 
 /**
- * What happens in the viewer. `heard`: the simulator has sent an update.
+ * What happens in the viewer. `heard`: the simulator has sent an update, for this time in
+ * milliseconds.
  * @typedef {{ is: 'loading', status: string, percent: number }
  *   | { is: 'shown', title: string }
  *   | { is: 'mode', mode: Mode }
- *   | { is: 'heard' }
+ *   | { is: 'heard', time: number }
  *   | { is: 'failed', why: import('./scene.js').SceneProblem }
  *   | { is: 'closed' }} ViewerEvent
  */
@@ -73,7 +74,7 @@ export class SmallViewer {
         return this.#show(event.xml);
       case 'update':
         this.#update(event.update);
-        return this.#tell({ is: 'heard' });
+        return this.#tell({ is: 'heard', time: event.update.time });
       case 'mode':
         return this.#enter(event.mode);
       case 'time':
@@ -102,7 +103,7 @@ export class SmallViewer {
     const { viewer } = this.#words;
     const play = button(viewer.play, () => this.#toggle(), viewer.playTitle);
     const step = button(viewer.step, () => this.#stream.send('step'), viewer.stepTitle);
-    const reset = button(viewer.reset, () => this.#reset(), viewer.resetTitle);
+    const reset = button(viewer.reset, () => this.reset(), viewer.resetTitle);
     const home = button(viewer.home, () => this.#camera.home(), viewer.homeTitle);
     const clock = make('span', { className: 'clock', id: 'clock', textContent: viewer.time(0) });
     clock.setAttribute('role', 'timer');
@@ -182,10 +183,23 @@ export class SmallViewer {
   }
 
   #toggle() {
-    this.#stream.send(this.#mode === 'pause' ? 'real-time:-1' : 'pause');
+    if (this.#mode === 'pause') {
+      this.play();
+    } else {
+      this.pause();
+    }
   }
 
-  #reset() {
+  play() {
+    this.#stream.send('real-time:-1');
+  }
+
+  pause() {
+    this.#stream.send('pause');
+  }
+
+  /** Sets the simulation back to its beginning, from where it goes on if it runs. */
+  reset() {
     this.#running = this.#mode === 'pause' ? undefined : this.#mode;
     this.#stream.send('pause');
     this.#stream.send('reset');

@@ -27,7 +27,6 @@ export const words = {
     webots: 'el visor de Webots',
     small: 'el visor pequeño',
     connect: 'Conectar',
-    disconnect: 'Desconectar',
     examples: 'Ejemplos',
     keep: 'Conservarla',
     printed: 'Mostrado por el proyecto o el simulador:',
@@ -63,7 +62,13 @@ export const words = {
     unreachable: ['Sin conexión', 'con el servidor de sesiones. Nuevo intento…'],
     lost: ['Sin conexión', 'Se sigue intentando.'],
   },
-  buttons: { leave: 'Desconectar', stop: 'Dejar de esperar' },
+  buttons: {
+    leave: 'Desconectar',
+    stop: 'Dejar de esperar',
+    fullScreen: 'Pantalla completa',
+    smallScreen: 'Salir de la pantalla completa',
+  },
+  ready: 'La simulación está lista.',
   stage: {
     clear: 'La simulación aparecerá aquí.',
     clearLeft: 'Has salido de la simulación; ha terminado.',

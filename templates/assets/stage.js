@@ -1,4 +1,4 @@
-// The place of the scene on the viewer page: chooses between Webots' own viewer and the small one, and shows it.
+// The place of the scene: chooses between Webots' own viewer and the small one, and shows it.
 
 import { SceneError } from './scene.js';
 import { SmallViewer } from './small_viewer.js';
@@ -10,11 +10,22 @@ const HEARD = 500;
 /** @typedef {import('./visit.js').Event} VisitEvent */
 /** @typedef {Extract<import('./visit.js').Effect, { do: 'show' }>} Show */
 
+/** `base`: the URL of the session server; `time`: told the time of the simulation, in milliseconds.
+ * @typedef {{ words: import('./language.js').Words, base: string, tell: (event: VisitEvent) => void,
+ *   time: (milliseconds: number) => void }} StageOptions
+ */
+
+/** A viewer that shows a simulation. Webots' own freezes by itself.
+ * @typedef {{ play(): void, pause(): void, reset(): void, close(): void, freeze?(): void }} Viewer
+ */
+
 export class Stage {
   #element;
   #words;
+  #base;
   #tell;
-  /** @type {SmallViewer | { close(): void, freeze?: undefined } | undefined} */
+  #time;
+  /** @type {Viewer | undefined} */
   #viewer;
   /** Number of simulations that were shown: later ones replace what earlier ones have not finished. */
   #shows = 0;
@@ -22,26 +33,27 @@ export class Stage {
 
   /**
    * @param {HTMLElement} element
-   * @param {import('./language.js').Words} words
-   * @param {(event: VisitEvent) => void} tell
+   * @param {StageOptions} options
    */
-  constructor(element, words, tell) {
+  constructor(element, { words, base, tell, time }) {
     this.#element = element;
     this.#words = words;
+    this.#base = base;
     this.#tell = tell;
+    this.#time = time;
   }
 
   /**
    * Shows a simulation.
    * @param {Show} simulation
-   * @param {{ choice: string, script: string | undefined, say: (text: string) => void }} options which viewer was chosen,
+   * @param {{ viewer: string, script: string | undefined, say: (text: string) => void }} options which viewer was chosen,
    *   and the configured URL of Webots' own
    */
-  async show({ address, kind, server, isBack }, { choice, script, say }) {
+  async show({ address, kind, server, isBack }, { viewer, script, say }) {
     this.#shows += 1;
     const show = this.#shows;
-    const webots = choice === 'small' ? undefined : ((await ownViewer(server)) ?? script);
-    const isSmall = !webots || (choice === 'automatic' && (await isDemonstration(address, kind)));
+    const webots = viewer === 'small' ? undefined : ((await ownViewer(server)) ?? script);
+    const isSmall = !webots || (viewer === 'automatic' && (await isDemonstration(address, kind)));
     if (show !== this.#shows) {
       return;
     }
@@ -51,7 +63,7 @@ export class Stage {
     } else {
       this.#showWebots(address, webots);
     }
-    if (isSmall && choice === 'webots') {
+    if (isSmall && viewer === 'webots') {
       say(this.#words.stage.onlySmall);
     }
   }
@@ -79,12 +91,11 @@ export class Stage {
             case 'loading':
               return tell({ type: 'scene', scene: event });
             case 'shown':
-              tell({ type: 'scene', scene: { is: 'shown', title: event.title, runs: false } });
-              // On a phone the scene would be out of sight, below the steps.
-              return this.#element.scrollIntoView({ block: 'nearest' });
+              return tell({ type: 'scene', scene: { is: 'shown', title: event.title, runs: false } });
             case 'mode':
               return tell({ type: 'mode', runs: event.mode !== 'pause' });
             case 'heard':
+              this.#time(event.time);
               return this.#hear(tell);
             case 'failed':
               return tell({ type: 'sceneFailed', why: event.why });
@@ -118,10 +129,30 @@ export class Stage {
     const frame = document.createElement('iframe');
     frame.title = this.#words.stage.webotsViewer;
     frame.allow = 'fullscreen';
-    frame.src = `webots-viewer#${new URLSearchParams({ script, stream: address, lang: this.#words.language })}`;
+    const wanted = new URLSearchParams({ script, stream: address, lang: this.#words.language });
+    frame.src = new URL(`webots-viewer#${wanted}`, this.#base).href;
     this.#element.replaceChildren(frame);
-    this.#viewer = { close: () => frame.remove() };
+    /** The frame has no origin. @type {(text: string) => void} */
+    const send = (text) => frame.contentWindow?.postMessage(text, '*');
+    this.#viewer = {
+      play: () => send('real-time:-1'),
+      pause: () => send('pause'),
+      reset: () => send('reset'),
+      close: () => frame.remove(),
+    };
     this.#tell({ type: 'scene', scene: { is: 'framed' } });
+  }
+
+  play() {
+    this.#viewer?.play();
+  }
+
+  pause() {
+    this.#viewer?.pause();
+  }
+
+  reset() {
+    this.#viewer?.reset();
   }
 
   /** Keeps what is shown, and closes its stream: its messages are no sign of life of the simulation's server. */

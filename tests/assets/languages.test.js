@@ -7,6 +7,7 @@ import { test } from 'node:test';
 import { words as english } from '../../templates/assets/english.js';
 import { formats } from '../../templates/assets/intl.js';
 import { firstOf, LANGUAGES } from '../../templates/assets/language.js';
+import { STEPS } from '../../templates/assets/page_view.js';
 import { ADVICE } from '../../templates/assets/reasons.js';
 
 const TEMPLATES = new URL('../../templates/', import.meta.url);
@@ -61,7 +62,7 @@ test('each language has a text for each code and name, without one of English', 
   }
 });
 
-test('the pages have the English words that they name, and no others', () => {
+test('the pages and the element have the English words that they name, and no others', () => {
   /** @type {Set<string>} */
   const used = new Set();
   for (const path of ['page.html', 'session/viewer.html', 'simulation/watch.html', 'simulation/who.html']) {
@@ -82,6 +83,12 @@ test('the pages have the English words that they name, and no others', () => {
       return '';
     });
     assert.doesNotMatch(rest.replace(/<[^>]*>/gs, ''), /[a-z]/i, path);
+  }
+  for (const [, name = ''] of read('assets/panel.js').matchAll(/page(?:\.|\[')([\w-]+)/g)) {
+    used.add(name);
+  }
+  for (const step of STEPS) {
+    used.add(step).add(`about-${step}`);
   }
   assert.deepEqual([...used].sort(), Object.keys(english.page).sort());
 });

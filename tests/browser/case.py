@@ -10,6 +10,15 @@ from playwright.sync_api import expect
 expect.set_options(timeout=1000 * SOON)
 
 
+# Where the viewer page keeps its simulation.
+KEPT = "webots-simulation /viewer simulation"
+
+
+def kept(page):
+    """The simulation that the tab keeps."""
+    return page.tab.evaluate(f"JSON.parse(sessionStorage.getItem('{KEPT}'))?.simulation")
+
+
 def picture(page):
     """A screenshot of the scene."""
     return page.tab.locator("#view").screenshot()

@@ -4,7 +4,7 @@ import json
 import re
 import unittest
 
-from case import Running, seconds
+from case import KEPT, Running, kept, seconds
 from fleet import ROOT, WORLD, free_ports, until
 from playwright.sync_api import expect
 
@@ -20,7 +20,7 @@ class ComingBack(Running):
         page.tab.goto(self.fleet.session.url("monitor"))
         page.tab.go_back()
         self.goes_on(page, server, pid, before)
-        token = page.tab.evaluate("JSON.parse(sessionStorage.getItem('simulation')).token")
+        token = kept(page)["token"]
         self.assertRegex(token, "^[0-9a-f]{48}$")
         self.assertFalse([url for url in page.asked if token in url], "a token in a URL")
         self.assertNotIn(token, server.log.read_text())
@@ -44,12 +44,12 @@ class ComingBack(Running):
     def test_two_tabs_with_one_token_are_one_simulation_and_the_first_is_told(self):
         page, server = self.running()
         pid = self.pid(server)
-        kept = page.tab.evaluate("sessionStorage.getItem('simulation')")
+        stored = page.tab.evaluate(f"sessionStorage.getItem('{KEPT}')")
         other = self.browser.page()
         self.addCleanup(other.close)
         # Like a tab that the browser has duplicated.
         other.tab.add_init_script(
-            f"sessionStorage.getItem('simulation') ?? sessionStorage.setItem('simulation', {json.dumps(kept)})"
+            f"sessionStorage.getItem('{KEPT}') ?? sessionStorage.setItem('{KEPT}', {json.dumps(stored)})"
         )
         other.tab.goto(self.fleet.session.url("viewer"))
         self.goes_on(other, server, pid, 0)

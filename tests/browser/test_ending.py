@@ -4,7 +4,7 @@ import pathlib
 import re
 import unittest
 
-from case import Running, seconds
+from case import Running, kept, seconds
 from fleet import WORLD, until
 from playwright.sync_api import expect
 
@@ -21,13 +21,13 @@ class OfflineForLong(Running):
         until("the simulation is gone", lambda: not server.status()["simulations"])
         until("nothing is left of it", lambda: not pathlib.Path(f"/proc/{pid}").exists())
         expect(page.tab.locator("#notice-advice")).to_have_text("Your simulation may have ended.")
-        self.assertEqual(page.tab.evaluate("JSON.parse(sessionStorage.getItem('simulation')).absence"), 10)
+        self.assertEqual(kept(page)["absence"], 10)
         page.context.set_offline(False)
         expect(page.tab.locator("#problem-text")).to_have_text(
             re.compile(r"^There was no connection for \d+ seconds: the simulation has ended.$")
         )
         expect(page.tab.get_by_role("button", name="Connect", exact=True)).to_be_enabled()
-        self.assertIsNone(page.tab.evaluate("sessionStorage.getItem('simulation')"))
+        self.assertIsNone(kept(page))
 
 
 class Idle(Running):

@@ -18,6 +18,10 @@ use crate::shared::run::timestamp;
 /// Assets of this server's pages, besides those that both servers share.
 const ASSETS: &[Asset] = &[
     asset!("viewer.js"),
+    asset!("viewer.css"),
+    asset!("embed.js"),
+    asset!("panel.js"),
+    asset!("visit_runner.js"),
     asset!("visit.js"),
     asset!("page_view.js"),
     asset!("reasons.js"),

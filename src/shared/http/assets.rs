@@ -16,6 +16,7 @@ macro_rules! asset {
 
 /// Assets that pages of both servers use: of each page, of live pages, and of the viewers.
 pub const COMMON: &[Asset] = &[
+    asset!("theme.css"),
     asset!("style.css"),
     asset!("icon.svg"),
     asset!("live.js"),
@@ -29,7 +30,7 @@ pub const COMMON: &[Asset] = &[
     asset!("spanish.js"),
     asset!("chinese.js"),
     asset!("japanese.js"),
-    asset!("viewer.css"),
+    asset!("simulation.css"),
     asset!("stream.js"),
     asset!("small_viewer.js"),
     asset!("scene.js"),

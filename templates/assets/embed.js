@@ -1,0 +1,316 @@
+// The element `<webots-simulation>`, which runs a world of this server's fleet in any page. `embed.d.ts` describes it.
+
+import { Store } from './kept.js';
+import { firstOf, LANGUAGES } from './language.js';
+import { problemText } from './page_view.js';
+import { Panel } from './panel.js';
+import { isConnected, reasonOf } from './visit.js';
+import { VisitRunner } from './visit_runner.js';
+
+/** @typedef {import('./visit.js').Event} VisitEvent */
+/** @typedef {import('./visit.js').State} State */
+
+/** What a page is told about the visit.
+ * @typedef {'idle' | 'waiting' | 'starting' | 'running' | 'lost' | 'ended'} PublicState
+ */
+
+/** @typedef {{ state: PublicState, world: string | undefined, ahead: number | undefined }} StateDetail */
+
+/** The URL of the session server: these files are its assets. */
+const BASE = new URL('..', import.meta.url).href;
+const STYLES = ['theme.css', 'simulation.css'];
+const NAME = 'webots-simulation';
+
+export class WebotsSimulation extends HTMLElement {
+  static observedAttributes = ['name'];
+
+  /** @type {Panel | undefined} */
+  #panel;
+  /** @type {VisitRunner | undefined} */
+  #runner;
+  /** What is called before the element is ready. @type {(() => void)[]} */
+  #calls = [];
+  #isOpening = false;
+  /** @type {StateDetail} */
+  #told = { state: 'idle', world: undefined, ahead: undefined };
+  /** The world that was started last. */
+  #wanted = '';
+  /** Whether the time is to run once the scene is shown. */
+  #plays = false;
+  /** Whether the scene was shown since the start. */
+  #isReady = false;
+  /** @type {AbortController | undefined} */
+  #listening;
+
+  /* what a page uses */
+
+  /** Where the visit is. */
+  get state() {
+    return this.#told.state;
+  }
+
+  /** The world: the URL of its page on its forge. */
+  get world() {
+    return this.getAttribute('world')?.trim() ?? '';
+  }
+
+  set world(world) {
+    this.setAttribute('world', world);
+  }
+
+  /**
+   * Starts a world; a simulation that runs ends.
+   * @param {string} [world] instead of that of the attribute
+   */
+  start(world = this.world || this.#wanted) {
+    this.#wanted = world;
+    this.#isReady = false;
+    this.#plays = this.hasAttribute('autoplay');
+    this.#call(() => this.#runner?.take({ type: 'submitted', world }));
+  }
+
+  /** Ends the simulation, or waits no longer. */
+  stop() {
+    this.#call(() => this.#runner?.take({ type: 'left' }));
+  }
+
+  /** Lets the time of the simulation run; of one that is not ready, once it is. */
+  play() {
+    this.#plays = this.state !== 'running';
+    this.#call(() => this.#panel?.stage.play());
+  }
+
+  /** Lets the time of the simulation stand. */
+  pause() {
+    this.#plays = false;
+    this.#call(() => this.#panel?.stage.pause());
+  }
+
+  /** Sets the simulation back to its beginning. */
+  reset() {
+    this.#call(() => this.#panel?.stage.reset());
+  }
+
+  /* the life of the element */
+
+  connectedCallback() {
+    if (!this.#runner && !this.#isOpening) {
+      this.#isOpening = true;
+      this.#open();
+    }
+  }
+
+  disconnectedCallback() {
+    // Who moves the element in the page removes it for a moment.
+    queueMicrotask(() => {
+      if (!this.isConnected) {
+        this.#close();
+      }
+    });
+  }
+
+  attributeChangedCallback() {
+    this.#panel?.nameVisitor(this.#name);
+  }
+
+  get #name() {
+    return this.getAttribute('name')?.trim() || undefined;
+  }
+
+  /** @param {() => void} call */
+  #call(call) {
+    if (this.#runner) {
+      call();
+    } else {
+      this.#calls.push(call);
+    }
+  }
+
+  async #open() {
+    const root = this.shadowRoot ?? this.attachShadow({ mode: 'open' });
+    const styles = STYLES.map(styleSheet);
+    root.replaceChildren(...styles);
+    const wanted = firstOf([this.getAttribute('lang') ?? '', ...navigator.languages]);
+    const [{ words }] = await Promise.all([LANGUAGES[wanted](), ...styles.map(loaded)]);
+    this.#isOpening = false;
+    // It may be gone again.
+    if (!this.isConnected) {
+      return;
+    }
+    const take = (/** @type {VisitEvent} */ event) => this.#runner?.take(event);
+    const panel = new Panel(words, BASE, {
+      begin: () => this.start(),
+      take,
+      time: (milliseconds) => this.#dispatch('time', { time: milliseconds / 1000 }),
+    });
+    panel.nameVisitor(this.#name);
+    root.append(panel.element);
+    this.#panel = panel;
+    const store = new Store(`${NAME} ${location.pathname} ${this.id || this.#number()}`);
+    this.#runner = new VisitRunner(BASE, store, panel, () => this.#choices(), this.#changed.bind(this));
+    this.#listen();
+    this.#begin();
+  }
+
+  /** The number of this element among those without an id. */
+  #number() {
+    return [...document.querySelectorAll(`${NAME}:not([id])`)].indexOf(this);
+  }
+
+  #choices() {
+    return {
+      named: this.world,
+      name: this.#name,
+      viewer: this.getAttribute('viewer') ?? 'automatic',
+      script: this.getAttribute('viewer-script') ?? undefined,
+    };
+  }
+
+  #listen() {
+    this.#listening = new AbortController();
+    const { signal } = this.#listening;
+    addEventListener('online', () => this.#runner?.take({ type: 'online' }), { signal });
+    // The page is left, perhaps only for a moment: a simulation that can be resumed waits.
+    addEventListener('pagehide', () => this.#runner?.take({ type: 'hidden' }), { signal });
+    // The browser shows the page from its back/forward cache.
+    addEventListener('pageshow', ({ persisted }) => persisted && this.#runner?.restore(), { signal });
+  }
+
+  /** Goes on with what this tab has kept, or starts by itself. */
+  #begin() {
+    const calls = this.#calls.splice(0);
+    const isRestored = calls.length === 0 && this.#runner?.restore();
+    if (!isRestored && calls.length === 0 && this.hasAttribute('autostart')) {
+      this.start();
+    }
+    for (const call of calls) {
+      call();
+    }
+  }
+
+  #close() {
+    this.#listening?.abort();
+    this.#runner?.close();
+    this.#runner = undefined;
+    this.#panel = undefined;
+    this.#calls = [];
+  }
+
+  /* events */
+
+  /**
+   * @param {string} type
+   * @param {object} detail
+   */
+  #dispatch(type, detail) {
+    this.dispatchEvent(new CustomEvent(type, { detail }));
+  }
+
+  /**
+   * @param {State} before
+   * @param {State} state
+   * @param {VisitEvent} event
+   */
+  #changed(before, state, event) {
+    const last = this.#told;
+    const told = { state: this.#publicState(state), world: worldOf(state), ahead: ahead(state) };
+    this.#told = told;
+    this.#wanted = told.world ?? this.#wanted;
+    if (told.state !== last.state || told.ahead !== last.ahead || told.world !== last.world) {
+      this.#dispatch('state', told);
+    }
+    if (before.is === 'asking' && before.line && state.is === 'connecting') {
+      this.#dispatch('turn', {});
+    }
+    if (isShown(state) && !this.#isReady) {
+      this.#ready();
+    }
+    if (state.is === 'ended' && before.is !== 'ended') {
+      this.#end(state.problem);
+    } else if (event.type === 'left' && before.is !== 'idle' && before.is !== 'ended') {
+      const words = this.#panel?.words.stage;
+      this.#isReady = false;
+      this.#dispatch('ended', { code: 'left', message: isConnected(before) ? words?.clearLeft : words?.clearStopped });
+    }
+  }
+
+  /**
+   * @param {State} state
+   * @returns {PublicState}
+   */
+  #publicState(state) {
+    switch (state.is) {
+      case 'idle':
+      case 'lost':
+      case 'ended':
+      case 'waiting':
+        return state.is;
+      case 'asking':
+        return state.line || state.waitsFor ? 'waiting' : 'starting';
+      case 'connecting':
+        return state.place.is === 'queued' ? 'waiting' : 'starting';
+      case 'running':
+        return isShown(state) || this.#isReady ? 'running' : 'starting';
+      default:
+        return 'starting';
+    }
+  }
+
+  #ready() {
+    this.#isReady = true;
+    this.#panel?.say(this.#panel.words.ready);
+    this.#dispatch('ready', {});
+    if (this.#plays) {
+      this.play();
+    }
+  }
+
+  /** @param {import('./visit.js').Problem} problem */
+  #end(problem) {
+    this.#isReady = false;
+    const words = this.#panel?.words;
+    const reason = reasonOf(problem);
+    const code = 'code' in problem ? problem.code : (reason?.code ?? 'unknown');
+    this.#dispatch('ended', { ...reason, code, message: words && problemText(problem, words) });
+  }
+}
+
+/** @param {string} name */
+function styleSheet(name) {
+  return Object.assign(document.createElement('link'), {
+    rel: 'stylesheet',
+    href: new URL(name, import.meta.url).href,
+  });
+}
+
+/**
+ * Waits until a style sheet is there, or can't be had.
+ * @param {HTMLLinkElement} sheet
+ */
+function loaded(sheet) {
+  return new Promise((resolve) => {
+    sheet.addEventListener('load', resolve);
+    sheet.addEventListener('error', resolve);
+  });
+}
+
+/** @param {State} state */
+function isShown(state) {
+  return state.is === 'running' && (state.scene.is === 'shown' || state.scene.is === 'framed');
+}
+
+/** @param {State} state */
+function ahead(state) {
+  if (state.is === 'asking') {
+    return state.line?.ahead;
+  }
+  return state.is === 'connecting' && state.place.is === 'queued' ? state.place.ahead : undefined;
+}
+
+/** @param {State} state */
+function worldOf(state) {
+  const going = state.is === 'ended' ? state.from : state;
+  return going.is === 'idle' ? undefined : going.goal.world;
+}
+
+customElements.get(NAME) ?? customElements.define(NAME, WebotsSimulation);
