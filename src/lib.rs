@@ -46,8 +46,10 @@
 //!
 //! - **session**: the [`simulation::client::Session`] of one simulation. The *session server* is the other program.
 //! - **simulation**: what a client requests: a slot, a checkout, a Webots. It has an id.
-//! - **slot**: a streaming port for one simulation, or the right to have one. Texts for users say *place*.
+//! - **slot**: a streaming port for one simulation, or the right to have one. Texts for users, keys and `/status` say *place*.
 //! - **queue**: the clients that wait for a slot of one simulation server.
+//! - **line**: the clients that wait at a session server for a slot of the fleet. Each has a [`session::line::Place`] in
+//!   it, which its **ticket** proves; a **pass** entitles it to one slot of one server.
 //! - **connection**: a TCP connection or a WebSocket, never a slot (the key `maxConnections` has its name from the original).
 //! - **client**: who holds a WebSocket of either server; **viewer**: who shows the stream of a Webots.
 //! - **reason**: why a request was refused, a start has failed or a simulation has ended, as a code

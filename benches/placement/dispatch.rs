@@ -78,7 +78,7 @@ impl Dispatcher for Own {
         let instances = Instances {
             running: present - starting,
             starting,
-            places: 100_000,
+            slots: 100_000,
             arrivals,
             ..Instances::default()
         };

@@ -194,7 +194,7 @@ fn speed() {
         load: Load::try_from(30.0).unwrap_or_default(),
         instances: Some(Instances {
             running: 10,
-            places: 100,
+            slots: 100,
             arrivals,
             ..Instances::default()
         }),

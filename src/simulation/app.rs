@@ -132,7 +132,7 @@ pub async fn serve(assembly: Application) -> Result<(), AppError> {
     actix_rt::spawn(Arc::clone(&slots).recheck());
     // This runs unless this thread is blocked, or another one holds the lock of the slots.
     actix_rt::spawn(service_manager::feed_watchdog(async move || {
-        slots.instances().places > 0
+        slots.instances().slots > 0
     }));
     let why = tokio::select! {
         why = handle_signals(&mut signals, &server) => why,

@@ -113,7 +113,7 @@ impl AppState {
     /// [`Load::NO_SLOT`] while no slot is free.
     pub fn load_with_slots(&self) -> Load {
         let instances = self.slots.instances();
-        if instances.present() < instances.places || self.load() > Load::NO_SLOT {
+        if instances.present() < instances.slots || self.load() > Load::NO_SLOT {
             self.load()
         } else {
             Load::NO_SLOT

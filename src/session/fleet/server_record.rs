@@ -220,13 +220,13 @@ impl ServerRecord {
     fn intake(&self, report: &ServerReport, limit: f64) -> (Intake, String) {
         let full = report
             .instances
-            .filter(|instances| instances.present() >= instances.places);
+            .filter(|instances| instances.present() >= instances.slots);
         if self.drained {
             (Intake::Draining, " (drained by drainedServers)".to_owned())
         } else if report.draining {
             (Intake::Draining, " (it drains itself)".to_owned())
         } else if let Some(full) = full {
-            let why = format!(", {} clients in {} places", full.present(), full.places);
+            let why = format!(", {} clients in {} places", full.present(), full.slots);
             (Intake::Full, why)
         } else if report.load.percent() >= limit {
             (Intake::Full, format!(" of {limit:.1} %"))

@@ -665,7 +665,7 @@ mod tests {
             for (id, server) in self.servers.iter().enumerate() {
                 let instances = Instances {
                     running: server.taken,
-                    places: server.slots,
+                    slots: server.slots,
                     freed: server.freed,
                     arrivals: server.arrivals,
                     ..Instances::default()

@@ -186,7 +186,7 @@ impl Backend {
             // The slots that the server has reserved are for clients in flight, from here or elsewhere.
             let on_their_way = count(self.reserved).max(f64::from(instances.reserved));
             let taken = f64::from(instances.present()) + on_their_way + self.sent_by_others();
-            taken < f64::from(instances.places)
+            taken < f64::from(instances.slots)
         };
         self.would_take(policy)
             && !self.is_filled
@@ -251,7 +251,7 @@ impl Backend {
             return;
         };
         // Clients in the queue cost nothing yet.
-        let present = f64::from(instances.present().min(instances.places));
+        let present = f64::from(instances.present().min(instances.slots));
         let shown = (present - self.unseen).max(0.0);
         // While many start, it is uncertain how much of them the load shows.
         let trust = if shown < present { shown / present } else { 1.0 };
@@ -342,7 +342,7 @@ mod tests {
         fn report(&mut self, seconds: f64, load: f64, counts: Option<(u32, u64)>) {
             let instances = counts.map(|(running, arrivals)| Instances {
                 running,
-                places: 1000,
+                slots: 1000,
                 arrivals,
                 ..Instances::default()
             });

@@ -233,7 +233,7 @@ mod tests {
     fn report(load: f64, present: u32, arrivals: u32) -> ServerReport {
         let instances = Instances {
             running: present,
-            places: 1000,
+            slots: 1000,
             arrivals: arrivals.into(),
             ..Instances::default()
         };

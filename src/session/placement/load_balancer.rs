@@ -247,10 +247,10 @@ mod tests {
         }
     }
 
-    fn instances(running: u32, places: u32, arrivals: u64) -> Instances {
+    fn instances(running: u32, slots: u32, arrivals: u64) -> Instances {
         Instances {
             running,
-            places,
+            slots,
             arrivals,
             ..Instances::default()
         }
@@ -361,7 +361,7 @@ mod tests {
                 1.0,
                 Some(Instances {
                     starting,
-                    places: 100,
+                    slots: 100,
                     arrivals,
                     ..Instances::default()
                 }),

@@ -33,7 +33,7 @@ struct Glance<'status> {
     idle: u64,
     starting: u64,
     queued: u64,
-    places: u64,
+    slots: u64,
 }
 
 /// The cells of one simulation server.
@@ -133,7 +133,7 @@ impl<'status> Glance<'status> {
             idle: sum(|instances| instances.idle),
             starting: sum(|instances| instances.starting),
             queued: sum(|instances| instances.queued),
-            places: sum(|instances| instances.places),
+            slots: sum(|instances| instances.slots),
         }
     }
 }

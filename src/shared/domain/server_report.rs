@@ -63,7 +63,8 @@ pub struct Instances {
     /// Webots runs, and so does its simulation.
     pub running: u32,
     /// Number of slots.
-    pub places: u32,
+    #[serde(rename = "places")]
+    pub slots: u32,
     /// Clients that have requested a start since the server started; it only grows.
     pub arrivals: u64,
     /// Slots that are reserved for clients with a pass.

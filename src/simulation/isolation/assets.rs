@@ -99,14 +99,14 @@ impl AssetCache {
         let mut files = Dir::from_fd(there.try_clone()?.into())?;
         let known = files_of(&assets.folder);
         let mut left = (self.limit / PARTS).saturating_sub(known.iter().map(|(_, size)| size).sum());
-        let mut places = MOST_FILES.saturating_sub(known.len());
+        let mut room = MOST_FILES.saturating_sub(known.len());
         for file in files.iter().take(MOST_FILES) {
             let file = file?;
             let Some(name) = file.file_name().to_str().ok().filter(|name| is_asset(name)) else {
                 continue;
             };
             let to = assets.folder.join(name);
-            if places == 0 || to.exists() {
+            if room == 0 || to.exists() {
                 continue;
             }
             let Ok(from) = openat(&there, name, flags, Mode::empty()).map(File::from) else {
@@ -121,7 +121,7 @@ impl AssetCache {
             }
             let mut copy = tempfile::NamedTempFile::new_in(&assets.folder)?;
             left -= io::copy(&mut from.take(about.len()), &mut copy)?;
-            places -= 1;
+            room -= 1;
             copy.persist(to)?;
         }
         Ok(())

@@ -51,15 +51,15 @@ pub fn start(address: IpAddr) -> io::Result<u16> {
 
 async fn serve(listener: std::net::TcpListener) -> io::Result<()> {
     let listener = TcpListener::from_std(listener)?;
-    let places = Arc::new(Semaphore::new(CONNECTIONS));
+    let permits = Arc::new(Semaphore::new(CONNECTIONS));
     loop {
-        let place = Arc::clone(&places).acquire_owned().await.map_err(io::Error::other)?;
+        let permit = Arc::clone(&permits).acquire_owned().await.map_err(io::Error::other)?;
         match listener.accept().await {
             Ok((stream, _)) => {
                 tokio::spawn(async move {
                     // The program has closed its connection, or gets no answer: it sees the end of the connection.
                     converse(stream).await.ok();
-                    drop(place);
+                    drop(permit);
                 });
             }
             Err(_) => sleep(PAUSE).await,

@@ -382,7 +382,7 @@ impl Slots {
             starting: count(&[Stage::CheckingOut, Stage::Launching]),
             idle: count(&[Stage::Idle, Stage::Stopping]),
             running: count(&[Stage::Running]),
-            places: u32::try_from(self.ports.len()).unwrap_or(u32::MAX),
+            slots: u32::try_from(self.ports.len()).unwrap_or(u32::MAX),
             arrivals: self.arrivals,
             reserved: u32::try_from(self.reservations.reserved.len()).unwrap_or(u32::MAX),
             freed: self.freed,

@@ -48,7 +48,7 @@ pub fn gauges<'text>(server: &AppState, snapshot: &Snapshot) -> Vec<Gauge<'text>
         Gauge::plain(
             "webots_simulation_places",
             "Simulations that fit",
-            f64::from(instances.places),
+            f64::from(instances.slots),
         ),
         Gauge {
             name: "webots_simulation_instances",
