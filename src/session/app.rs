@@ -15,7 +15,7 @@ use crate::session::web::configure;
 use crate::shared::config;
 use crate::shared::domain::{ClientUrls, FleetKey, Reason};
 use crate::shared::http::server::{self, HttpServerOptions};
-use crate::shared::http::{BasicAuth, ConnectionLimiter, LiveUpdates, Metrics, SharedPage};
+use crate::shared::http::{AdminAuth, AuthSettings, ConnectionLimiter, LiveUpdates, Metrics, SharedPage};
 use crate::shared::run::{
     AppError, Phase, ServerCommand, Signals, limit_clients, permanent, raise_open_files, service_manager, start,
 };
@@ -64,7 +64,13 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     let websocket_url = config.websocket_url();
     let server = Arc::new(assemble(config, connections, phase)?);
     let shared = web::Data::from(Arc::clone(&server));
-    let app = move || App::new().app_data(shared.clone()).configure(configure);
+    let auth = web::Data::from(Arc::clone(&server.admin_auth));
+    let app = move || {
+        App::new()
+            .app_data(shared.clone())
+            .app_data(auth.clone())
+            .configure(configure)
+    };
     let http = server::serve(socket, server.connections.clone(), options, app)?;
     let handle = http.handle();
     let serving = actix_rt::spawn(http);
@@ -149,8 +155,20 @@ fn assemble(
     )?;
     let registry = Registry::start(Arc::clone(&config), available_sender, waited);
     let key = config.fleet_key.as_ref().map(|key| FleetKey::new(key.reveal()));
+    let key = key.unwrap_or_else(FleetKey::random);
+    let admin_auth = AdminAuth::new(AuthSettings {
+        password: config.admin_password.clone(),
+        tokens: config.api_tokens.clone(),
+        key: key.clone(),
+        has_fleet: config.fleet_key.is_some(),
+        port: config.port,
+        ssl: config.ssl,
+        trusted_proxies: config.trusted_proxies.clone(),
+        user_header: config.user_header.clone(),
+        home: "monitor",
+    });
     Ok(AppState {
-        key: key.unwrap_or_else(FleetKey::random),
+        key,
         registry,
         available,
         client_urls: ClientUrls {
@@ -164,7 +182,7 @@ fn assemble(
         monitor: SharedPage::default(),
         live: LiveUpdates::default(),
         announcement: watch::Sender::default(),
-        admin_auth: config.admin_password.clone().map(BasicAuth::new),
+        admin_auth: Arc::new(admin_auth),
         started: Instant::now(),
         config,
     })

@@ -12,7 +12,7 @@ use super::config::SessionConfig;
 use crate::session::fleet::{FleetStatus, GetStatus, Pick, Registry, Wait};
 use crate::session::line::Place;
 use crate::shared::domain::{ClientUrls, Failure, FleetKey, ProjectUrl, PublicAddress, Reason};
-use crate::shared::http::{BasicAuth, ConnectionKind, ConnectionLimiter, LiveUpdates, Metrics, SharedPage};
+use crate::shared::http::{AdminAuth, ConnectionKind, ConnectionLimiter, LiveUpdates, Metrics, SharedPage};
 use crate::shared::run::Phase;
 
 /// The label of requests for which a simulation server is chosen; the label of the others is the code of their reason.
@@ -44,8 +44,8 @@ pub struct AppState {
     pub live: LiveUpdates,
     /// The administrator's announcement: one line of text, never markup; empty if there is none.
     pub announcement: watch::Sender<String>,
-    /// Checks the administrator's password, if one is configured.
-    pub admin_auth: Option<BasicAuth>,
+    /// Tells administrators from others.
+    pub admin_auth: Arc<AdminAuth>,
     /// When the server was started.
     pub started: Instant,
 }

@@ -17,7 +17,8 @@ use super::{announcer, readiness};
 use crate::shared::domain::{AdmissionRules, FleetKey, Reason, ServerRun};
 use crate::shared::http::server::{self, HttpServerOptions};
 use crate::shared::http::{
-    AddressQuota, BasicAuth, ConnectionLimiter, LiveUpdates, Metrics, STREAMS_PER_CLIENT, SharedPage, TCP_PER_CLIENT,
+    AddressQuota, AdminAuth, AuthSettings, ConnectionLimiter, LiveUpdates, Metrics, STREAMS_PER_CLIENT, SharedPage,
+    TCP_PER_CLIENT,
 };
 use crate::shared::run::{
     AppError, Phase, ServerCommand, Signals, limit_clients, permanent, raise_open_files, service_manager, start,
@@ -110,10 +111,12 @@ pub async fn serve(assembly: Application) -> Result<(), AppError> {
     let stream_thread = StreamThread::start(options.silence)?;
     let silence = options.silence;
     let answer = server.config.timing.answer;
+    let auth = web::Data::from(Arc::clone(&server.admin_auth));
     let app = move || {
         let upstream = Upstream::new(simulations, stream_thread.clone(), silence, answer);
         App::new()
             .app_data(shared.clone())
+            .app_data(auth.clone())
             .app_data(upstream)
             .configure(configure)
     };
@@ -237,6 +240,18 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
     for refusal in Reason::REFUSALS {
         starts.with_label_values(&[refusal.code()]);
     }
+    let fleet_key = config.fleet_key.as_ref().map(|key| FleetKey::new(key.reveal()));
+    let admin_auth = AdminAuth::new(AuthSettings {
+        password: config.admin_password.clone(),
+        tokens: config.api_tokens.clone(),
+        key: fleet_key.clone().unwrap_or_else(FleetKey::random),
+        has_fleet: fleet_key.is_some(),
+        port: config.port,
+        ssl: config.ssl,
+        trusted_proxies: config.trusted_proxies.clone(),
+        user_header: config.user_header.clone(),
+        home: "monitor",
+    });
     let failed_starts = Arc::default();
     let problem = readiness::watch(
         Arc::clone(&config),
@@ -246,7 +261,7 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
     );
     Ok(AppState {
         rules,
-        fleet_key: config.fleet_key.as_ref().map(|key| FleetKey::new(key.reveal())),
+        fleet_key,
         server_run: ServerRun(rand::random()),
         problem,
         failed_starts,
@@ -262,7 +277,7 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
         run: Arc::new(run),
         phase: watch::Sender::new(Phase::Open),
         webots_threads: [thread()?, thread()?, thread()?, thread()?],
-        admin_auth: config.admin_password.clone().map(BasicAuth::new),
+        admin_auth: Arc::new(admin_auth),
         connections: ConnectionLimiter::new(max_tcp(&config), config.max_clients, config.max_clients_per_address),
         metrics,
         starts,

@@ -14,7 +14,7 @@ use super::slots::SlotPool;
 use crate::shared::domain::{
     AdmissionRules, Failure, FleetKey, Load, Pass, ProjectUrl, Reason, ReservationId, ServerRun,
 };
-use crate::shared::http::{AddressQuota, BasicAuth, ConnectionLimiter, LiveUpdates, Metrics, SharedPage};
+use crate::shared::http::{AddressQuota, AdminAuth, ConnectionLimiter, LiveUpdates, Metrics, SharedPage};
 use crate::shared::run::Phase;
 use crate::simulation::checkout::CheckoutService;
 use crate::simulation::container::ContainerService;
@@ -66,8 +66,8 @@ pub struct AppState {
     pub ends: Ends,
     /// The threads on which the actors of Webots run.
     pub webots_threads: [ArbiterHandle; WEBOTS_THREADS],
-    /// Checks the administrator's password, if one is configured.
-    pub admin_auth: Option<BasicAuth>,
+    /// Tells administrators from others.
+    pub admin_auth: Arc<AdminAuth>,
     /// Limits and counts connections.
     pub connections: ConnectionLimiter,
     /// Rate limit of requests for simulations per address.

@@ -9,11 +9,12 @@ const form = document.getElementById('announce');
 /** @param {{ text?: string }} order without a text, the announcement ends */
 async function announce(order) {
   const request = { method: 'POST', headers: { 'Content-Type': 'application/json' }, body: JSON.stringify(order) };
-  // The browser asks for the password.
   const problem = find('announce-problem', HTMLElement);
   const answer = await fetch('announcement', request).catch(() => undefined);
   if (answer?.ok) {
     problem.textContent = '';
+  } else if (answer?.status === 401) {
+    location.assign('sign-in?to=monitor');
   } else {
     problem.textContent = answer ? await answer.text() : 'The server does not answer.';
   }

@@ -68,6 +68,14 @@ class Page:
         if message.type in ("error", "warning") and OWN_SPEED not in message.text:
             self.complaints.append(f"{message.type}: {message.text}")
 
+    def sign_in(self, server, password, name="teacher"):
+        """Signs in at a server as an administrator, and returns to the page that follows."""
+        self.tab.goto(f"{server}/sign-in")
+        self.tab.get_by_label("Your name").fill(name)
+        self.tab.get_by_label("Password").fill(password)
+        self.tab.get_by_role("button", name="Sign in").click()
+        self.tab.wait_for_url(lambda url: "sign-in" not in url)
+
     def from_address(self, address):
         """From now on its requests seem to be forwarded by a web server, from this address."""
         self.context.set_extra_http_headers({"X-Forwarded-For": address})

@@ -136,14 +136,13 @@ def pages(browser, demo, folder):
 def a_class(browser, demo, folder):
     """Takes pictures of a teacher's pages: who is who, watching, stopping, announcing, a list of 200 on a phone."""
     hosts = {"localhost"}
-    credentials = {"username": "teacher", "password": PASSWORD}
     anna = start(browser, demo, "Playground", width=WIDTH, height=860, name="Anna")
     ben = start(browser, demo, "Carousel", height=860, name="Ben")
     others = browser.page(width=360, height=300)
     others.tab.goto(f"http://{demo.session}/viewer")
     start_all(others, NAMES[2:12], lambda name: None, PLAYGROUND)
-    teacher = browser.page(width=WIDTH, height=860, http_credentials=credentials)
-    teacher.tab.goto(f"http://{demo.simulation}/sign-in")
+    teacher = browser.page(width=WIDTH, height=860)
+    teacher.sign_in(f"http://{demo.simulation}", PASSWORD)
     rows = teacher.tab.locator("#simulations tr")
     expect(rows).to_have_count(12)
     expect(rows.locator("[data-label=CPU]", has_text="%")).to_have_count(12)
@@ -154,12 +153,13 @@ def a_class(browser, demo, folder):
     with teacher.context.expect_page() as opened:
         row.get_by_role("link", name="Watch").click()
     opened.value.close()
-    watching = browser.page(width=WIDTH, height=760, http_credentials=credentials)
+    watching = browser.page(width=WIDTH, height=760)
+    watching.sign_in(f"http://{demo.simulation}", PASSWORD)
     watching.tab.goto(row.get_by_role("link", name="Watch").evaluate("link => link.href"))
     expect(watching.tab.locator("#state")).to_have_text("Watching")
     expect(anna.tab.locator("#watched")).to_be_visible()
-    fleet = browser.page(width=WIDTH, height=860, http_credentials=credentials)
-    fleet.tab.goto(f"http://{demo.session}/monitor")
+    fleet = browser.page(width=WIDTH, height=860)
+    fleet.sign_in(f"http://{demo.session}", PASSWORD)
     fleet.tab.get_by_label("Text for all open viewers").fill("Maintenance from noon on: please save your work.")
     fleet.tab.get_by_role("button", name="Announce").click()
     expect(anna.tab.locator("#announcement")).to_be_visible()
@@ -169,15 +169,15 @@ def a_class(browser, demo, folder):
     row.get_by_role("button", name="Stop").click()
     teacher.tab.get_by_label("Reason").fill("Please come to my desk")
     shoot(teacher, folder, "stop", hosts, teacher.tab.get_by_role("dialog"), margin=60)
-    phone(browser, demo, folder, credentials, hosts)
+    phone(browser, demo, folder, hosts)
     for one in [anna, ben, others, teacher, fleet]:
         one.close()
 
 
-def phone(browser, demo, folder, credentials, hosts):
+def phone(browser, demo, folder, hosts):
     """Takes a picture of the list of a large class, made of many copies of each row."""
-    page = browser.page(width=390, height=844, http_credentials=credentials)
-    page.tab.goto(f"http://{demo.simulation}/sign-in")
+    page = browser.page(width=390, height=844)
+    page.sign_in(f"http://{demo.simulation}", PASSWORD)
     row = page.tab.locator("#simulations tr").first
     known = page.tab.locator("#simulations tr").evaluate_all(
         "rows => rows.map((row) => [row.dataset.key, row.innerHTML])"

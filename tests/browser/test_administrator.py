@@ -4,7 +4,6 @@ import json
 import unittest
 import urllib.parse
 
-from browser import Page
 from case import BrowserTest
 from fleet import until
 from playwright.sync_api import expect
@@ -18,14 +17,8 @@ class Administrator(BrowserTest):
     simulation = {"adminPassword": PASSWORD}
 
     def page_with_password(self, url, **options):
-        context = self.browser.chromium.new_context(
-            http_credentials={"username": "teacher", "password": PASSWORD},
-            viewport={"width": options.get("width", 1280), "height": options.get("height", 900)},
-        )
-        context.set_default_timeout(60_000)
-        page = Page(context)
-        self.addCleanup(page.close)
-        page.tab.goto(url)
+        page = self.open(url, **options)
+        page.sign_in(url.removesuffix("/monitor"), PASSWORD)
         return page
 
     def student(self, name):
@@ -47,8 +40,16 @@ class Administrator(BrowserTest):
         self.assertNotIn("Anna", stranger.tab.content())
         expect(stranger.tab.get_by_role("button", name="Stop")).to_have_count(0)
 
-        teacher = self.page_with_password(server.url("monitor"))
+        teacher = self.open(server.url("monitor"))
         teacher.tab.get_by_role("link", name="Sign in").click()
+        self.assertEqual(teacher.faults(), [])
+        teacher.tab.get_by_label("Password").fill("a guess")
+        teacher.tab.get_by_role("button", name="Sign in").click()
+        expect(teacher.tab.get_by_role("alert")).to_have_text("This is not the password.")
+        self.assertEqual(teacher.faults(), [])
+        # The browser reports the status of the page.
+        teacher.complaints.clear()
+        teacher.sign_in(server.url("").rstrip("/"), PASSWORD)
         row = teacher.tab.locator("#simulations tr")
         expect(row.locator('td[data-label="Who"]')).to_contain_text(LABEL)
         expect(row.locator('td[data-label="Who"]')).to_contain_text("unverified")
@@ -80,6 +81,9 @@ class Administrator(BrowserTest):
         expect(teacher.tab.locator("#ends tr").first).to_contain_text("administrator")
         expect(teacher.tab.locator("#ends tr").first).to_contain_text("Anna")
         expect(teacher.tab.locator("#simulations tr")).to_have_count(0)
+        teacher.tab.get_by_role("button", name="Sign out").click()
+        expect(teacher.tab.get_by_role("link", name="Sign in")).to_be_visible()
+        expect(teacher.tab.locator("#ends tr").first).not_to_contain_text("Anna")
 
     def test_an_announcement_is_seen_on_open_pages_and_is_gone_when_it_is_over(self):
         viewer = self.open(self.fleet.session.url("viewer"))

@@ -59,14 +59,13 @@ class AClass(BrowserTest):
 
     def monitors(self):
         """The teacher's pages: the monitor of each machine, opened from the fleet's monitor."""
-        credentials = {"username": "teacher", "password": PASSWORD}
-        fleet = self.visit("teacher", "monitor", http_credentials=credentials)
+        fleet = self.visit("teacher", "monitor")
+        fleet.sign_in(self.fleet.url("").rstrip("/"), PASSWORD)
         expect(fleet.tab.locator("#servers .state.up, #servers .state.full")).to_have_count(2)
         machines = []
         for link in fleet.tab.locator("#servers th a").all():
             machine = Page(fleet.context)
-            machine.tab.goto(link.get_attribute("href"))
-            machine.tab.get_by_role("link", name="Sign in").click()
+            machine.sign_in(link.get_attribute("href").removesuffix("/monitor"), PASSWORD)
             expect(machine.tab.locator("#live")).to_have_text("Live")
             machines.append(machine)
         return fleet, machines

@@ -58,7 +58,9 @@ class Languages(BrowserTest):
         self.assertEqual(len(servers), 1)
         simulation = servers[0].status()["simulations"][0]["id"]
         watch = servers[0].url(f"watch?id={simulation}&lang=ja")
-        watching = self.open(watch, http_credentials={"username": "admin", "password": "secret"})
+        watching = self.open("about:blank")
+        watching.sign_in(servers[0].url("").rstrip("/"), "secret")
+        watching.tab.goto(watch)
         expect(watching.tab.locator("#state")).to_have_text("見学中")
         expect(watching.tab.locator("h1")).to_have_text("シミュレーションの見学")
         expect(watching.tab.locator("#mode")).to_have_text("実時間")

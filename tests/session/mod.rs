@@ -12,6 +12,7 @@ mod placement;
 mod pushing;
 mod requests;
 mod seeing;
+mod signing_in;
 mod stopping;
 mod trust;
 mod waiting;

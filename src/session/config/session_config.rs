@@ -13,8 +13,8 @@ use super::timing::Timing;
 use crate::session::placement::PlacementPolicy;
 use crate::shared::config::keys::keys;
 use crate::shared::config::{
-    Configuration, ExpandedPath, Secret, check_fleet_key, expanded, is_web_url, one_or_many, optional_whole, percent,
-    require, seconds, whole,
+    ApiToken, Configuration, ExpandedPath, Secret, check_api_tokens, check_fleet_key, expanded, is_web_url,
+    one_or_many, optional_whole, percent, require, seconds, whole,
 };
 use crate::shared::domain::{PublicAddress, PublicUrl, complete_host};
 use crate::shared::http::TrustedProxies;
@@ -65,6 +65,9 @@ pub struct SessionConfig {
     pub webhook: Option<Secret> = None,
     /// Password for actions such as `/announcement`. Default: none, and actions are off.
     pub admin_password: Option<Secret> = None,
+    /// Tokens of programs, each with what it may do. Default: none.
+    #[serde(deserialize_with = "one_or_many")]
+    pub api_tokens: Vec<ApiToken> = Vec::new(),
     /// Secret of at least 16 letters that all servers of a fleet share: it signs the passes and tickets of the line.
     /// Default: none, and a free slot is for the first client that comes.
     pub fleet_key: Option<Secret> = None,
@@ -168,6 +171,7 @@ impl Configuration for SessionConfig {
         let warning = complete_host(&mut self.server, self.port_rewrite)?;
         self.check_servers()?;
         check_fleet_key(self.fleet_key.as_ref())?;
+        check_api_tokens(&self.api_tokens)?;
         require(self.timing.silence > self.timing.ping, "timing.silence", || {
             format!("{} s is not more than timing.ping", self.timing.silence.as_secs_f64())
         })?;

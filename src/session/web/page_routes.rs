@@ -48,7 +48,7 @@ async fn monitor(request: HttpRequest, server: web::Data<AppState>) -> Result<Ht
         let view = view(&server, &*server.status().await?).map_err(ErrorInternalServerError)?;
         let page = Monitor {
             started: timestamp(SystemTime::now() - server.started.elapsed()),
-            has_actions: server.admin_auth.is_some(),
+            has_actions: server.admin_auth.is_on(),
             view,
         };
         page.render().map_err(ErrorInternalServerError)

@@ -15,7 +15,7 @@ use super::web_client::WebClient;
 use super::{metrics, page_routes};
 use crate::session::state::AppState;
 use crate::shared::http::routing::{self, GET, POST, READ, json_body, path, retry_after};
-use crate::shared::http::{CONTENT_TYPE, ConnectionKind, refuse_action, websocket};
+use crate::shared::http::{CONTENT_TYPE, ConnectionKind, sign_in, websocket};
 use crate::shared::text::one_line;
 
 /// The body of `POST /announcement`.
@@ -44,6 +44,7 @@ fn add(app: &mut web::ServiceConfig) {
         .service(path("/session", GET, session))
         .service(path("/load", READ, load))
         .configure(page_routes::configure)
+        .configure(sign_in::configure)
         .service(path("/status", READ, status_json))
         .service(path("/metrics", READ, metrics_text))
         .service(path("/health", READ, health))
@@ -147,10 +148,10 @@ async fn metrics_text(server: web::Data<AppState>) -> Result<HttpResponse> {
 
 /// Replaces the announcement, which requires the administrator's password; an empty text removes it.
 async fn announcement(request: HttpRequest, payload: web::Payload, server: web::Data<AppState>) -> HttpResponse {
-    let peer = server.config.trusted_proxies.peer(&request);
-    if let Some(refusal) = refuse_action(server.admin_auth.as_ref(), &request, peer) {
-        return refusal;
-    }
+    let administrator = match server.admin_auth.actor(&request) {
+        Ok(administrator) => administrator,
+        Err(error) => return HttpResponse::from_error(error),
+    };
     let text = match json_body(&request, payload, "{\"text\": TEXT}").await {
         Ok(Announcement { text }) => one_line(text.trim()),
         Err(refusal) => return refusal,
@@ -159,7 +160,7 @@ async fn announcement(request: HttpRequest, payload: web::Payload, server: web::
         let words = format!("Error: an announcement has at most {MAX_ANNOUNCEMENT} letters.");
         return HttpResponse::BadRequest().body(words);
     }
-    log::info!("client {peer}: announces {text:?}");
+    log::info!("{administrator}: announces {text:?}");
     server.announcement.send_replace(text);
     HttpResponse::Ok().body("ok")
 }

@@ -1,11 +1,13 @@
 //! Configuration files: loading, errors, and the types of values.
 
+mod api_token;
 mod fleet_key;
 pub mod keys;
 mod loading;
 mod secret;
 mod value;
 
+pub use api_token::{ApiToken, Permission, check_api_tokens};
 pub use fleet_key::check_fleet_key;
 pub use loading::{Configuration, LoadedConfig, load, require};
 pub use secret::Secret;

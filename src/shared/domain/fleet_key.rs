@@ -17,6 +17,10 @@ pub enum Purpose {
     Ticket,
     /// The answer of a session server to the challenge of a simulation server.
     Link,
+    /// An administrator's sign-in at one server.
+    SignIn,
+    /// An administrator's way from the session server to the page of a simulation server.
+    Entry,
 }
 
 /// Length of a signature, in bytes.

@@ -3,6 +3,7 @@
 
 use std::collections::HashMap;
 use std::collections::hash_map::Entry;
+use std::hash::Hash;
 use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -168,22 +169,25 @@ impl actix_web::ResponseError for ConnectionLimitError {
     }
 }
 
-/// Largest number of addresses that are tracked.
-const MAX_ADDRESSES: usize = 10_000;
+/// Largest number of keys that are tracked.
+const MAX_KEYS: usize = 10_000;
 
 /// Rate limit per client address.
+pub type AddressQuota = Quota<IpAddr>;
+
+/// Rate limit per key.
 #[derive(Debug)]
-pub struct AddressQuota {
+pub struct Quota<Key> {
     /// The time in which one use becomes available again.
     interval: Duration,
     /// The time in which a whole quota becomes available again.
     whole: Duration,
-    /// When the whole quota of an address is available again (GCRA: its theoretical arrival time). Other addresses have
-    /// used nothing.
-    restored: Mutex<HashMap<IpAddr, Instant>>,
+    /// When the whole quota of a key is available again (GCRA: its theoretical arrival time). Other keys have used
+    /// nothing.
+    restored: Mutex<HashMap<Key, Instant>>,
 }
 
-impl AddressQuota {
+impl<Key: Copy + Eq + Hash> Quota<Key> {
     /// An unused quota: `burst` uses at once, and `per_minute` uses in each minute after that.
     pub fn new(burst: u32, per_minute: u32) -> Self {
         let interval = Duration::from_mins(1) / per_minute.max(1);
@@ -194,16 +198,16 @@ impl AddressQuota {
         }
     }
 
-    /// Takes one use from the quota of an address. Returns whether there was one left; always true if the address is
-    /// unknown.
-    pub fn take(&self, address: Option<IpAddr>) -> bool {
-        let Some(address) = address else { return true };
+    /// Takes one use from the quota of a key, such as an address. Returns whether there was one left; always true if the
+    /// key is unknown.
+    pub fn take(&self, key: Option<Key>) -> bool {
+        let Some(key) = key else { return true };
         let now = Instant::now();
         let mut restored = self.restored.lock();
-        if restored.len() >= MAX_ADDRESSES && !restored.contains_key(&address) {
+        if restored.len() >= MAX_KEYS && !restored.contains_key(&key) {
             make_room(&mut restored, now);
         }
-        let at = restored.entry(address).or_insert(now);
+        let at = restored.entry(key).or_insert(now);
         let next = now.max(*at) + self.interval;
         let is_left = next <= now + self.whole;
         if is_left {
@@ -213,9 +217,9 @@ impl AddressQuota {
     }
 
     /// Gives back one use that was taken.
-    pub fn give_back(&self, address: Option<IpAddr>) {
-        if let Some(address) = address
-            && let Some(at) = self.restored.lock().get_mut(&address)
+    pub fn give_back(&self, key: Option<Key>) {
+        if let Some(key) = key
+            && let Some(at) = self.restored.lock().get_mut(&key)
             && let Some(earlier) = at.checked_sub(self.interval)
         {
             *at = earlier;
@@ -223,13 +227,13 @@ impl AddressQuota {
     }
 }
 
-/// Forgets the addresses whose whole quota is available again; if many remain, also the half that has used the least. So
+/// Forgets the keys whose whole quota is available again; if many remain, also the half that has used the least. So
 /// clients with very many addresses can neither fill the memory nor have others refused.
-fn make_room(restored: &mut HashMap<IpAddr, Instant>, now: Instant) {
+fn make_room<Key: Eq + Hash>(restored: &mut HashMap<Key, Instant>, now: Instant) {
     restored.retain(|_, at| *at > now);
-    if restored.len() > MAX_ADDRESSES / 2 {
+    if restored.len() > MAX_KEYS / 2 {
         let mut times: Vec<Instant> = restored.values().copied().collect();
-        let (_, &mut middle, _) = times.select_nth_unstable(MAX_ADDRESSES / 2);
+        let (_, &mut middle, _) = times.select_nth_unstable(MAX_KEYS / 2);
         restored.retain(|_, at| *at > middle);
     }
 }
@@ -303,7 +307,7 @@ mod tests {
             let other = std::net::Ipv6Addr::from_bits((0x2001_0db9 << 96) + (number << 64));
             assert!(quota.take(Some(other.into())), "{other}");
         }
-        assert!(quota.restored.lock().len() <= MAX_ADDRESSES);
+        assert!(quota.restored.lock().len() <= MAX_KEYS);
         assert!(!quota.take(guesser), "the one who has used most is not forgotten");
     }
 }

@@ -3,6 +3,8 @@
 pub mod assets;
 mod auth;
 mod client_stream;
+mod cookie;
+mod guesses;
 mod limits;
 mod live_updates;
 pub mod liveness;
@@ -12,10 +14,11 @@ mod page;
 mod peer;
 pub mod routing;
 pub mod server;
+pub mod sign_in;
 pub mod tls;
 pub mod websocket;
 
-pub use auth::{AuthError, BasicAuth, refuse_action, require_administrator};
+pub use auth::{AdminAuth, Administrator, AuthError, AuthSettings};
 pub use client_stream::upgrade;
 pub use limits::{
     AddressQuota, ConnectionKind, ConnectionLimiter, ConnectionPermit, STREAMS_PER_CLIENT, TCP_PER_CLIENT, share,

@@ -54,7 +54,8 @@ fn restricted(policy: &str) -> HttpResponseBuilder {
     let mut response = HttpResponse::Ok();
     response
         .insert_header((header::CONTENT_SECURITY_POLICY, policy))
-        .insert_header((header::REFERRER_POLICY, "no-referrer"))
+        // Other sites get none. With `no-referrer`, forms would be sent without the `Origin` of their page.
+        .insert_header((header::REFERRER_POLICY, "same-origin"))
         .insert_header(("Cross-Origin-Opener-Policy", "same-origin"))
         .content_type("text/html; charset=utf-8");
     response

@@ -7,7 +7,7 @@ use actix_web::dev::HttpServiceFactory;
 use actix_web::http::header::{self, HeaderName, HeaderValue};
 use actix_web::http::{Method, StatusCode};
 use actix_web::middleware::DefaultHeaders;
-use actix_web::web::Payload;
+use actix_web::web::{Bytes, Payload};
 use actix_web::{FromRequest, Handler, HttpRequest, HttpResponse, Resource, Responder, guard, web};
 use rand::RngExt;
 use serde::de::DeserializeOwned;
@@ -74,6 +74,19 @@ pub async fn json_body<T: DeserializeOwned + Default>(
     payload: Payload,
     form: &str,
 ) -> Result<T, HttpResponse> {
+    let body = body(request, payload).await?;
+    if body.is_empty() {
+        return Ok(T::default());
+    }
+    serde_json::from_slice(&body)
+        .map_err(|_| HttpResponse::BadRequest().body(format!("Error: the body is not {form}.")))
+}
+
+/// Reads a body.
+///
+/// # Errors
+/// The answer to a request whose body can't be read.
+pub async fn body(request: &HttpRequest, payload: Payload) -> Result<Bytes, HttpResponse> {
     let headers = request.headers();
     let length = headers
         .get(header::CONTENT_LENGTH)
@@ -82,12 +95,10 @@ pub async fn json_body<T: DeserializeOwned + Default>(
         let words = format!("Error: a body has a Content-Length of at most {MAX_BODY} bytes.");
         return Err(HttpResponse::PayloadTooLarge().force_close().body(words));
     }
-    let wrong = || HttpResponse::BadRequest().body(format!("Error: the body is not {form}."));
     let read = actix_web::rt::time::timeout(BODY_TIMEOUT, payload.to_bytes_limited(MAX_BODY)).await;
     match read {
-        Ok(Ok(Ok(body))) if body.is_empty() => Ok(T::default()),
-        Ok(Ok(Ok(body))) => serde_json::from_slice(&body).map_err(|_| wrong()),
-        Ok(_) => Err(wrong()),
+        Ok(Ok(Ok(body))) => Ok(body),
+        Ok(_) => Err(HttpResponse::BadRequest().body("Error: the body can't be read.")),
         Err(_) => Err(HttpResponse::RequestTimeout()
             .force_close()
             .body("Error: the body did not come in time.")),

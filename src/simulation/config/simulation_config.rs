@@ -15,8 +15,8 @@ use super::timing::Timing;
 use super::urls::Streaming;
 use crate::shared::config::keys::keys;
 use crate::shared::config::{
-    Configuration, ExpandedPath, Secret, check_fleet_key, expanded, minutes, one_or_many, optional_whole, percent,
-    require, seconds, whole,
+    ApiToken, Configuration, ExpandedPath, Secret, check_api_tokens, check_fleet_key, expanded, minutes, one_or_many,
+    optional_whole, percent, require, seconds, whole,
 };
 use crate::shared::domain::{PublicUrl, UrlPrefix, complete_host};
 use crate::shared::http::{Origin, TrustedProxies};
@@ -161,6 +161,9 @@ pub struct SimulationConfig {
     pub allowed_origins: Vec<Origin> = Vec::new(),
     /// Password for actions such as `/drain`. Default: none, and actions are off.
     pub admin_password: Option<Secret> = None,
+    /// Tokens of programs, each with what it may do. Default: none.
+    #[serde(deserialize_with = "one_or_many")]
+    pub api_tokens: Vec<ApiToken> = Vec::new(),
     /// Secret of at least 16 letters that all servers of a fleet share: it signs the passes and tickets of the line.
     /// Default: none, and a free slot is for the first client that comes.
     pub fleet_key: Option<Secret> = None,
@@ -175,16 +178,10 @@ pub struct SimulationConfig {
 impl SimulationConfig {
     /// Returns the files that may contain secrets: the configuration file, and those that it names.
     pub fn secret_files(&self) -> impl Iterator<Item = &Path> {
-        let secrets = [self.admin_password.as_ref(), self.fleet_key.as_ref()];
-        let [password, key] = secrets.map(|secret| secret.and_then(Secret::file));
-        [
-            Some(self.file.as_path()),
-            self.git_config.as_ref().map(|file| &*file.0),
-            password,
-            key,
-        ]
-        .into_iter()
-        .flatten()
+        let tokens = self.api_tokens.iter().map(|one| &one.token);
+        let secrets = self.admin_password.iter().chain(&self.fleet_key).chain(tokens);
+        let files = [Some(self.file.as_path()), self.git_config.as_ref().map(|file| &*file.0)];
+        files.into_iter().flatten().chain(secrets.filter_map(Secret::file))
     }
 
     /// Whether simulations are spread over the GPUs of the machine.
@@ -262,6 +259,7 @@ impl Configuration for SimulationConfig {
                 .map(|path| format!("sandbox: {} is not there", path.display())),
         );
         check_fleet_key(self.fleet_key.as_ref())?;
+        check_api_tokens(&self.api_tokens)?;
         require(self.timing.silence > self.timing.ping, "timing.silence", || {
             format!("{} s is not more than timing.ping", self.timing.silence.as_secs_f64())
         })?;

@@ -8,14 +8,14 @@ use crate::shared::http::{AuthError, Origin};
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::state::AppState;
 
-/// The sender of a request, as the password shows.
+/// The sender of a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Visitor {
-    /// No password is configured.
+    /// No password or token is configured.
     Anybody,
-    /// The request has no password, or another one, which may be meant for a web server in front.
+    /// The request has no sign-in, or another password, which may be meant for a web server in front.
     Stranger,
-    /// The request has the password.
+    /// The request is an administrator's.
     Administrator,
 }
 
@@ -25,13 +25,11 @@ impl Visitor {
     /// # Errors
     /// When its address has sent too many passwords: the administrator must not get the page for strangers.
     pub fn of(request: &HttpRequest, server: &AppState) -> Result<Self, AuthError> {
-        let Some(auth) = &server.admin_auth else {
-            return Ok(Self::Anybody);
-        };
-        match auth.check(request, server.config.trusted_proxies.peer(request)) {
-            Ok(()) => Ok(Self::Administrator),
-            Err(AuthError::NoPassword) => Ok(Self::Stranger),
+        match server.admin_auth.reader(request) {
+            Ok(_) => Ok(Self::Administrator),
+            Err(AuthError::Off) => Ok(Self::Anybody),
             Err(AuthError::TooMany) => Err(AuthError::TooMany),
+            Err(_) => Ok(Self::Stranger),
         }
     }
 

@@ -15,7 +15,7 @@ use super::{pages, webots_viewer};
 use crate::asset;
 use crate::shared::http::assets::{self, Asset};
 use crate::shared::http::routing::{GET, READ, path};
-use crate::shared::http::{ConnectionKind, FOREIGN_SCRIPTS, OWN_FILES, PageView, VIEWER, html, require_administrator};
+use crate::shared::http::{ConnectionKind, FOREIGN_SCRIPTS, OWN_FILES, PageView, VIEWER, html, sign_in};
 use crate::simulation::container;
 use crate::simulation::ends::{last_lines, output_file};
 use crate::simulation::machine::{self, Usages};
@@ -146,8 +146,8 @@ async fn output(
     which: web::Query<Which>,
     server: web::Data<AppState>,
 ) -> actix_web::Result<HttpResponse> {
-    if let Some(auth) = &server.admin_auth {
-        auth.check(&request, server.config.trusted_proxies.peer(&request))?;
+    if server.admin_auth.is_on() {
+        server.admin_auth.reader(&request)?;
     }
     let logs = server.config.log_dir.0.join("simulation");
     let tail =
@@ -186,9 +186,8 @@ async fn watch(
     which: web::Query<Which>,
     server: web::Data<AppState>,
 ) -> actix_web::Result<HttpResponse> {
-    let peer = server.config.trusted_proxies.peer(&request);
-    if let Some(refusal) = require_administrator(server.admin_auth.as_ref(), &request, peer) {
-        return Ok(refusal);
+    if let Err(error) = server.admin_auth.reader(&request) {
+        return Ok(sign_in::refuse(error, &request, &format!("watch?id={}", which.id)));
     }
     let snapshot = server.slots.snapshot();
     let simulation = snapshot

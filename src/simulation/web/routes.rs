@@ -9,7 +9,7 @@ use super::access::{Visitor, check_origin};
 use super::status::status_page;
 use super::{actions, metrics, page_routes, stream_routes};
 use crate::shared::http::routing::{self, GET, READ, path};
-use crate::shared::http::{CONTENT_TYPE, ConnectionKind, websocket};
+use crate::shared::http::{CONTENT_TYPE, ConnectionKind, sign_in, websocket};
 use crate::simulation::client::{SlotLink, WebClient};
 use crate::simulation::state::AppState;
 
@@ -23,6 +23,7 @@ fn add(app: &mut web::ServiceConfig) {
         .service(path("/slots", GET, slots))
         .service(path("/load", READ, load))
         .configure(page_routes::configure)
+        .configure(sign_in::configure)
         .configure(stream_routes::configure)
         .service(path("/status", READ, status_json))
         .service(path("/metrics", READ, metrics_text))
