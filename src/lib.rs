@@ -25,6 +25,7 @@
 //! | [`simulation::client`] | a client's WebSocket (`web_client`), that of a session server that asks for slots (`slot_link`), the session of its simulation, which sends it nearly all messages (`session`; `start`: before Webots runs, with the choice of the GPU) |
 //! | [`simulation::attachment`] | how a connection is attached to its session, and how a client resumes it |
 //! | [`simulation::slots`] | the slots that clients wait for: leases, the queue and the shares of addresses and users (`slot_pool`), those that are reserved for the line of session servers (`reservations`), the streams of simulations and the tokens that identify them (`stream`) |
+//! | [`simulation::spare_wishes`] | which worlds are kept ready before clients ask for them, and how many; the actor that does it is `spare_keeper` in [`simulation::client`], a spare's slot is in `spare` of [`simulation::slots`] |
 //! | `simulation::relay` | a stream between a client and the port of its Webots |
 //! | `simulation::web` | routes, pages, `/status` and Prometheus metrics of the simulation server (gauges in `metrics`, counters in `app` and `ends`) |
 //!
@@ -55,6 +56,7 @@
 //! - **reason**: why a request was refused, a start has failed or a simulation has ended, as a code
 //!   ([`shared::domain::Reason`]); a **failure** ([`shared::domain::Failure`]) has also its sentence and the output of others.
 //! - **stage**: the state of a simulation as pages show it ([`simulation::snapshot::Stage`]); it follows from the state of its actor.
+//! - **spare**: a simulation that is kept ready without a client (key `ready`).
 //! - **ready**: Webots has its world, so that viewers may connect. Until then it may **listen**.
 //!
 //! # Who talks to whom
@@ -96,7 +98,7 @@
 //!
 //! | actor or task | ends by itself | after a panic |
 //! |---|---|---|
-//! | Registry, `LoadMonitor` | never | the server logs it and exits with code 1: the service manager restarts it |
+//! | Registry, `LoadMonitor`, `SpareKeeper` | never | the server logs it and exits with code 1: the service manager restarts it |
 //! | `ServerMonitor` | when its server is removed from the configuration, or no name resolves to that server any more | the registry starts a new one |
 //! | mailer | never | it is restarted; the notices that it held are lost |
 //! | `WebClient` | with its connection | its connection closes, and its session is notified |

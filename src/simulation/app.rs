@@ -12,8 +12,10 @@ use super::config::SimulationConfig;
 use super::ends::Ends;
 use super::slots::SlotPool;
 use super::snapshot::Snapshot;
+use super::spare_wishes::SpareWishes;
 use super::state::AppState;
 use super::{announcer, readiness};
+use crate::shared::config::load;
 use crate::shared::domain::{AdmissionRules, FleetKey, Reason, ServerRun};
 use crate::shared::http::server::{self, HttpServerOptions};
 use crate::shared::http::{
@@ -24,6 +26,7 @@ use crate::shared::run::{
     AppError, Phase, ServerCommand, Signals, limit_clients, permanent, raise_open_files, service_manager, start,
 };
 use crate::simulation::checkout::{CacheDir, CheckoutService};
+use crate::simulation::client::SpareKeeper;
 use crate::simulation::container::ContainerService;
 use crate::simulation::isolation::{DiskMonitor, Launcher};
 use crate::simulation::machine::{LoadMonitor, Spread, UsageMonitor};
@@ -133,6 +136,7 @@ pub async fn serve(assembly: Application) -> Result<(), AppError> {
     );
     let slots = Arc::clone(&server.slots);
     actix_rt::spawn(Arc::clone(&slots).recheck());
+    let spare_keeper = SpareKeeper::new(Arc::clone(&server)).start();
     // This runs unless this thread is blocked, or another one holds the lock of the slots.
     actix_rt::spawn(service_manager::feed_watchdog(async move || {
         slots.instances().slots > 0
@@ -140,6 +144,7 @@ pub async fn serve(assembly: Application) -> Result<(), AppError> {
     let why = tokio::select! {
         why = handle_signals(&mut signals, &server) => why,
         fault = permanent::stopped("LoadMonitor", server.load_monitor.clone()) => return Err(fault.into()),
+        fault = permanent::stopped("SpareKeeper", spare_keeper) => return Err(fault.into()),
         ended = &mut serving => return Err(server::fault(ended).into()),
         never = guardian.watch() => match never {},
     };
@@ -171,8 +176,19 @@ async fn handle_signals(signals: &mut Signals, server: &AppState) -> &'static st
         match command {
             ServerCommand::Stop => return "stopping",
             ServerCommand::Drain => server.drain(),
-            ServerCommand::Reload => log::info!("SIGHUP changes nothing here: the configuration is read at start"),
+            ServerCommand::Reload => reload(server),
         }
+    }
+}
+
+/// Reads the key `ready` again. All others are read at start only.
+fn reload(server: &AppState) {
+    match load::<SimulationConfig>(&server.config.file) {
+        Ok(loaded) => {
+            server.spare_wishes.configure(loaded.config.ready);
+            log::info!("the key ready was read again; all others are read at start");
+        }
+        Err(error) => log::error!("the configuration was not read again: {error}"),
     }
 }
 
@@ -252,6 +268,8 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
         user_header: config.user_header.clone(),
         home: "monitor",
     });
+    let spare_wishes = SpareWishes::default();
+    spare_wishes.configure(config.ready.clone());
     let failed_starts = Arc::default();
     let problem = readiness::watch(
         Arc::clone(&config),
@@ -267,6 +285,7 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
         failed_starts,
         ends,
         slots,
+        spare_wishes,
         sessions: Arc::default(),
         load_monitor,
         readings,
@@ -306,7 +325,7 @@ async fn drained(server: &AppState) {
 
 /// Waits until there is no simulation, no slot is reserved, and the queue is empty.
 async fn empty(server: &AppState) {
-    let is_empty = |all: &Snapshot| all.simulations.is_empty() && all.instances.reserved == 0;
+    let is_empty = |all: &Snapshot| all.simulations.is_empty() && all.spares == 0 && all.instances.reserved == 0;
     while !is_empty(&server.slots.snapshot()) {
         actix_rt::time::sleep(POLL_INTERVAL).await;
     }

@@ -8,8 +8,9 @@ use actix::prelude::*;
 use parking_lot::Mutex;
 use tokio::sync::mpsc::UnboundedReceiver;
 
-use crate::shared::domain::Failure;
+use crate::shared::domain::{Failure, ProjectUrl, View};
 use crate::shared::http::Peer;
+use crate::simulation::client_identity::ClientIdentity;
 
 /// A connection of a client, for the session that it is attached to.
 pub struct Connection {
@@ -20,6 +21,20 @@ pub struct Connection {
     /// The client's actions. They end with the connection: the client may come back. A session drops the receiver when
     /// it ends, or after it has sent the client its end.
     pub actions: UnboundedReceiver<ClientAction>,
+}
+
+/// A client that asks for a simulation, and may have one.
+pub struct NewClient {
+    /// Its connection.
+    pub connection: Connection,
+    /// Who it is.
+    pub identity: ClientIdentity,
+    /// Its world.
+    pub world: ProjectUrl,
+    /// How it wants to see that.
+    pub view: View,
+    /// Whether it may come back.
+    pub resumable: bool,
 }
 
 /// Messages from a session to its client.

@@ -19,6 +19,7 @@ mod relay;
 pub(crate) mod simulation_id;
 pub(crate) mod slots;
 pub mod snapshot;
+pub mod spare_wishes;
 pub mod state;
 mod web;
 pub(crate) mod webots;

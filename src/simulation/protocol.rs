@@ -34,7 +34,7 @@ use actix_web_actors::ws::CloseCode;
 use serde::{Deserialize, Deserializer, Serialize};
 use serde_json::Value;
 
-use crate::shared::domain::{Blame, Failure, Reason, Retry};
+use crate::shared::domain::{Blame, Failure, Reason, Retry, View};
 use crate::shared::text::{client_text, without_paths};
 use crate::simulation::attachment::Token;
 use crate::simulation::snapshot::SceneKind;
@@ -83,6 +83,15 @@ pub enum Mode {
     W3d,
     /// A video.
     Mjpeg,
+}
+
+impl From<Mode> for View {
+    fn from(mode: Mode) -> Self {
+        match mode {
+            Mode::X3d | Mode::W3d => Self::X3d,
+            Mode::Mjpeg => Self::Mjpeg,
+        }
+    }
 }
 
 /// Why a message is invalid. The message is for the client.

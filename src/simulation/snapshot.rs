@@ -51,8 +51,10 @@ pub enum Stage {
 pub struct Snapshot {
     /// The numbers by state.
     pub instances: Instances,
-    /// Each simulation, sorted by id.
+    /// Each simulation that has a client, sorted by id.
     pub simulations: Vec<Simulation>,
+    /// Number of those that are kept ready without a client.
+    pub spares: usize,
 }
 
 /// One simulation, as pages and programs see it.
@@ -73,7 +75,7 @@ pub struct Simulation {
     pub stage: Stage,
     /// When its client requested it, in seconds since 1970.
     pub since: u64,
-    /// When it was launched, in seconds since 1970; the time limit starts then.
+    /// When it was launched, or taken by its client if it was kept ready, in seconds since 1970; the time limit starts then.
     pub launched: Option<u64>,
     /// The root of its process tree, once it is launched.
     pub pid: Option<i32>,

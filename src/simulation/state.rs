@@ -4,15 +4,17 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use actix::{Addr, ArbiterHandle};
+use jiff::Timestamp;
 use tokio::sync::watch;
 
 use super::attachment::ResumableSessions;
 use super::config::SimulationConfig;
 use super::ends::Ends;
 use super::readiness::FailedStarts;
-use super::slots::SlotPool;
+use super::slots::{SlotPool, SpareKind, SpareStatus};
+use super::spare_wishes::SpareWishes;
 use crate::shared::domain::{
-    AdmissionRules, Failure, FleetKey, Load, Pass, ProjectUrl, Reason, ReservationId, ServerRun,
+    AdmissionRules, Failure, FleetKey, Load, Pass, ProjectUrl, ReadyStatus, Reason, ReservationId, ServerRun,
 };
 use crate::shared::http::{AddressQuota, AdminAuth, ConnectionLimiter, LiveUpdates, Metrics, SharedPage};
 use crate::shared::run::Phase;
@@ -38,6 +40,8 @@ pub struct AppState {
     pub rules: AdmissionRules,
     /// Leases slots.
     pub slots: Arc<SlotPool>,
+    /// What simulations are asked for to be kept ready.
+    pub spare_wishes: SpareWishes,
     /// The sessions that their clients can resume.
     pub sessions: Arc<ResumableSessions>,
     /// Measures the load of the machine.
@@ -173,6 +177,28 @@ impl AppState {
             Failure::new(Reason::InvalidPass, message)
         })?;
         Ok(Some(pass.reservation))
+    }
+
+    /// What is kept ready for clients, by world.
+    pub fn ready(&self) -> Vec<ReadyStatus> {
+        let mut problems = self.spare_wishes.problems();
+        let mut spares = self.slots.spares();
+        let status = |(kind, wanted): (SpareKind, u32)| {
+            let there = spares.remove(&kind).unwrap_or_default();
+            let count = |matches: fn(&SpareStatus) -> bool| {
+                u32::try_from(there.iter().filter(|one| matches(one)).count()).unwrap_or(u32::MAX)
+            };
+            ReadyStatus {
+                wanted,
+                ready: count(|one| one.is_ready && !one.is_outdated && !one.is_reserved),
+                starting: count(|one| !one.is_ready),
+                problem: problems.remove(&kind),
+                mode: kind.view,
+                world: kind.world,
+            }
+        };
+        let wanted = self.spare_wishes.wanted(Timestamp::now(), Instant::now());
+        wanted.into_iter().map(status).collect()
     }
 
     /// Returns why this server can't start simulations; `None` if it can.

@@ -10,12 +10,12 @@ use serde_json::json;
 
 use crate::class::Class;
 use crate::support::client::Heard;
+use crate::support::clock::Clock;
 use crate::support::name_server::NameServer;
 use crate::support::network::Network;
 use crate::support::relay::Relay;
 use crate::support::{self, Builder, Client, Forge, SOON, Server, Webots, disk, http, ports};
 use crate::support::{instance_folders_in, instances_below, session_server, simulation_server};
-use crate::surroundings::Clock;
 
 /// Number of simulation servers.
 pub const SERVERS: usize = 5;

@@ -1,7 +1,5 @@
 //! Faults in the servers' environment: disks, files, clocks, names and links.
 
-use std::fs::File;
-use std::os::unix::fs::FileExt;
 use std::process::Command;
 
 use nix::sys::signal::Signal;
@@ -13,7 +11,6 @@ use crate::fault::WHILE;
 use crate::fleet::{Fleet, SERVERS, SMALL_DISK};
 use crate::support::disk::{Full, ReadOnly};
 use crate::support::relay::Mood;
-use crate::support::{Builder, shared_library};
 
 pub async fn fill_disk(fleet: &mut Fleet, _: &mut SmallRng) -> bool {
     let folder = fleet.site.folder(SMALL_DISK);
@@ -55,36 +52,6 @@ pub async fn no_files(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
     let is_possible = limit(server.fd_count().unwrap() as u64);
     actix_rt::time::sleep(WHILE).await;
     limit(soft) && is_possible
-}
-
-/// A time of day that can be set, for the programs that are started with it.
-pub struct Clock {
-    folder: tempfile::TempDir,
-    step: File,
-}
-
-impl Clock {
-    /// A clock without an offset.
-    pub fn new() -> Self {
-        let folder = shared_library("faults/clock.c", "clock.so");
-        let step = File::create(folder.path().join("step")).unwrap();
-        let clock = Self { folder, step };
-        clock.set(0);
-        clock
-    }
-
-    /// Makes a server use this clock.
-    pub fn of(&self, server: Builder) -> Builder {
-        let file = |name: &str| self.folder.path().join(name).to_str().unwrap().to_owned();
-        server
-            .env("LD_PRELOAD", &file("clock.so"))
-            .env("CLOCK_STEP", &file("step"))
-    }
-
-    /// Sets the offset from the machine's clock.
-    pub fn set(&self, seconds: i64) {
-        self.step.write_all_at(&seconds.to_ne_bytes(), 0).unwrap();
-    }
 }
 
 /// The clock of all servers steps, and steps back.

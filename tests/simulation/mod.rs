@@ -24,6 +24,7 @@ mod relay;
 mod resuming;
 pub mod scene;
 mod soak;
+mod spares;
 mod stopping;
 mod stopping_one;
 mod who;

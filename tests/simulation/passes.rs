@@ -64,6 +64,7 @@ impl Link {
             waited,
             address: None,
             user: None,
+            world: None,
         };
         let wishes = Wishes {
             number: self.number,
@@ -256,6 +257,7 @@ async fn who_has_its_share_is_passed_over_and_keeps_its_place() {
         waited,
         address: Some(address.parse().unwrap()),
         user: None,
+        world: None,
     };
     let wishes = Wishes {
         number: 1,

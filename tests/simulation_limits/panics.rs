@@ -155,7 +155,7 @@ pub async fn a_session_leaves_nothing_in_any_state() {
             pass: None,
         };
         let identity = ClientIdentity::new(None, None);
-        let session = Session::open(Arc::clone(&inside.server), identity, connection, &start).unwrap();
+        let session = Session::open(&inside.server, identity, connection, &start).unwrap();
         inside.until(stage).await;
         session.do_send(Panic);
         // By this a client's connection notices that its session is gone.

@@ -21,6 +21,7 @@ macro_rules! needs {
 
 pub mod authority;
 pub mod client;
+pub mod clock;
 pub mod disk;
 pub mod display;
 pub mod git;

@@ -647,6 +647,7 @@ mod tests {
                         challenge: 0,
                         server: ServerRun(server as u64),
                         pass: 10.0,
+                        keeps_ready: true,
                     };
                     fleet.dispatcher.link(server, &hello);
                 }

@@ -102,6 +102,7 @@ mod tests {
             challenge: 0,
             server: ServerRun(1),
             pass: 10.0,
+            keeps_ready: true,
         })
     }
 
@@ -115,6 +116,7 @@ mod tests {
                 waited: 0,
                 address: None,
                 user: None,
+                world: None,
             })
         };
         let wishes = link.wishes(first, all, |place| place.number >= begin, wish)?;

@@ -179,6 +179,7 @@ impl<Client: Clone> WaitingLine<Client> {
             waited: now.saturating_sub(place.since),
             address: waiting.address,
             user: waiting.user.as_deref().map(str::to_owned),
+            world: None,
         })
     }
 

@@ -4,13 +4,15 @@ use std::fmt;
 use std::path::Path;
 
 use percent_encoding::percent_decode_str;
+use serde::{Deserialize, Serialize};
 use url::Url;
 
 /// A world: a repository on a Git host, and the path of a world file below a reference of it.
 ///
 /// The reference may contain slashes (`feature/arm`), so the URL alone does not show where it ends;
 /// [`ProjectUrl::candidates`] returns the possible readings, and the repository's branches and tags decide.
-#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
 pub struct ProjectUrl {
     host: String,
     /// The path segments that name the repository, percent-decoded, as are the other segments.
@@ -131,6 +133,20 @@ impl ProjectUrl {
                 })
             })
             .collect()
+    }
+}
+
+impl TryFrom<String> for ProjectUrl {
+    type Error = ProjectUrlError;
+
+    fn try_from(text: String) -> Result<Self, ProjectUrlError> {
+        Self::parse(&text)
+    }
+}
+
+impl From<ProjectUrl> for String {
+    fn from(world: ProjectUrl) -> Self {
+        world.to_string()
     }
 }
 

@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 use super::admission::{Admission, AdmissionRules};
 use super::load::Load;
 use super::project_url::ProjectUrl;
+use super::ready::{self, ReadyStatus, View};
 use super::reason::Reason;
 use super::url_prefix::UrlPrefix;
 use crate::shared::text::one_line;
@@ -48,6 +49,9 @@ pub struct ServerReport {
     /// Why the server can't start simulations; `None` if it can.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub problem: Option<String>,
+    /// What it keeps ready for clients.
+    #[serde(default, deserialize_with = "ready::lenient")]
+    pub ready: Vec<ReadyStatus>,
 }
 
 /// Number of simulations of a server by state.
@@ -71,6 +75,9 @@ pub struct Instances {
     pub reserved: u32,
     /// Slots that have become free since the server started; it only grows.
     pub freed: u64,
+    /// Simulations that are kept ready without a client, in any state. They yield their slots to clients, and count
+    /// nowhere else.
+    pub spare: u32,
 }
 
 /// Ignores prefixes that this version can't parse: the server that reports them enforces them itself.
@@ -105,6 +112,12 @@ impl ServerReport {
             problem,
             ..report
         })
+    }
+
+    /// Number of simulations of this world that a client can take at once.
+    pub fn ready(&self, world: &ProjectUrl, view: View) -> u32 {
+        let matching = self.ready.iter().filter(|one| one.mode == view && one.world == *world);
+        matching.map(|one| one.ready).fold(0, u32::saturating_add)
     }
 
     /// The report of a server that has only `/load`.

@@ -2,7 +2,8 @@
 //!
 //! The simulation server begins with a [`Hello`], whose challenge the session server answers with a [`Proof`]. Then the
 //! session server sends [`Wishes`], each of which replaces the one before, and the simulation server sends [`Offers`]:
-//! one in answer to each, and one whenever it reserves a slot.
+//! one in answer to each, and one whenever it reserves a slot. Beside that, the session server may send a
+//! [`KeepReady`](super::KeepReady), if the [`Hello`] says so.
 
 use std::net::IpAddr;
 
@@ -10,6 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use super::fleet_key::{FleetKey, Purpose};
 use super::pass::{ReservationId, ServerRun};
+use super::project_url::ProjectUrl;
 
 /// The first message of a simulation server.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -21,6 +23,9 @@ pub struct Hello {
     pub server: ServerRun,
     /// Seconds for which a reservation holds.
     pub pass: f64,
+    /// Whether it keeps simulations ready on request ([`KeepReady`](super::KeepReady)).
+    #[serde(default)]
+    pub keeps_ready: bool,
 }
 
 /// The first message of a session server: it has the fleet's key.
@@ -44,6 +49,9 @@ pub struct Wish {
     /// Its user, who has a share of the slots.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub user: Option<String>,
+    /// Its world, of which one may be ready.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub world: Option<ProjectUrl>,
 }
 
 /// The clients that want slots of a simulation server.
@@ -120,6 +128,7 @@ mod tests {
             challenge: 5,
             server: ServerRun(6),
             pass: 10.0,
+            keeps_ready: true,
         };
         let key = FleetKey::new("a secret of a fleet");
         let proof = hello.prove(&key);

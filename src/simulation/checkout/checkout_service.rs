@@ -3,6 +3,7 @@
 //! First the commit is fetched into the cache (see [`super::commit_resolver`]); then each client gets its own copy of
 //! the project's directory, written on a thread of its own. Dropping the handle cancels both.
 
+use std::collections::HashMap;
 use std::io;
 use std::path::Path;
 use std::sync::Arc;
@@ -14,8 +15,9 @@ use tokio_util::task::AbortOnDropHandle;
 use super::commit_resolver::CommitResolver;
 use super::git::{Git, timed_out};
 use super::project::Project;
-use super::repository::{CheckoutError, Unreadable, failed};
+use super::repository::{CheckoutError, Repository, Unreadable, failed};
 use super::repository_cache::{CacheDir, RepositoryCache};
+use super::revision::Tip;
 use super::single_flight::SharedProgress;
 use super::{file_restore, redirect, steps, work_tree};
 use crate::shared::domain::{AdmissionRules, Failure, ProjectUrl, Reason};
@@ -30,6 +32,19 @@ pub struct CheckoutService {
     /// Limits the number of projects that are copied at a time.
     copies: Semaphore,
     _keeps_within_budget: AbortOnDropHandle<()>,
+}
+
+/// Keeps a repository in the cache until this is dropped.
+pub struct KeptRepository {
+    _repository: Arc<Repository>,
+}
+
+/// What a remote has said of worlds of one repository.
+pub struct Tips {
+    /// The commits that their URLs mean.
+    pub tips: HashMap<ProjectUrl, Tip>,
+    /// Keeps the repository in the cache.
+    pub kept: KeptRepository,
 }
 
 /// Limit of concurrent copies of projects: git may hold files in memory while it writes them.
@@ -57,10 +72,58 @@ impl CheckoutService {
         })
     }
 
-    /// Starts to check a world out into a client's directory. `progress` receives each step as text.
+    /// Asks the remote once what the URLs of these worlds, all of one repository, mean now; and keeps the repository in the
+    /// cache. Unless `is_due`, the remote is not asked.
+    ///
+    /// # Errors
+    /// When it can't be asked.
+    pub fn tips(
+        self: &Arc<Self>,
+        worlds: Vec<ProjectUrl>,
+        is_due: bool,
+    ) -> impl Future<Output = Result<Tips, Failure>> + use<> {
+        let this = Arc::clone(self);
+        async move {
+            let limit = this.config.timing.checkout;
+            let asked = actix_rt::time::timeout(limit, this.ask_tips(&worlds, is_due)).await;
+            let asked = asked.unwrap_or_else(|_| Err(CheckoutError::OfRepository(timed_out(limit))));
+            let about = |error: CheckoutError| match worlds.first() {
+                Some(world) => error.about(world),
+                None => Failure::new(Reason::ServerFault, "No world was named"),
+            };
+            asked.map_err(about)
+        }
+    }
+
+    async fn ask_tips(&self, worlds: &[ProjectUrl], is_due: bool) -> Result<Tips, CheckoutError> {
+        let mut current = worlds.to_vec();
+        let mut redirects = 0;
+        let found = loop {
+            match self.resolver.tips(&current, is_due).await {
+                Err(CheckoutError::Moved(location)) if redirects < redirect::MAX_REDIRECTS => {
+                    redirects += 1;
+                    for world in &mut current {
+                        *world = self.resolver.moved(world, location.as_deref())?;
+                    }
+                }
+                done => break done?,
+            }
+        };
+        let (repository, tips) = found.ok_or(CheckoutError::NoCommit)?;
+        Ok(Tips {
+            tips: worlds.iter().cloned().zip(tips).collect(),
+            kept: KeptRepository {
+                _repository: repository,
+            },
+        })
+    }
+
+    /// Starts to check a world out into a client's directory, at this tip if it is known. `progress` receives each step as
+    /// text.
     pub fn start(
         self: &Arc<Self>,
         world: ProjectUrl,
+        tip: Option<Tip>,
         instance: InstanceDir,
         progress: SharedProgress,
     ) -> AbortOnDropHandle<Result<Project, Failure>> {
@@ -68,7 +131,7 @@ impl CheckoutService {
         let job = async move {
             let mut world = world;
             let limit = this.config.timing.checkout;
-            let done = actix_rt::time::timeout(limit, this.check_out(&mut world, instance, &progress)).await;
+            let done = actix_rt::time::timeout(limit, this.check_out(&mut world, tip, instance, &progress)).await;
             let done = done.unwrap_or_else(|_| Err(CheckoutError::OfRepository(timed_out(limit))));
             done.map_err(|error| error.about(&world))
         };
@@ -79,6 +142,7 @@ impl CheckoutService {
     async fn check_out(
         &self,
         world: &mut ProjectUrl,
+        tip: Option<Tip>,
         instance: InstanceDir,
         progress: &SharedProgress,
     ) -> Result<Project, CheckoutError> {
@@ -86,7 +150,7 @@ impl CheckoutService {
         let mut redirects = 0;
         let mut mended = None;
         let project = loop {
-            match self.attempt(world, &instance, progress).await {
+            match self.attempt(world, tip.clone(), &instance, progress).await {
                 Err(CheckoutError::Moved(location)) if redirects < redirect::MAX_REDIRECTS => {
                     redirects += 1;
                     *world = self.resolver.moved(world, location.as_deref())?;
@@ -105,10 +169,11 @@ impl CheckoutService {
     async fn attempt(
         &self,
         world: &ProjectUrl,
+        tip: Option<Tip>,
         instance: &Arc<InstanceDir>,
         progress: &SharedProgress,
     ) -> Result<Project, CheckoutError> {
-        let found = self.resolver.resolve(world, &**progress).await?;
+        let found = self.resolver.resolve(world, tip, &**progress).await?;
         // The semaphore is never closed.
         let _turn = self.copies.acquire().await.ok();
         let wanted = world.clone();

@@ -9,7 +9,7 @@ use tokio::sync::watch;
 use super::git::GitError;
 use super::repository::{CheckoutError, Repository, failed};
 use super::repository_cache::{COMMITS, HISTORY, RepositoryCache};
-use super::revision::{self, Revision, TrustSource};
+use super::revision::{self, Revision, Tip, TrustSource};
 use super::single_flight::{OnProgress, SingleFlight};
 use super::{redirect, steps};
 use crate::shared::domain::{AdmissionRules, Failure, ProjectUrl, Reason};
@@ -21,7 +21,7 @@ pub struct CommitResolver {
     config: Arc<SimulationConfig>,
     /// Limit redirects of Git hosts.
     rules: AdmissionRules,
-    searches: SingleFlight<ProjectUrl, Result<Arc<ResolvedCommit>, CheckoutError>>,
+    searches: SingleFlight<(ProjectUrl, Option<Tip>), Result<Arc<ResolvedCommit>, CheckoutError>>,
     /// The remotes to which Git hosts have redirected, by [`Remote::key`]: GitLab redirects to `REPOSITORY.git`.
     redirected: Mutex<HashMap<String, Remote>>,
 }
@@ -61,19 +61,50 @@ impl CommitResolver {
         }
     }
 
-    /// Waits until a world's commit is in the cache. Callers with the same world share one search.
+    /// Waits until a world's commit is in the cache. Callers with the same world share one search. With a tip, which the
+    /// remote has said before, it is not asked.
     ///
     /// # Errors
     /// Why it can't be fetched.
     pub async fn resolve(
         self: &Arc<Self>,
         world: &ProjectUrl,
+        tip: Option<Tip>,
         progress: OnProgress<'_>,
     ) -> Result<Arc<ResolvedCommit>, CheckoutError> {
         let this = Arc::clone(self);
-        let wanted = world.clone();
-        let search = |sender| async move { this.search(&wanted, &sender).await.map(Arc::new) };
-        self.searches.join(world.clone(), progress, search).await
+        let key = (world.clone(), tip);
+        let (world, tip) = key.clone();
+        let search = |sender| async move { this.search(&world, tip, &sender).await.map(Arc::new) };
+        self.searches.join(key, progress, search).await
+    }
+
+    /// Returns the cached repository of these worlds, which have one, and the commits that their URLs mean now. The remote
+    /// is asked once, if `is_due` and there is a URL that names a branch or tag.
+    ///
+    /// # Errors
+    /// When it can't be asked.
+    pub async fn tips(
+        &self,
+        worlds: &[ProjectUrl],
+        is_due: bool,
+    ) -> Result<Option<(Arc<Repository>, Vec<Tip>)>, CheckoutError> {
+        let Some(first) = worlds.first() else { return Ok(None) };
+        let repository = self.repository(first, COMMITS).await?;
+        let has_name = |world: &&ProjectUrl| revision::commit_of(world, self.config.any_commit).is_none();
+        let named: Vec<&ProjectUrl> = worlds.iter().filter(has_name).collect();
+        let answer = if is_due && !named.is_empty() {
+            repository.ask(&revision::search_arguments(named)).await?
+        } else {
+            String::new()
+        };
+        let tips = if is_due {
+            let tip = |world| Tip(revision::found(world, &answer).into());
+            worlds.iter().map(tip).collect()
+        } else {
+            Vec::new()
+        };
+        Ok(Some((repository, tips)))
     }
 
     /// The same world in the repository to which its Git host redirects.
@@ -91,14 +122,16 @@ impl CommitResolver {
     async fn search(
         &self,
         world: &ProjectUrl,
+        tip: Option<Tip>,
         sender: &watch::Sender<String>,
     ) -> Result<ResolvedCommit, CheckoutError> {
         let progress = |step| drop(sender.send_replace(step));
         progress(steps::looking_for(&world.repository()));
         let repository = self.repository(world, COMMITS).await?;
-        let revisions = match revision::commit_of(world, self.config.any_commit) {
-            Some(commit) => vec![commit],
-            None => revision::found(world, &repository.ask(&revision::search_arguments(world)).await?),
+        let revisions = match (revision::commit_of(world, self.config.any_commit), tip) {
+            (Some(commit), _) => vec![commit],
+            (None, Some(tip)) => tip.0.to_vec(),
+            (None, None) => revision::found(world, &repository.ask(&revision::search_arguments([world])).await?),
         };
         let search = Search {
             resolver: self,

@@ -17,8 +17,9 @@ mod single_flight;
 mod steps;
 mod work_tree;
 
-pub use checkout_service::CheckoutService;
+pub use checkout_service::{CheckoutService, KeptRepository, Tips};
 pub use disk::outgrown;
 pub use project::Project;
 pub use repository_cache::CacheDir;
+pub use revision::Tip;
 pub use single_flight::{OnProgress, SingleFlight};

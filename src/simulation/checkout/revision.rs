@@ -1,10 +1,13 @@
 //! The commit that a world's URL means, and its contents: arguments for git, and parsers of its answers. Pure.
 
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
 use super::repository::REMOTE;
 use crate::shared::domain::{ProjectUrl, Reading};
 
 /// One commit that a world's URL may mean.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Revision {
     /// The hash of a commit, or of an annotated tag of one.
     pub commit: String,
@@ -16,9 +19,13 @@ pub struct Revision {
     pub trust: TrustSource,
 }
 
+/// The commits that a world's URL may mean, as its remote has said.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub struct Tip(pub(super) Arc<[Revision]>);
+
 /// Why a commit is trusted to be the repository's own. Git hosts also serve commits of forks and of proposals by their
 /// hash, which the repository's owner never accepted: allowing a repository must not allow those.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum TrustSource {
     /// The remote reports it as the newest commit of a branch or tag.
     Tip,
@@ -70,9 +77,10 @@ fn fetch(options: &[&str], references: &[&str]) -> Vec<String> {
         .collect()
 }
 
-/// Lists the branches and tags of the remote that a URL may mean.
-pub fn search_arguments(world: &ProjectUrl) -> Vec<String> {
-    let names = world.candidates().into_iter().flat_map(|reading| full_names(&reading));
+/// Lists the branches and tags of the remote that URLs of its worlds may mean.
+pub fn search_arguments<'world>(worlds: impl IntoIterator<Item = &'world ProjectUrl>) -> Vec<String> {
+    let readings = worlds.into_iter().flat_map(ProjectUrl::candidates);
+    let names: BTreeSet<String> = readings.flat_map(|reading| full_names(&reading)).collect();
     ["ls-remote", "--quiet", "--", REMOTE]
         .map(str::to_owned)
         .into_iter()

@@ -4,9 +4,12 @@ mod arrival;
 mod resume;
 mod session;
 mod slot_link;
+mod spare;
+mod spare_keeper;
 mod start;
 mod web_client;
 
 pub use session::Session;
 pub use slot_link::SlotLink;
+pub use spare_keeper::SpareKeeper;
 pub use web_client::WebClient;

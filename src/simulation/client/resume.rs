@@ -75,7 +75,7 @@ impl Session {
     }
 
     /// Tells a client that has come back what it has missed.
-    fn tell_again(&self) {
+    pub(super) fn tell_again(&self) {
         let State::Ready(ready) = &self.state else { return };
         self.text(protocol::simulation_id(self.id));
         let rest = self
@@ -105,13 +105,15 @@ impl Handler<Resume> for Session {
             return connection.client.do_send(ToClient::Close(refusal));
         }
         log::info!("{}: goes on as client {peer}", self.name());
-        self.peer = peer;
+        self.peer = Some(peer);
         let attached = Self::attached(connection, ctx);
         match std::mem::replace(&mut self.client, Client::Connected(attached)) {
             Client::Connected(before) => before.client.do_send(ToClient::Close(protocol::taken_over())),
             Client::Away(deadline) => {
                 ctx.cancel_future(deadline);
             }
+            // It has no token before it has a client.
+            Client::Expected(_) => {}
         }
         if let State::Ready(Ready { token, .. }) = &mut self.state {
             *token = token.map(Token::next);

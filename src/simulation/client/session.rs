@@ -1,6 +1,7 @@
 //! Actor: the session of one simulation, from the request for it to its end, as one state machine.
 //!
-//! Created by a web client that requests a simulation. Dropping it releases what it holds in its state: a position in
+//! Created by a web client that requests a simulation, or by the [`SpareKeeper`](super::SpareKeeper), which keeps some ready
+//! until a client takes them (`spare`). Dropping it releases what it holds in its state: a position in
 //! the queue, a checkout in progress, a running Webots. It ends with its client's connection, or some time later if the
 //! client may return. `start` contains the way to a running Webots, `resume` the wait for the client,
 //! `arrival` that for the first viewer.
@@ -11,16 +12,16 @@ use std::time::{Duration, Instant};
 use actix::prelude::*;
 use futures_util::stream::AbortHandle;
 
-use crate::shared::domain::{Failure, ProjectUrl, Reason};
+use crate::shared::domain::{Failure, ProjectUrl, Reason, ReservationId, View};
 use crate::shared::http::Peer;
 use crate::shared::run::closing;
-use crate::simulation::attachment::{ClientAction, Connection, ToClient, Token};
-use crate::simulation::checkout::Project;
+use crate::simulation::attachment::{ClientAction, Connection, NewClient, ToClient, Token};
+use crate::simulation::checkout::{Project, Tip};
 use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::ends::{StopReason, lost};
-use crate::simulation::protocol::{self, Mode};
+use crate::simulation::protocol;
 use crate::simulation::simulation_id::SimulationId;
-use crate::simulation::slots::{Slot, SlotEvent, SlotLease};
+use crate::simulation::slots::{Slot, SlotEvent, SlotLease, SpareKind, Taker};
 use crate::simulation::snapshot::SceneKind;
 use crate::simulation::state::AppState;
 use crate::simulation::webots::{Keep, Stop, Webots, WebotsEvent};
@@ -30,24 +31,43 @@ pub struct Session {
     pub(super) server: Arc<AppState>,
     /// The id of the simulation.
     pub(super) id: SimulationId,
-    /// The address of its last connection.
-    pub(super) peer: Peer,
+    /// The address of its last connection; `None` if it is kept ready and never had one.
+    pub(super) peer: Option<Peer>,
     pub(super) client: Client,
     pub(super) state: State,
     /// How its client wants to see it.
-    pub(super) mode: Mode,
+    pub(super) view: View,
     /// Whether its client may resume it.
     pub(super) resumable: bool,
     /// Whether a controller is being reset.
-    is_resetting: bool,
+    pub(super) is_resetting: bool,
 }
 
 /// The client of a session.
 pub(super) enum Client {
+    /// None has taken the simulation, which is kept ready.
+    Expected(Expected),
     /// It is connected.
     Connected(Attachment),
     /// It may come back until this timer ends the session.
     Away(SpawnHandle),
+}
+
+/// What a simulation is kept ready for.
+pub(super) struct Expected {
+    pub(super) kind: SpareKind,
+    /// Its keeper, which is told how that goes.
+    pub(super) keeper: Recipient<SpareEvent>,
+}
+
+/// What happens to a simulation that is kept ready, for its keeper.
+#[derive(Message, Debug)]
+#[rtype(result = "()")]
+pub enum SpareEvent {
+    /// One is ready.
+    Ready(SpareKind),
+    /// One has failed to start, or has ended although nobody has asked for that.
+    Failed(SpareKind, Failure),
 }
 
 /// A connection that is attached to a session. Dropping it detaches the connection at once.
@@ -67,8 +87,12 @@ impl Drop for Attachment {
 /// The life cycle of a simulation, as its session knows it. Each state holds what exists only in it; dropping a state
 /// releases that.
 pub(super) enum State {
-    /// Waiting for a slot; the lease holds the position in the queue.
-    Waiting { world: ProjectUrl, lease: SlotLease },
+    /// Waiting for a slot; the lease holds the position in the queue. `tip` is the commit, if it is known already.
+    Waiting {
+        world: ProjectUrl,
+        tip: Option<Tip>,
+        lease: SlotLease,
+    },
     /// The project is being checked out for this slot; the job ends with the actor.
     CheckingOut(Slot),
     /// Webots was requested, and is not ready.
@@ -143,7 +167,7 @@ impl State {
         }
     }
 
-    fn launched(&self) -> Option<&Launched> {
+    pub(super) fn launched(&self) -> Option<&Launched> {
         match self {
             Self::Launching(launched) | Self::Ready(Ready { launched, .. }) => Some(launched),
             Self::Waiting { .. } | Self::CheckingOut(_) | Self::Over { .. } => None,
@@ -160,38 +184,80 @@ impl State {
 }
 
 impl Session {
-    /// Opens the session of a client that requests a simulation, and returns its address; or tells the client why it gets
-    /// none.
+    /// Gives a client that requests a simulation one that is kept ready, or opens a session for it and returns that; or
+    /// tells the client why it gets none.
     pub fn open(
-        server: Arc<AppState>,
+        server: &Arc<AppState>,
         identity: ClientIdentity,
         connection: Connection,
         request: &protocol::Start,
     ) -> Option<Addr<Self>> {
-        let (world, reservation) = match Self::admit(&server, connection.peer, request) {
+        let (world, reservation) = match Self::admit(server, connection.peer, request) {
             Ok(admitted) => admitted,
             Err(failure) => {
                 connection.client.do_send(ToClient::Close(failure));
                 return None;
             }
         };
+        let client = NewClient {
+            connection,
+            identity,
+            world,
+            view: request.mode.unwrap_or_default().into(),
+            resumable: request.resumable.unwrap_or_default() && !server.config.timing.absence.is_zero(),
+        };
+        let taker = Taker {
+            kind: SpareKind {
+                world: client.world.clone(),
+                view: client.view,
+            },
+            peer: client.connection.peer,
+            identity: client.identity.clone(),
+        };
+        match server.slots.take_spare(&taker, reservation) {
+            // The session exists until it has received this.
+            Some(session) => {
+                session.do_send(SlotEvent::Taken(Box::new(client)));
+                None
+            }
+            None => Some(Self::start_for(Arc::clone(server), client, reservation)),
+        }
+    }
+
+    /// Starts a simulation for a client.
+    pub(super) fn start_for(
+        server: Arc<AppState>,
+        client: NewClient,
+        reservation: Option<ReservationId>,
+    ) -> Addr<Self> {
+        let NewClient {
+            connection,
+            identity,
+            world,
+            view,
+            resumable,
+        } = client;
         let id = SimulationId::next();
         let peer = connection.peer;
         log::info!("{id}: client {peer}: asks for {world}{identity}");
-        Some(Self::create(|ctx| {
+        Self::create(|ctx| {
             let me = ctx.address().recipient();
             let state = match SlotLease::acquire(&server.slots, id, me, &world, (peer, identity), reservation) {
-                Ok(lease) => State::Waiting { world, lease },
+                Ok(lease) => State::Waiting {
+                    world,
+                    tip: None,
+                    lease,
+                },
                 Err(failure) => State::Over { failure, token: None },
             };
             let session = Self {
-                resumable: request.resumable.unwrap_or_default() && !server.config.timing.absence.is_zero(),
+                resumable,
                 server,
                 id,
-                peer,
+                peer: Some(peer),
                 client: Client::Connected(Self::attached(connection, ctx)),
                 state,
-                mode: request.mode.unwrap_or_default(),
+                view,
                 is_resetting: false,
             };
             session.text(protocol::simulation_id(id));
@@ -201,11 +267,14 @@ impl Session {
                 ctx.stop();
             }
             session
-        }))
+        })
     }
 
     pub(super) fn name(&self) -> String {
-        format!("{}: client {}", self.id, self.peer)
+        match self.peer {
+            Some(peer) => format!("{}: client {peer}", self.id),
+            None => format!("{}: kept ready", self.id),
+        }
     }
 
     fn send(&self, message: ToClient) {
@@ -243,6 +312,9 @@ impl Session {
     pub(super) fn finish(&mut self, failure: Failure, ctx: &mut Context<Self>) {
         if let State::Over { .. } = self.state {
             return;
+        }
+        if let Client::Expected(_) = self.client {
+            return self.finish_spare(failure, ctx);
         }
         self.tell(&failure);
         let token = self.state.token();
@@ -298,19 +370,34 @@ impl Session {
             // It has ended meanwhile.
             other => return self.state = other,
         };
-        self.count("ready");
-        self.server.failed_starts.reset();
-        let register = || self.server.sessions.register(ctx.address().recipient());
         self.state = State::Ready(Ready {
             launched,
             started,
             port,
             url,
-            token: self.resumable.then(register),
+            token: None,
             idle_end: None,
             is_watched: false,
-            arrival: self.await_viewer(ctx),
+            arrival: Arrival::Settled,
         });
+        match &self.client {
+            Client::Expected(Expected { kind, keeper }) => keeper.do_send(SpareEvent::Ready(kind.clone())),
+            Client::Connected(_) | Client::Away(_) => {
+                self.server.failed_starts.reset();
+                self.hand_over(ctx);
+            }
+        }
+    }
+
+    /// The simulation is ready, and has its client: tells it so.
+    pub(super) fn hand_over(&mut self, ctx: &mut Context<Self>) {
+        self.count("ready");
+        let arrival = self.await_viewer(ctx);
+        if let State::Ready(ready) = &mut self.state {
+            ready.arrival = arrival;
+            let register = || self.server.sessions.register(ctx.address().recipient());
+            ready.token = self.resumable.then(register);
+        }
         self.offer();
         if self.resumable {
             let absence = self.server.config.timing.absence.as_secs();
@@ -367,7 +454,7 @@ impl Handler<SlotEvent> for Session {
     fn handle(&mut self, event: SlotEvent, ctx: &mut Self::Context) {
         match event {
             SlotEvent::Granted(port) => match std::mem::replace(&mut self.state, State::lost()) {
-                State::Waiting { world, lease } => self.check_out(world, Slot { lease, port }, ctx),
+                State::Waiting { world, tip, lease } => self.check_out(world, tip, Slot { lease, port }, ctx),
                 // It has ended while it waited.
                 other => self.state = other,
             },
@@ -384,12 +471,16 @@ impl Handler<SlotEvent> for Session {
                 self.finish(Failure::new(Reason::StoppedByAdministrator, why), ctx);
             }
             SlotEvent::MakeRoom => {
-                // Its client may have come back meanwhile.
-                if let Client::Away(_) = self.client {
-                    self.report(StopReason::MakesRoom);
-                    self.finish(StopReason::MakesRoom.into(), ctx);
-                }
+                let reason = match self.client {
+                    Client::Expected(_) => StopReason::Unneeded,
+                    Client::Away(_) => StopReason::MakesRoom,
+                    // It has come back meanwhile.
+                    Client::Connected(_) => return,
+                };
+                self.report(reason);
+                self.finish(reason.into(), ctx);
             }
+            SlotEvent::Taken(client) => self.taken_by(*client, ctx),
         }
     }
 }

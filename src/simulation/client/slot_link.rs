@@ -7,9 +7,9 @@ use std::sync::Arc;
 
 use actix::prelude::*;
 use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
-use crate::shared::domain::{FleetKey, Hello, Proof, Wishes};
+use crate::shared::domain::{FleetKey, Hello, KeepReady, Proof, Wishes};
 use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::{ConnectionPermit, Peer};
 use crate::shared::run::{Phase, closing};
@@ -34,6 +34,14 @@ enum State {
     Trusted(LinkId),
 }
 
+/// What a session server sends.
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum FromSessionServer {
+    Ready(KeepReady),
+    Wishes(Wishes),
+}
+
 type Context = WebsocketContext<SlotLink>;
 
 impl SlotLink {
@@ -43,6 +51,7 @@ impl SlotLink {
             challenge: rand::random(),
             server: server.server_run,
             pass: server.config.timing.pass.as_secs_f64(),
+            keeps_ready: true,
         };
         Self {
             server,
@@ -77,8 +86,9 @@ impl SlotLink {
                 self.state = State::Trusted(id);
                 self.server.slots.open_link(id, ctx.address().recipient());
             }
-            State::Trusted(id) => match serde_json::from_str::<Wishes>(text) {
-                Ok(wishes) if self.server.takes_nobody() => {
+            State::Trusted(id) => match serde_json::from_str::<FromSessionServer>(text) {
+                Ok(FromSessionServer::Ready(KeepReady { keep_ready })) => self.server.spare_wishes.ask(*id, keep_ready),
+                Ok(FromSessionServer::Wishes(wishes)) if self.server.takes_nobody() => {
                     let nothing = Wishes {
                         first: Vec::new(),
                         all: 0,
@@ -86,7 +96,7 @@ impl SlotLink {
                     };
                     self.server.slots.wish(*id, &nothing);
                 }
-                Ok(wishes) => self.server.slots.wish(*id, &wishes),
+                Ok(FromSessionServer::Wishes(wishes)) => self.server.slots.wish(*id, &wishes),
                 Err(error) => {
                     log::warn!("client {}: {error}", self.peer);
                     Self::close(CloseCode::Policy, ctx);
@@ -131,6 +141,7 @@ impl Actor for SlotLink {
     fn stopped(&mut self, _: &mut Self::Context) {
         if let State::Trusted(id) = self.state {
             self.server.slots.close_link(id);
+            self.server.spare_wishes.leave(id);
         }
     }
 }

@@ -6,12 +6,12 @@ use std::time::Instant;
 
 use actix::prelude::*;
 
-use super::session::{Launched, Session, State, WebotsHandle};
-use crate::shared::domain::{Blame, Failure, ProjectUrl, Reason, ReservationId};
+use super::session::{Client, Launched, Session, State, WebotsHandle};
+use crate::shared::domain::{Blame, Failure, ProjectUrl, Reason, ReservationId, View};
 use crate::shared::http::Peer;
-use crate::simulation::checkout::Project;
+use crate::simulation::checkout::{Project, Tip};
 use crate::simulation::machine::sensors::Gpu;
-use crate::simulation::protocol::{self, Mode, Start};
+use crate::simulation::protocol::{self, Start};
 use crate::simulation::readiness;
 use crate::simulation::slots::{Slot, SlotLease};
 use crate::simulation::snapshot::SceneKind;
@@ -45,9 +45,10 @@ impl Session {
         count(&self.server, outcome);
     }
 
-    /// Ends a start that has failed. A start that fails because of this server is reported to session servers.
+    /// Ends a start that has failed. A client's start that fails because of this server is reported to session servers.
     pub(super) fn fail(&mut self, failure: Failure, ctx: &mut Context<Self>) {
-        if failure.reason.blame() == Blame::Server {
+        let has_client = !matches!(self.client, Client::Expected(_));
+        if failure.reason.blame() == Blame::Server && has_client {
             self.server
                 .failed_starts
                 .add(&format!("{}: {failure} ({})", self.name(), failure.reason));
@@ -58,7 +59,7 @@ impl Session {
         self.finish(failure, ctx);
     }
 
-    pub(super) fn check_out(&mut self, world: ProjectUrl, slot: Slot, ctx: &mut Context<Self>) {
+    pub(super) fn check_out(&mut self, world: ProjectUrl, tip: Option<Tip>, slot: Slot, ctx: &mut Context<Self>) {
         self.state = State::CheckingOut(slot);
         let instance = match self.server.run.instance() {
             Ok(instance) => instance,
@@ -74,7 +75,7 @@ impl Session {
         let me = ctx.address();
         // A full mailbox drops this line of progress.
         let progress = move |text: String| drop(me.try_send(WebotsEvent::Progress(text)));
-        let job = self.server.checkouts.start(world, instance, Arc::new(progress));
+        let job = self.server.checkouts.start(world, tip, instance, Arc::new(progress));
         job.into_actor(self)
             .map(|result, this, ctx| match result {
                 Ok(Ok(project)) => this.launch(project, ctx),
@@ -105,7 +106,7 @@ impl Session {
         );
         let version = project.world.version.clone();
         let release = Release::of_simulation(&program, &project.world.version);
-        let scene = (self.mode != Mode::Mjpeg).then(|| SceneKind::of(release));
+        let scene = (self.view != View::Mjpeg).then(|| SceneKind::of(release));
         slot.lease.update(|simulation| {
             simulation.version = Some(version);
             simulation.scene = scene;
@@ -123,10 +124,11 @@ impl Session {
             assets: self.server.launcher.assets_of(&project.repository()),
             project,
             release,
-            mode: self.mode,
+            view: self.view,
             gpu,
             slot,
-            client: self.peer,
+            address: self.peer.and_then(Peer::rate_limit_key),
+            is_spare: matches!(self.client, Client::Expected(_)),
             events: ctx.address().recipient(),
         };
         let thread = self.server.webots_thread(spec.slot.port);

@@ -148,7 +148,7 @@ impl WebClient {
                 let identity = ClientIdentity::new(self.user.as_deref(), start.name.as_deref());
                 // Sent only if the session panics: otherwise it sends an end itself.
                 let connection = self.attach(lost(), ctx);
-                Session::open(Arc::clone(&self.server), identity, connection, &start);
+                Session::open(&self.server, identity, connection, &start);
             }
             _ => log::info!(
                 "client {}: a message that asks for nothing, or for a second simulation on one connection; ignored",

@@ -18,7 +18,7 @@ use crate::shared::config::{
     ApiToken, Configuration, ExpandedPath, Secret, check_api_tokens, check_fleet_key, expanded, minutes, one_or_many,
     optional_whole, percent, require, seconds, whole,
 };
-use crate::shared::domain::{PublicUrl, UrlPrefix, complete_host};
+use crate::shared::domain::{PublicUrl, ReadyEntry, UrlPrefix, complete_host};
 use crate::shared::http::{Origin, TrustedProxies};
 use crate::simulation::machine::display;
 
@@ -156,6 +156,13 @@ pub struct SimulationConfig {
     /// Seconds after six missed heartbeats until a simulation is ended. Default: 60.
     #[serde(with = "seconds")]
     pub hang_limit: Duration = Duration::from_mins(1),
+    /// Worlds of which simulations are kept ready: `{"world": ..., "count": ..., "when": ...}`. Default: none.
+    #[serde(deserialize_with = "one_or_many")]
+    pub ready: Vec<ReadyEntry> = Vec::new(),
+    /// Load (percent) from which none is started to be kept ready; from 10 more, in memory of the machine or its GPUs, they
+    /// end. Above 100: the load does not matter. Default: 80.
+    #[serde(deserialize_with = "percent::<1000, _>")]
+    pub ready_load: f64 = 80.0,
     /// Pages from which browsers may open `/client`, as origins (`https://lab.org`). Default: any.
     #[serde(deserialize_with = "one_or_many")]
     pub allowed_origins: Vec<Origin> = Vec::new(),

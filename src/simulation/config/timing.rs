@@ -43,6 +43,9 @@ pub struct Timing {
     /// Time for which a slot is reserved for a client with a pass, whose turn it is in the line. Default: 10.
     #[serde(with = "seconds")]
     pub pass: Duration = Duration::from_secs(10),
+    /// Interval between two questions to a remote whether branches of worlds that are kept ready have moved. Default: 60.
+    #[serde(with = "seconds")]
+    pub branches: Duration = Duration::from_mins(1),
     /// Timeout of simulations when the server stops. Default: 9.
     #[serde(with = "seconds")]
     pub stop: Duration = Duration::from_secs(9),

@@ -29,7 +29,7 @@ fn line(level: &str, ended: &Ended) -> String {
         simulation.id.to_string(),
         time(simulation.since),
         time(ended.at),
-        quoted(&ended.client.to_string()),
+        quoted(&ended.client.map(|client| client.to_string()).unwrap_or_default()),
         quoted(&simulation.repository),
         quoted(&simulation.world),
         simulation.port.map(|port| port.to_string()).unwrap_or_default(),

@@ -29,8 +29,8 @@ pub struct End {
 pub struct Ended {
     /// Its last snapshot.
     pub simulation: Simulation,
-    /// Its client.
-    pub client: Peer,
+    /// Its client; `None` if it was kept ready and never had one.
+    pub client: Option<Peer>,
     /// When it ended, in seconds since 1970.
     pub at: u64,
     /// Its events: one line each, with the time.
@@ -60,6 +60,6 @@ impl Ended {
 
     /// Whether its output and events are kept in a file.
     pub fn has_output(&self) -> bool {
-        self.simulation.log.is_some() || self.is_abnormal()
+        self.client.is_some() && self.simulation.log.is_some() || self.is_abnormal()
     }
 }

@@ -60,15 +60,19 @@ impl Ends {
         })
     }
 
-    /// Records an end.
+    /// Records an end. That of a simulation that never had a client counts for nobody, and is listed only if it has failed.
     pub fn record(&self, ended: Ended) {
-        self.counter.with_label_values(&[ended.end.failure.reason.code()]).inc();
-        let ended = Arc::new(ended);
-        let mut latest = self.latest.lock();
-        if latest.len() == LISTED {
-            latest.pop_back();
+        if ended.client.is_some() {
+            self.counter.with_label_values(&[ended.end.failure.reason.code()]).inc();
         }
-        latest.push_front(Arc::clone(&ended));
+        let ended = Arc::new(ended);
+        if ended.client.is_some() || ended.is_abnormal() {
+            let mut latest = self.latest.lock();
+            if latest.len() == LISTED {
+                latest.pop_back();
+            }
+            latest.push_front(Arc::clone(&ended));
+        }
         // The thread runs until the last sender is dropped.
         self.writer.send(Job::Write(ended)).ok();
     }
@@ -108,7 +112,9 @@ fn write_all(logs: &Path, level: &str, jobs: &Receiver<Job>) {
 }
 
 fn write(logs: &Path, level: &str, ended: &Ended) {
-    if let Err(error) = csv::append(&logs.join("simulations.csv"), level, ended) {
+    if ended.client.is_some()
+        && let Err(error) = csv::append(&logs.join("simulations.csv"), level, ended)
+    {
         log::warn!("{}: its end is not in simulations.csv: {error}", ended.simulation.id);
     }
     if let Err(error) = kept_output::keep(logs, ended) {

@@ -40,6 +40,7 @@ pub(super) fn keep(logs: &Path, ended: &Ended) -> io::Result<()> {
     let kept = logs.join(ENDED).join(&name);
     fs::remove_file(log.with_extension("log.1")).ok();
     if !ended.has_output() {
+        fs::remove_file(&log).ok();
         return Ok(());
     }
     fs::create_dir_all(logs.join(ENDED))?;
@@ -109,7 +110,7 @@ mod tests {
         simulation.log = Some(logs.join(FOLDER_OF_RUNNING).join(format!("{}.log", simulation.id)));
         Ended {
             simulation,
-            client: Peer::Proxy(std::net::Ipv4Addr::LOCALHOST.into()),
+            client: Some(Peer::Proxy(std::net::Ipv4Addr::LOCALHOST.into())),
             at: 0,
             events: vec!["12:00:00 it began".to_owned()],
             end: Failure::new(reason, "").into(),

@@ -13,6 +13,8 @@ pub enum StopReason {
     MakesRoom,
     /// Nobody has opened its stream in time.
     NoViewer,
+    /// It was kept ready without a client, and is not needed.
+    Unneeded,
     /// An administrator has asked for it.
     Administrator,
     /// The server stops.
@@ -32,6 +34,7 @@ impl From<StopReason> for Failure {
                 "Others wait for a place, and your address has left several simulations behind",
             ),
             StopReason::NoViewer => Self::new(Reason::NoViewer, "Nobody has opened its 3D view"),
+            StopReason::Unneeded => Self::new(Reason::Left, "It was kept ready, and no client has taken it"),
             StopReason::Administrator => Self::new(Reason::StoppedByAdministrator, "The administrator has stopped it"),
             StopReason::ServerStopped => Self::new(Reason::ServerStopped, "The server was stopped"),
             StopReason::SessionLost => lost(),

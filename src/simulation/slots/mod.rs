@@ -5,10 +5,12 @@ mod reservations;
 mod simulation_record;
 mod slot_lease;
 mod slot_pool;
+mod spare;
 mod stream;
 
 pub use reservations::{LinkId, Reserved};
-pub use simulation_record::SlotEvent;
+pub use simulation_record::{SlotEvent, SpareKind};
 pub use slot_lease::{Slot, SlotLease};
 pub use slot_pool::SlotPool;
+pub use spare::{SpareStatus, Taker};
 pub use stream::StreamTarget;

@@ -7,8 +7,9 @@ use std::time::{Duration, Instant};
 use actix::{Message, Recipient};
 
 use super::simulation_record::Party;
-use crate::shared::domain::{Failure, Offer, Offers, Reason, ReservationId, Wish, Wishes};
+use crate::shared::domain::{Failure, Offer, Offers, ProjectUrl, Reason, ReservationId, Wish, Wishes};
 use crate::shared::http::AddressQuota;
+use crate::simulation::simulation_id::SimulationId;
 
 /// What a session server must be told.
 #[derive(Message)]
@@ -35,8 +36,8 @@ pub(super) struct Reservations {
 
 /// A slot that waits for its client.
 pub(super) struct Reservation {
-    /// The port.
-    pub(super) port: u16,
+    /// What it holds.
+    pub(super) held: Held,
     /// The address and the user that it counts for, each with its limit.
     pub(super) parties: Vec<(Party, usize)>,
     /// When its client has entered the line.
@@ -46,12 +47,32 @@ pub(super) struct Reservation {
     link: LinkId,
 }
 
+/// What a reservation holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Held {
+    /// A free port.
+    Port(u16),
+    /// A simulation that is kept ready. Its client takes it, or it ends and the client gets its port.
+    Spare(SimulationId),
+}
+
+impl Held {
+    /// The simulation that is kept ready.
+    pub(super) fn spare(self) -> Option<SimulationId> {
+        match self {
+            Self::Port(_) => None,
+            Self::Spare(id) => Some(id),
+        }
+    }
+}
+
 /// A client of a session server.
 pub(super) struct Wanted {
     ticket: u64,
     since: Instant,
     address: Option<IpAddr>,
     parties: Vec<(Party, usize)>,
+    world: Option<ProjectUrl>,
 }
 
 struct Link {
@@ -118,6 +139,7 @@ impl Reservations {
                 since: now.checked_sub(Duration::from_millis(wish.waited)).unwrap_or(now),
                 address: wish.address,
                 parties: parties(wish),
+                world: wish.world.clone(),
             })
             .collect();
         link.all = (wishes.all as usize).max(link.wanted.len());
@@ -152,8 +174,25 @@ impl Reservations {
         address.is_some_and(|address| self.behind.contains_key(&address))
     }
 
-    /// Reserves a port for a client.
-    pub(super) fn reserve(&mut self, id: LinkId, index: usize, port: u16) {
+    /// The world of a client.
+    pub(super) fn world(&self, id: LinkId, index: usize) -> Option<&ProjectUrl> {
+        self.links.get(&id)?.wanted.get(index)?.world.as_ref()
+    }
+
+    /// Whether a simulation that is kept ready is promised to a client.
+    pub(super) fn holds(&self, id: SimulationId) -> bool {
+        self.reserved.values().any(|one| one.held == Held::Spare(id))
+    }
+
+    /// A simulation that was kept ready has left its port: who it was promised to gets that.
+    pub(super) fn keep_port(&mut self, id: SimulationId, port: u16) {
+        for one in self.reserved.values_mut().filter(|one| one.held == Held::Spare(id)) {
+            one.held = Held::Port(port);
+        }
+    }
+
+    /// Reserves a port, or a simulation that is kept ready, for a client.
+    pub(super) fn reserve(&mut self, id: LinkId, index: usize, held: Held) {
         let Some(link) = self.links.get_mut(&id) else { return };
         let Some(wanted) = link.wanted.remove(index) else {
             return;
@@ -166,9 +205,13 @@ impl Reservations {
         });
         link.has_news = true;
         let seconds = wanted.since.elapsed().as_secs_f64();
-        log::info!("the slot of port {port} is reserved for a client of the line, which has waited {seconds:.1} s");
+        let what = match held {
+            Held::Port(port) => format!("the slot of port {port}"),
+            Held::Spare(id) => format!("{id}, which is kept ready,"),
+        };
+        log::info!("{what} is reserved for a client of the line, which has waited {seconds:.1} s");
         let reserved = Reservation {
-            port,
+            held,
             parties: wanted.parties,
             since: wanted.since,
             address: wanted.address,

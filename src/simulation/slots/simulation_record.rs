@@ -7,11 +7,11 @@ use std::time::{Instant, SystemTime};
 use actix::{Message, Recipient};
 use tokio::sync::Semaphore;
 
-use crate::shared::domain::{Failure, Reason};
+use crate::shared::domain::{Failure, ProjectUrl, Reason, View};
 use crate::shared::http::Peer;
 use crate::shared::run::{seconds_since_1970, timestamp};
 use crate::shared::text::{excerpt, without_paths};
-use crate::simulation::attachment::Token;
+use crate::simulation::attachment::{NewClient, Token};
 use crate::simulation::ends::{End, Ended, lost};
 use crate::simulation::snapshot::{Simulation, Stage};
 
@@ -25,8 +25,10 @@ pub(super) struct SimulationRecord {
     pub listener: Recipient<SlotEvent>,
     /// The simulation, as pages show it. It has no port while it is in the queue.
     pub simulation: Simulation,
-    /// Its client, which counts for its address.
-    pub client: Peer,
+    /// Its client, which counts for its address; `None` if it is kept ready for one.
+    pub client: Option<Peer>,
+    /// What it is kept ready for, as long as it has no client.
+    pub spare: Option<Spare>,
     /// The address and the user of its client, if their slots are limited, each with its limit.
     pub parties: Vec<(Party, usize)>,
     /// Whether its Webots tells controllers if it has a world; known once it has a stream.
@@ -35,11 +37,28 @@ pub(super) struct SimulationRecord {
     pub accesses: Vec<Access>,
     /// Why the server ends it, once it does, as text for those at its streams.
     pub ending: Arc<OnceLock<String>>,
-    /// Whether it was told to make room for a client that waits.
+    /// Whether it was told to make room for a client that waits, or was kept ready and ends.
     pub makes_room: bool,
     /// Its end, once that is reported. Only the first report counts.
     pub end: Option<End>,
     events: Vec<String>,
+}
+
+/// What a simulation without a client is kept ready for: any client that asks for this can take it.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct SpareKind {
+    /// The world.
+    pub world: ProjectUrl,
+    /// How it is shown.
+    pub view: View,
+}
+
+/// What makes a simulation one without a client.
+#[derive(Debug)]
+pub(super) struct Spare {
+    pub(super) kind: SpareKind,
+    /// Whether its branch has moved since: no client takes it.
+    pub(super) is_outdated: bool,
 }
 
 /// An event of a lease.
@@ -56,8 +75,11 @@ pub enum SlotEvent {
     Viewed,
     /// The administrator stops the simulation; the text is for its client.
     Stopped(String),
-    /// Another client waits for a slot, and too many simulations of the address wait for clients that are away.
+    /// Another client waits for a slot, and too many simulations of the address wait for clients that are away; or the
+    /// simulation was kept ready, and is not needed.
     MakeRoom,
+    /// A client takes the simulation, which was kept ready.
+    Taken(Box<NewClient>),
 }
 
 /// Access to the stream of a simulation.
@@ -124,12 +146,33 @@ impl SimulationRecord {
     /// A simulation that a client has just requested.
     pub(super) fn new(simulation: Simulation, client: Peer, listener: Recipient<SlotEvent>) -> Self {
         let event = format!("its client asks for {}", simulation.world);
+        Self::with(simulation, Some(client), None, listener, &event)
+    }
+
+    /// A simulation that is kept ready for clients.
+    pub(super) fn spare(simulation: Simulation, kind: SpareKind, listener: Recipient<SlotEvent>) -> Self {
+        let event = format!("it is kept ready, with {}", simulation.world);
+        let spare = Spare {
+            kind,
+            is_outdated: false,
+        };
+        Self::with(simulation, None, Some(spare), listener, &event)
+    }
+
+    fn with(
+        simulation: Simulation,
+        client: Option<Peer>,
+        spare: Option<Spare>,
+        listener: Recipient<SlotEvent>,
+        event: &str,
+    ) -> Self {
         let mut record = Self {
             since: Instant::now(),
             sent_position: None,
             listener,
             simulation,
             client,
+            spare,
             parties: Vec::new(),
             answers_controllers: false,
             accesses: Vec::new(),
@@ -138,7 +181,7 @@ impl SimulationRecord {
             end: None,
             events: Vec::new(),
         };
-        record.note(&event);
+        record.note(event);
         record
     }
 

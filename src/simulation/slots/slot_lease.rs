@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use actix::Recipient;
 
-use super::simulation_record::{Access, Holder, SimulationRecord, SlotEvent};
+use super::simulation_record::{Access, Holder, SimulationRecord, SlotEvent, SpareKind};
 use super::slot_pool::SlotPool;
 use crate::shared::domain::{Failure, ProjectUrl, ReservationId};
 use crate::shared::http::Peer;
@@ -45,6 +45,22 @@ impl SlotLease {
         let record = SimulationRecord::new(Simulation::new(id, world, identity), client, listener);
         slots.acquire(record, reservation)?;
         Ok(Self {
+            id,
+            slots: Arc::clone(slots),
+        })
+    }
+
+    /// Takes a free slot for a simulation that is kept ready for clients; `None` if there is none that no client waits
+    /// for.
+    pub fn for_spare(
+        slots: &Arc<SlotPool>,
+        id: SimulationId,
+        listener: Recipient<SlotEvent>,
+        kind: SpareKind,
+    ) -> Option<Self> {
+        let simulation = Simulation::new(id, &kind.world, ClientIdentity::default());
+        let record = SimulationRecord::spare(simulation, kind, listener);
+        slots.add_spare(record).then(|| Self {
             id,
             slots: Arc::clone(slots),
         })

@@ -14,9 +14,10 @@ use actix::Recipient;
 use parking_lot::Mutex;
 
 use super::port;
-use super::reservations::{LinkId, Reservations, Reserved};
-use super::simulation_record::{Party, SimulationRecord, SlotEvent};
-use crate::shared::domain::{Failure, Instances, Reason, ReservationId, Wish, Wishes};
+use super::reservations::{Held, LinkId, Reservations, Reserved};
+use super::simulation_record::{Party, SimulationRecord, SlotEvent, SpareKind};
+use crate::shared::domain::{Failure, Instances, Reason, ReservationId, View, Wish, Wishes};
+use crate::shared::http::Peer;
 use crate::simulation::ends::Ends;
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::snapshot::{Simulation, Snapshot, Stage};
@@ -27,14 +28,14 @@ pub struct SlotPool(pub(super) Mutex<Slots>);
 pub(super) struct Slots {
     ports: RangeInclusive<u16>,
     queue_capacity: usize,
-    per_address: Option<usize>,
-    per_user: Option<usize>,
+    pub(super) per_address: Option<usize>,
+    pub(super) per_user: Option<usize>,
     /// Number of leases that were requested, including those of clients that were refused.
-    arrivals: u64,
+    pub(super) arrivals: u64,
     /// Number of simulations that have given their slots back.
     freed: u64,
     /// The slots that are reserved for clients of session servers' lines.
-    reservations: Reservations,
+    pub(super) reservations: Reservations,
     /// All simulations in the order in which they were requested. Those without a port are the queue.
     pub(super) records: BTreeMap<SimulationId, SimulationRecord>,
     ends: Ends,
@@ -126,13 +127,17 @@ impl SlotPool {
         slots.arrivals += 1;
         let limits = (slots.per_address, slots.per_user);
         let user = record.simulation.identity.user.clone();
-        record.parties = parties(record.client.rate_limit_key(), user, limits);
+        record.parties = parties(record.client.and_then(Peer::rate_limit_key), user, limits);
         let id = record.simulation.id;
         if let Some(reservation) = reservation {
             record.since = reservation.since;
             // It may count for somebody else than the session server knew.
             if record.parties == reservation.parties || may_have(&slots.lent(), &record.parties) {
-                record.lend(reservation.port);
+                match reservation.held {
+                    Held::Port(port) => record.lend(port),
+                    // It is of another kind than the client: the client gets its port.
+                    Held::Spare(spare) => slots.end_least(spare),
+                }
                 slots.records.insert(id, record);
                 slots.serve();
                 return Ok(());
@@ -156,7 +161,8 @@ impl SlotPool {
         let mut slots = self.0.lock();
         if let Some(record) = slots.records.remove(&id) {
             if let Some(port) = record.simulation.port {
-                slots.freed += 1;
+                slots.reservations.keep_port(id, port);
+                slots.freed += u64::from(record.spare.is_none());
                 log::info!(target: "simulation", "{id}: the slot of port {port} is free");
             }
             slots.ends.record(record.ended());
@@ -196,10 +202,12 @@ impl SlotPool {
     /// All simulations at this moment.
     pub fn snapshot(&self) -> Snapshot {
         let slots = self.0.lock();
-        let simulations = slots.records.values().map(|record| record.simulation.clone()).collect();
+        let (spares, of_clients): (Vec<_>, Vec<_>) = slots.records.values().partition(|record| record.spare.is_some());
+        let simulations = of_clients.into_iter().map(|record| record.simulation.clone()).collect();
         Snapshot {
             instances: slots.instances(),
             simulations,
+            spares: spares.len(),
         }
     }
 }
@@ -216,7 +224,7 @@ impl Slots {
     }
 
     /// Number of slots that each address and user has whose slots are limited.
-    fn lent(&self) -> HashMap<Party, usize> {
+    pub(super) fn lent(&self) -> HashMap<Party, usize> {
         let mut lent: HashMap<Party, usize> = HashMap::new();
         let of_records = self
             .records
@@ -238,7 +246,9 @@ impl Slots {
             .queue()
             .filter(|waiting| may_have(&lent, &waiting.parties))
             .map(|waiting| {
-                let is_behind = self.reservations.is_behind(waiting.client.rate_limit_key());
+                let is_behind = self
+                    .reservations
+                    .is_behind(waiting.client.and_then(Peer::rate_limit_key));
                 ((is_behind, waiting.since), waiting.simulation.id)
             })
             .min();
@@ -277,11 +287,17 @@ impl Slots {
     }
 
     /// Grants free slots to the clients in the queue, makes room for the others, and sends them their position.
-    fn serve(&mut self) {
+    pub(super) fn serve(&mut self) {
         self.grant();
         self.make_room();
         let queue: Vec<Instant> = self.queue().map(|waiting| waiting.since).collect();
-        let free = self.ports.len().saturating_sub(self.taken().count());
+        // A slot of a simulation without a client is as good as free, unless it is promised.
+        let of_clients = self
+            .records
+            .values()
+            .filter(|record| record.simulation.port.is_some() && record.spare.is_none());
+        let used = of_clients.count() + self.reservations.reserved.len();
+        let free = self.ports.len().saturating_sub(used);
         self.reservations.tell(free, &queue);
         for (before, waiting) in self
             .records
@@ -297,12 +313,14 @@ impl Slots {
     }
 
     fn grant(&mut self) {
-        while let Some(next) = self.next()
-            && let Some(port) = self.free_port()
-        {
+        while let Some(next) = self.next() {
             match next {
-                Next::InLine(link, index) => self.reservations.reserve(link, index, port),
+                Next::InLine(link, index) => {
+                    let Some(held) = self.to_hold(link, index) else { return };
+                    self.reservations.reserve(link, index, held);
+                }
                 Next::InQueue(id) => {
+                    let Some(port) = self.free_port() else { return };
                     if let Some(first) = self.records.get_mut(&id) {
                         first.lend(port);
                     }
@@ -311,20 +329,42 @@ impl Slots {
         }
     }
 
-    /// While clients wait because all slots are taken, ends simulations that wait for their own clients: one for each, the
-    /// longest absent first, of addresses for which more than a quarter of the slots waits. So somebody who leaves one
+    /// What is reserved for a client in a line: a simulation that is kept ready for it, a free port, or the slot of
+    /// another simulation without a client, which ends once the client comes.
+    fn to_hold(&self, link: LinkId, index: usize) -> Option<Held> {
+        let kind = self.reservations.world(link, index).map(|world| SpareKind {
+            world: world.clone(),
+            // A client in the line does not say how it will show its world.
+            view: View::default(),
+        });
+        let own = kind.and_then(|kind| self.best_spare(&kind)).map(Held::Spare);
+        own.or_else(|| self.free_port().map(Held::Port))
+            .or_else(|| self.least_spare().map(Held::Spare))
+    }
+
+    /// Number of clients that wait for a slot, and may have one.
+    pub(super) fn waiting(&self) -> usize {
+        let lent = self.lent();
+        self.eligible().count() + self.reservations.waiting(|parties| may_have(&lent, parties))
+    }
+
+    /// While clients wait because all slots are taken, ends others: one for each, first those that are kept ready without
+    /// a client, then simulations that wait for their own clients: the longest absent first, of addresses for which more than a quarter of the slots waits. So somebody who leaves one
     /// simulation after the other can't keep all slots.
     fn make_room(&mut self) {
-        let lent = self.lent();
-        let waiting = self.eligible().count() + self.reservations.waiting(|parties| may_have(&lent, parties));
+        let waiting = self.waiting();
         if waiting == 0 || self.free_port().is_some() {
             return;
         }
         let leaving = self
             .records
             .values()
-            .filter(|record| record.is_away() && record.makes_room);
+            .filter(|record| record.makes_room && (record.is_away() || record.spare.is_some()));
         for _ in leaving.count()..waiting {
+            if let Some(spare) = self.least_spare() {
+                self.end_least(spare);
+                continue;
+            }
             let Some(longest_away) = self.longest_away() else {
                 return;
             };
@@ -340,7 +380,7 @@ impl Slots {
         let address = |record: &SimulationRecord| {
             record
                 .client
-                .rate_limit_key()
+                .and_then(Peer::rate_limit_key)
                 .filter(|_| record.is_away() && !record.makes_room)
         };
         for address in self.records.values().filter_map(address) {
@@ -357,11 +397,15 @@ impl Slots {
     /// The ports that are leased or reserved.
     fn taken(&self) -> impl Iterator<Item = u16> {
         let leased = self.records.values().filter_map(|record| record.simulation.port);
-        leased.chain(self.reservations.reserved.values().map(|one| one.port))
+        let reserved = self.reservations.reserved.values().filter_map(|one| match one.held {
+            Held::Port(port) => Some(port),
+            Held::Spare(_) => None,
+        });
+        leased.chain(reserved)
     }
 
     /// The lowest port that is neither leased nor reserved nor used by another program.
-    fn free_port(&self) -> Option<u16> {
+    pub(super) fn free_port(&self) -> Option<u16> {
         let taken: HashSet<u16> = self.taken().collect();
         self.ports
             .clone()
@@ -373,7 +417,7 @@ impl Slots {
             let matching = self
                 .records
                 .values()
-                .filter(|record| stages.contains(&record.simulation.stage))
+                .filter(|record| record.spare.is_none() && stages.contains(&record.simulation.stage))
                 .count();
             u32::try_from(matching).unwrap_or(u32::MAX)
         };
@@ -386,6 +430,8 @@ impl Slots {
             arrivals: self.arrivals,
             reserved: u32::try_from(self.reservations.reserved.len()).unwrap_or(u32::MAX),
             freed: self.freed,
+            spare: u32::try_from(self.records.values().filter(|record| record.spare.is_some()).count())
+                .unwrap_or(u32::MAX),
         }
     }
 }
@@ -399,7 +445,7 @@ enum Next {
 }
 
 /// The address and the user of a client, if their slots are limited, each with its limit.
-fn parties(
+pub(super) fn parties(
     address: Option<IpAddr>,
     user: Option<String>,
     (per_address, per_user): (Option<usize>, Option<usize>),
@@ -410,7 +456,7 @@ fn parties(
 }
 
 /// Whether these may have another slot.
-fn may_have(lent: &HashMap<Party, usize>, parties: &[(Party, usize)]) -> bool {
+pub(super) fn may_have(lent: &HashMap<Party, usize>, parties: &[(Party, usize)]) -> bool {
     let is_left = |(party, most): &(Party, usize)| lent.get(party).is_none_or(|slots| slots < most);
     parties.iter().all(is_left)
 }

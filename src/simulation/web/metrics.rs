@@ -1,6 +1,7 @@
 //! The Prometheus metrics of `/metrics` that follow from the state of the server. The counter of starts is in
 //! `app.rs`, that of ends in `ends/ends.rs`.
 
+use crate::shared::domain::ReadyStatus;
 use crate::shared::http::Gauge;
 use crate::simulation::machine::sensors::Gpu;
 use crate::simulation::snapshot::Snapshot;
@@ -21,6 +22,14 @@ pub fn gauges<'text>(server: &AppState, snapshot: &Snapshot) -> Vec<Gauge<'text>
         let labels = |gpu: &Gpu| vec![gpu.index.to_string(), gpu.name.clone()];
         readings.gpus.iter().map(|gpu| (labels(gpu), value(gpu))).collect()
     };
+    let ready = server.ready();
+    let spares = |count: fn(&ReadyStatus) -> u32| f64::from(ready.iter().map(count).fold(0, u32::saturating_add));
+    let of_spares = [
+        ("wanted", spares(|one| one.wanted)),
+        ("ready", spares(|one| one.ready)),
+        ("starting", spares(|one| one.starting)),
+        ("failing", spares(|one| u32::from(one.problem.is_some()))),
+    ];
     let flag = |is_set: bool| f64::from(u8::from(is_set));
     let failed = "Starts in a row that failed for a reason of this server's own";
     let lost = "1 while GPUs have answered and some or all don't any more";
@@ -58,6 +67,12 @@ pub fn gauges<'text>(server: &AppState, snapshot: &Snapshot) -> Vec<Gauge<'text>
                 .iter()
                 .map(|(state, count)| (vec![(*state).to_owned()], f64::from(*count)))
                 .collect(),
+        },
+        Gauge {
+            name: "webots_simulation_kept_ready",
+            help: "Simulations that are kept ready without a client; failing: worlds of which none can be started",
+            labels: &["state"],
+            values: of_spares.map(|(state, count)| (vec![state.to_owned()], count)).into(),
         },
         Gauge::plain("webots_machine_cpu_percent", "CPU in use", machine.cpu),
         Gauge::plain("webots_machine_memory_percent", "Memory in use", machine.memory),

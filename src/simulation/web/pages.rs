@@ -6,7 +6,7 @@ use askama::Template;
 use url::Url;
 
 use super::access::Visitor;
-use crate::shared::domain::Instances;
+use crate::shared::domain::{Instances, ReadyStatus, View};
 use crate::shared::http::{PageView, TableRow};
 use crate::shared::run::timestamp;
 use crate::shared::text::one_line;
@@ -35,6 +35,8 @@ struct Glance<'server> {
     load: f64,
     /// Why no simulation can be started; `None` if some can.
     problem: Option<String>,
+    /// What is kept ready for clients.
+    ready: Vec<ReadyStatus>,
 }
 
 /// The cells of one simulation.
@@ -116,6 +118,7 @@ pub fn view(
         instances,
         load,
         problem,
+        ready: server.ready(),
     }
     .render()?;
     let parts = [("glance", glance)].into();

@@ -37,6 +37,7 @@ pub fn status_page(server: &AppState, snapshot: &Snapshot, names_machine: bool) 
         reserves: server.fleet_key.is_some(),
         failed_starts: server.failed_starts.count(),
         problem: server.problem(),
+        ready: server.ready(),
     };
     let more = json!({
         "isolation": server.launcher.level,

@@ -1,7 +1,7 @@
 //! The launch specification: everything that one Webots is started with.
 
 use std::ffi::OsString;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -10,14 +10,13 @@ use actix::prelude::*;
 use super::event::WebotsEvent;
 use super::release::Release;
 use super::startup::{ListenSign, StartupEvent, follow_startup};
-use crate::shared::http::Peer;
+use crate::shared::domain::View;
 use crate::simulation::checkout::Project;
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::container::{ContainerRequest, ContainerService};
 use crate::simulation::isolation::{Cgroup, DiskMonitor, DiskUse, Display, Launcher, RepositoryAssets};
 use crate::simulation::machine::sensors::Gpu;
 use crate::simulation::process::SpawnSpec;
-use crate::simulation::protocol::Mode;
 use crate::simulation::slots::Slot;
 
 /// Everything that one Webots is started with.
@@ -39,13 +38,15 @@ pub struct LaunchSpec {
     /// The release of Webots that runs, if it is known.
     pub release: Option<Release>,
     /// How it is shown.
-    pub mode: Mode,
+    pub view: View,
     /// The GPU assigned to it, if any.
     pub gpu: Option<Gpu>,
     /// The slot, with its port.
     pub slot: Slot,
-    /// Its client.
-    pub client: Peer,
+    /// The address of its client, which has a share of the builders of images.
+    pub address: Option<IpAddr>,
+    /// Whether it is kept ready, and has no client yet.
+    pub is_spare: bool,
     /// Receives the events.
     pub events: Recipient<WebotsEvent>,
 }
@@ -60,7 +61,7 @@ impl LaunchSpec {
             project: Arc::clone(&self.project),
             port: self.slot.port,
             gpu: self.gpu.clone(),
-            address: self.client.rate_limit_key(),
+            address: self.address,
             command,
         }
     }
@@ -70,9 +71,9 @@ impl LaunchSpec {
     /// The 3D stream is requested as plain `--stream`: R2025a rejects `--stream=x3d`, R2023b rejects `--stream=w3d`.
     /// The MJPEG stream shows the window, which therefore must be neither minimized nor without rendering.
     fn options(&self) -> Vec<String> {
-        let (window, stream): (&[_], _) = match self.mode {
-            Mode::Mjpeg => (&[], "--stream=mjpeg"),
-            _ => (&["--minimize", "--no-rendering"], "--stream"),
+        let (window, stream): (&[_], _) = match self.view {
+            View::Mjpeg => (&[], "--stream=mjpeg"),
+            View::X3d => (&["--minimize", "--no-rendering"], "--stream"),
         };
         let mut options = [&["--batch", "--mode=pause"], window]
             .concat()

@@ -29,6 +29,11 @@ use crate::simulation::snapshot::Stage;
 #[rtype(result = "()")]
 pub struct Stop(pub StopReason);
 
+/// A client takes the simulation, which was kept ready: its time limit begins.
+#[derive(Message)]
+#[rtype(result = "()")]
+pub struct Taken;
+
 /// The actor.
 pub struct Webots {
     pub(super) spec: LaunchSpec,
@@ -86,6 +91,7 @@ pub(super) struct Stopping {
 pub(super) struct Process {
     group: ProcessGroup,
     tail: Tail,
+    /// When its time limit has begun: with the start of the process, or with its client.
     started: Instant,
     /// Restarts the controller of a competition's participant.
     restart: Option<Arc<Notify>>,
@@ -168,6 +174,12 @@ impl Webots {
             self.follow_startup(ctx);
         }
         ctx.run_later(self.spec.config.timing.launch, Self::check_launch);
+        if !self.spec.is_spare {
+            self.limit_time(ctx);
+        }
+    }
+
+    fn limit_time(&self, ctx: &mut Context<Self>) {
         let limit = self.spec.config.timeout;
         ctx.run_later(Duration::from_secs(limit), move |this, ctx| {
             let message = format!("The time limit of {limit} seconds was reached");
@@ -278,8 +290,8 @@ impl Webots {
         }
     }
 
-    /// Ends Webots: gracefully, or at once if it exceeds a limit, which it could exceed further in a grace period. Only
-    /// the first reason counts.
+    /// Ends Webots: gracefully, or at once if it exceeds a limit, which it could exceed further in a grace period, or if no
+    /// client has used it. Only the first reason counts.
     pub(super) fn stop(&mut self, failure: Failure, ctx: &mut Context<Self>) {
         let was_ready = matches!(self.state, State::Ready(_));
         let Process { mut group, tail, .. } = match self.take_state() {
@@ -297,7 +309,7 @@ impl Webots {
         if failure.reason.blame() == Blame::User || failure.reason == Reason::ServerStopped {
             self.spec.slot.lease.ending(&failure.message);
         }
-        if is_excess {
+        if is_excess || self.spec.is_spare {
             drop(group);
         } else {
             group.terminate();
@@ -453,6 +465,19 @@ impl Handler<StartupEvent> for Webots {
             StartupEvent::Loading(progress) => self.send(WebotsEvent::Progress(progress)),
             StartupEvent::Ready => self.become_ready(ctx),
         }
+    }
+}
+
+impl Handler<Taken> for Webots {
+    type Result = ();
+
+    fn handle(&mut self, _: Taken, ctx: &mut Self::Context) {
+        self.spec.is_spare = false;
+        if let Some(process) = self.state.process() {
+            process.started = Instant::now();
+            self.limit_time(ctx);
+        }
+        self.used(ctx);
     }
 }
 

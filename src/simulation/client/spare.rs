@@ -1,0 +1,99 @@
+//! How a session keeps its simulation ready without a client, and continues with the client that takes it.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use actix::prelude::*;
+
+use super::session::{Client, Expected, Ready, Session, SpareEvent, State};
+use crate::shared::domain::{Failure, Reason};
+use crate::simulation::attachment::NewClient;
+use crate::simulation::checkout::Tip;
+use crate::simulation::protocol;
+use crate::simulation::simulation_id::SimulationId;
+use crate::simulation::slots::{SlotLease, SpareKind};
+use crate::simulation::state::AppState;
+use crate::simulation::webots::Taken;
+
+impl Session {
+    /// Opens the session of a simulation without a client, if there is a free slot that no client waits for.
+    pub(super) fn open_spare(
+        server: &Arc<AppState>,
+        kind: SpareKind,
+        tip: Option<Tip>,
+        keeper: Recipient<SpareEvent>,
+    ) -> Addr<Self> {
+        let id = SimulationId::next();
+        let server = Arc::clone(server);
+        Self::create(|ctx| {
+            let lease = SlotLease::for_spare(&server.slots, id, ctx.address().recipient(), kind.clone());
+            let state = if let Some(lease) = lease {
+                log::info!("{id}: is kept ready with {}", kind.world);
+                State::Waiting {
+                    world: kind.world.clone(),
+                    tip,
+                    lease,
+                }
+            } else {
+                ctx.stop();
+                State::lost()
+            };
+            Self {
+                server,
+                id,
+                peer: None,
+                view: kind.view,
+                client: Client::Expected(Expected { kind, keeper }),
+                state,
+                resumable: false,
+                is_resetting: false,
+            }
+        })
+    }
+
+    /// Ends a session that has no client, unless one has just taken the simulation.
+    pub(super) fn finish_spare(&mut self, failure: Failure, ctx: &mut Context<Self>) {
+        let Client::Expected(Expected { kind, keeper }) = &self.client else {
+            return;
+        };
+        log::info!("{}: {failure} ({})", self.name(), failure.reason);
+        if !matches!(failure.reason, Reason::Left | Reason::ServerStopped) {
+            keeper.do_send(SpareEvent::Failed(kind.clone(), failure.clone()));
+        }
+        let has_no_client = self.server.slots.give_up_spare(self.id);
+        self.state = State::Over { failure, token: None };
+        // Otherwise that client is on its way.
+        if has_no_client {
+            ctx.stop();
+        }
+    }
+
+    /// A client takes the simulation.
+    pub(super) fn taken_by(&mut self, client: NewClient, ctx: &mut Context<Self>) {
+        if let State::Over { .. } = self.state {
+            Self::start_for(Arc::clone(&self.server), client, None);
+            return ctx.stop();
+        }
+        let NewClient {
+            connection,
+            identity,
+            resumable,
+            ..
+        } = client;
+        let peer = connection.peer;
+        log::info!("{}: client {peer}: takes it{identity}", self.id);
+        self.peer = Some(peer);
+        self.resumable = resumable;
+        self.client = Client::Connected(Self::attached(connection, ctx));
+        self.text(protocol::simulation_id(self.id));
+        if let Some(launched) = self.state.launched() {
+            launched.webots.0.do_send(Taken);
+            self.text(protocol::shutdown_timeout(self.server.config.timeout));
+            self.texts(launched.texts.iter().cloned());
+        }
+        if let State::Ready(Ready { started, .. }) = &mut self.state {
+            *started = Instant::now();
+            self.hand_over(ctx);
+        }
+    }
+}

@@ -1,0 +1,311 @@
+//! Simulations that are kept ready: clients take them at once, they take nothing from clients, and nothing of them stays.
+
+use std::time::Duration;
+
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use serde_json::{Value, json};
+
+use super::life::quick;
+use super::scene::nothing_left;
+use crate::support::clock::Clock;
+use crate::support::{
+    Builder, Client, DEMO, Server, WORLD, Webots, arm, demo_server, http, instance_folders_in, instances_below,
+    server_of, until, world,
+};
+
+/// A server that keeps this many of the world of [`arm`] ready, however busy the machine is.
+fn keeping(builder: Builder, count: u32) -> Builder {
+    let builder = builder.set("readyLoad", 1000).set("timing.branches", 0.5);
+    quick(builder).set("ready", json!([{"world": arm(), "count": count}]))
+}
+
+/// What a server reports of the world of [`arm`].
+async fn kept(server: &Server) -> Value {
+    server.status().await["ready"][0].clone()
+}
+
+async fn until_ready(server: &Server, count: u32) {
+    let are_ready = async || kept(server).await["ready"] == count;
+    until(&format!("{count} are ready"), are_ready).await;
+}
+
+/// The processes that were started as Webots: the ids.
+fn pids(server: &Server) -> Vec<i32> {
+    let all = instances_below(&server.cache()).into_iter();
+    let mut pids: Vec<i32> = all
+        .filter(|(_, words)| words.contains("--batch"))
+        .map(|(pid, _)| pid)
+        .collect();
+    pids.sort_unstable();
+    pids
+}
+
+async fn asking(server: &Server, start: Value) -> Client {
+    let mut client = Client::connect(&server.websocket("/client")).await;
+    client.send(&json!({ "start": start }).to_string()).await;
+    client
+}
+
+#[actix_rt::test]
+async fn a_client_takes_one_that_is_ready_and_starts_nothing() {
+    needs!("bwrap");
+    for level in ["none", "sandbox"] {
+        let server = keeping(demo_server(4), 2)
+            .set("isolation", level)
+            .set("idleTimeout", 0.05)
+            .start()
+            .await;
+        until_ready(&server, 2).await;
+        let status = server.status().await;
+        assert_eq!(status["simulations"], json!([]), "it is no client's");
+        assert_eq!(
+            (&status["instances"]["spare"], &status["instances"]["idle"]),
+            (&json!(2), &json!(0))
+        );
+        // Twice as long as a simulation of a client may be paused.
+        actix_rt::time::sleep(Duration::from_secs(6)).await;
+        let before = pids(&server);
+        let mut client = asking(
+            &server,
+            json!({"url": arm(), "mode": "w3d", "resumable": true, "name": "Anna"}),
+        )
+        .await;
+        let token = client.token().await;
+        let heard: Vec<_> = client.heard.iter().map(String::as_str).collect();
+        assert_eq!(heard[1..3], ["shutdownTimeout: 7200", "kind: w3d"], "{heard:?}");
+        assert!(
+            heard[3].starts_with("webots:ws://localhost:") && heard[4] == "absence: 60",
+            "{heard:?}"
+        );
+        let one = server.simulations().await.remove(0);
+        assert!(before.contains(&i32::try_from(one["pid"].as_i64().unwrap()).unwrap()) || level == "sandbox");
+        assert_eq!(server.status().await["instances"]["arrivals"], 1);
+        // It is this client's as any other simulation: it can be seen, is resumed, and its limit of time begins now.
+        let port = one["port"].as_u64().unwrap();
+        let viewer = Client::connect(&format!("ws://127.0.0.1:{port}/"))
+            .await
+            .with_running_scene()
+            .await;
+        drop(client);
+        let mut client = Client::resuming(&server, &token).await;
+        client.token().await;
+        drop(viewer);
+        // Another one is started in its place.
+        until_ready(&server, 2).await;
+        client.close_with(1000).await;
+        until("only those are left", async || {
+            server.simulations().await.is_empty() && kept(&server).await["ready"] == 2
+        })
+        .await;
+        let metrics = server.metrics().await;
+        assert!(
+            metrics.contains("webots_simulation_kept_ready{state=\"ready\"} 2"),
+            "{metrics}"
+        );
+        assert!(
+            metrics.contains("webots_simulation_starts_total{outcome=\"ready\"} 1"),
+            "{metrics}"
+        );
+        assert!(server.monitor().await.contains("Kept ready: a.wbt"));
+        let lines = std::fs::read_to_string(server.folder.join("log/simulation/simulations.csv")).unwrap();
+        assert_eq!(lines.lines().count(), 2, "the heading, and one client: {lines}");
+    }
+}
+
+#[actix_rt::test]
+async fn only_a_client_of_its_world_and_mode_takes_it() {
+    let builder = keeping(demo_server(4), 1);
+    builder.forge().commit("lab/arm", "main", &[("worlds/b.wbt", WORLD)]);
+    let server = builder.start().await;
+    until_ready(&server, 1).await;
+    let before = pids(&server);
+    let mut other = asking(&server, json!({"url": world("lab/arm", "main", "worlds/b.wbt")})).await;
+    other.until("loading: webots is starting").await;
+    other.until("webots:").await;
+    // The demo simulator, started for it, has no video.
+    let mut video = asking(&server, json!({"url": arm(), "mode": "mjpeg"})).await;
+    video.until("loading: webots is starting").await;
+    assert!(video.until("reason: ").await.contains("launch-failed"));
+    assert!(before.iter().all(|pid| pids(&server).contains(pid)));
+    assert_eq!(kept(&server).await["ready"], 1);
+}
+
+#[actix_rt::test]
+async fn clients_get_the_slots_of_those_that_are_ready_in_any_state() {
+    // The second is a Webots that never gets ready.
+    for state in ["idle", "launching"] {
+        let builder = keeping(server_of(Webots::that_is(state), 2), 2);
+        builder.forge().commit("lab/arm", "main", &[("worlds/b.wbt", WORLD)]);
+        let server = builder.start().await;
+        until("all slots are taken", async || {
+            server.status().await["instances"]["spare"] == 2
+        })
+        .await;
+        let other = world("lab/arm", "main", "worlds/b.wbt");
+        let mut first = Client::start(&server, &other).await;
+        let mut second = Client::start(&server, &other).await;
+        for client in [&mut first, &mut second] {
+            client.until("shutdownTimeout").await;
+        }
+        let status = server.status().await;
+        assert_eq!(
+            (&status["instances"]["spare"], &status["ready"][0]["wanted"]),
+            (&json!(0), &json!(2))
+        );
+        // Nobody is ended for one that could be kept ready.
+        actix_rt::time::sleep(Duration::from_secs(1)).await;
+        assert_eq!(server.simulations().await.len(), 2);
+        first.leave().await;
+        until("one is kept again", async || {
+            server.status().await["instances"]["spare"] == 1
+        })
+        .await;
+    }
+}
+
+#[actix_rt::test]
+async fn a_client_takes_even_one_that_starts() {
+    let webots = Webots::script(&format!("sleep 3; exec {DEMO} \"$@\""));
+    let server = keeping(server_of(webots, 1), 1).start().await;
+    until("it starts", async || {
+        kept(&server).await["starting"] == 1 && !pids(&server).is_empty()
+    })
+    .await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("shutdownTimeout: 7200").await;
+    client.until("webots:").await;
+    assert_eq!(server.log().matches(": started ").count(), 1);
+    client.leave().await;
+}
+
+#[actix_rt::test]
+async fn when_the_branch_moves_new_ones_come_before_old_ones_go() {
+    let server = keeping(demo_server(3), 2).start().await;
+    until_ready(&server, 2).await;
+    let before = pids(&server);
+    let changed = WORLD.replace("title \"Test\"", "title \"Changed\"");
+    let commit = server.forge().commit("lab/arm", "main", &[("worlds/a.wbt", &changed)]);
+    let mut fewest = usize::MAX;
+    until("all are replaced", async || {
+        let now = pids(&server);
+        fewest = fewest.min(now.len());
+        now.iter().all(|pid| !before.contains(pid)) && kept(&server).await["ready"] == 2
+    })
+    .await;
+    assert!(fewest >= 2, "{fewest}");
+    assert!(server.log().contains("its branch has moved"), "{commit}");
+    let client = Client::ready(&server).await;
+    let is_new = |folder: std::path::PathBuf| {
+        std::fs::read_to_string(folder.join("project/worlds/a.wbt")).is_ok_and(|text| text.contains("Changed"))
+    };
+    until("all have the new commit", async || {
+        let folders = instance_folders_in(&server.cache());
+        folders.len() == 3 && folders.into_iter().all(is_new)
+    })
+    .await;
+    // A branch that is gone: nobody would get that world.
+    client.leave().await;
+    until_ready(&server, 2).await;
+    let bare = server.forge().path().join("lab/arm");
+    crate::support::git::git(&bare, &["update-ref", "-d", "refs/heads/main"]);
+    until("none is kept", async || {
+        let kept = kept(&server).await;
+        kept["ready"] == 0
+            && kept["problem"]
+                .as_str()
+                .is_some_and(|why| why.contains("no branch, tag or commit"))
+    })
+    .await;
+}
+
+#[actix_rt::test]
+async fn a_world_that_fails_is_told_once_and_ejects_nobody() {
+    let builder = keeping(demo_server(2), 1);
+    builder
+        .forge()
+        .commit("lab/arm", "main", &[("worlds/a.wbt", "no world\n")]);
+    let server = builder.start().await;
+    let problem = async || kept(&server).await["problem"].as_str().map(str::to_owned);
+    until("it is told", async || {
+        problem().await.is_some_and(|why| why.contains("is no world file"))
+    })
+    .await;
+    until("it is tried again", async || {
+        server.log().matches("is kept ready with").count() > 1
+    })
+    .await;
+    assert_eq!(server.log().matches("can't be kept ready").count(), 1);
+    assert_eq!(server.status().await["failedStarts"], 0);
+    assert!(
+        server
+            .metrics()
+            .await
+            .contains("webots_simulation_kept_ready{state=\"failing\"} 1")
+    );
+    assert!(server.monitor().await.contains("is no world file"));
+    // The branch moves: it is tried at once.
+    server.forge().commit("lab/arm", "main", &[("worlds/a.wbt", WORLD)]);
+    until_ready(&server, 1).await;
+    assert_eq!(problem().await, None);
+    // One that ends by itself is replaced, after a pause.
+    kill(Pid::from_raw(pids(&server)[0]), Signal::SIGKILL).unwrap();
+    until("its end is told", async || problem().await.is_some()).await;
+    until_ready(&server, 1).await;
+    assert_eq!(problem().await, None);
+}
+
+#[actix_rt::test]
+async fn nothing_stays_after_any_end_of_the_server() {
+    for signal in [Signal::SIGTERM, Signal::SIGUSR1, Signal::SIGKILL] {
+        let folder = tempfile::tempdir().unwrap();
+        let mut server = keeping(demo_server(3), 2).folder(folder.path()).start().await;
+        until_ready(&server, 2).await;
+        let cache = server.cache();
+        server.signal(signal);
+        let code = server.ended().await;
+        assert_eq!(code, (signal != Signal::SIGKILL).then_some(0), "{signal}");
+        until("no process is left", async || instances_below(&cache).is_empty()).await;
+    }
+}
+
+#[actix_rt::test]
+async fn a_list_is_read_again_and_worlds_are_kept_only_when_it_says_so() {
+    let clock = Clock::new();
+    let server = clock.of(keeping(demo_server(3), 1)).start().await;
+    until_ready(&server, 1).await;
+    let entry = |more: Value| {
+        let mut entry = json!({"world": arm(), "count": 2});
+        entry.as_object_mut().unwrap().extend(more.as_object().unwrap().clone());
+        json!({"ready": [entry]})
+    };
+    let in_an_hour = std::time::SystemTime::now() + Duration::from_hours(1);
+    let in_an_hour = humantime::format_rfc3339_seconds(in_an_hour).to_string();
+    server.reload(entry(json!({ "until": in_an_hour })));
+    until_ready(&server, 2).await;
+    clock.set(2 * 3600);
+    until("the time is over", async || {
+        server.status().await["instances"]["spare"] == 0
+    })
+    .await;
+    nothing_left(&server, 3).await;
+    clock.set(0);
+    until_ready(&server, 2).await;
+    server.reload(json!({"ready": "nonsense"}));
+    until("the mistake is told", async || {
+        server.log().contains("was not read again")
+    })
+    .await;
+    assert_eq!(kept(&server).await["ready"], 2);
+    server.reload(json!({"ready": []}));
+    until("none is kept", async || {
+        server.status().await["instances"]["spare"] == 0
+    })
+    .await;
+    assert_eq!(server.status().await["ready"], json!([]));
+    // Nothing is in a client's way.
+    let client = Client::ready(&server).await;
+    client.leave().await;
+    nothing_left(&server, 3).await;
+    assert!(http::get(&server.url("/health")).await.text().contains("ok"));
+}
