@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
-# Runs worlds in your Webots through a fleet on this machine, with and without the sandbox, direct and relayed, and prints
-# a table to paste into an issue:
+# Runs worlds in your Webots through a fleet on this machine, with and without the sandbox, direct and relayed: a student
+# starts one, plays it, is watched, loses the connection, comes back and leaves; another's is stopped. It prints a table
+# to paste into an issue:
 #
 #   WEBOTS_HOME=/usr/local/webots tests/real-webots.sh [WORLD.wbt]...
 #   tests/real-webots.sh --program PROGRAM [WORLD.wbt]...     # another program in its place, such as the demo simulator

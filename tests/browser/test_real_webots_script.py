@@ -27,6 +27,7 @@ class RealWebots(unittest.TestCase):
         self.assertEqual({row["result"] for row in rows}, {"ok"}, rows)
         self.assertEqual({row["stream"] for row in rows}, {"direct", "relay"})
         self.assertEqual({row["world"] for row in rows}, {"controller", "physics"})
+        self.assertEqual({row["watched"] for row in rows}, {"yes"})
         self.assertTrue(all(float(row["real-time factor"]) > 0.2 for row in rows), rows)
         self.assertEqual(code, 0)
 

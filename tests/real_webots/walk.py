@@ -1,17 +1,22 @@
 """Runs worlds in a Webots through a fleet: walk.py PROGRAM [WORLD]...; an empty PROGRAM is that of WEBOTS_HOME."""
 
+import base64
 import json
 import os
 import pathlib
 import platform
+import re
 import shutil
+import socket
 import sys
 import time
+import urllib.request
 
 HERE = pathlib.Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent / "browser"))
 
 from fleet import SOON, Fleet, until  # noqa: E402
+from websockets.exceptions import ConnectionClosed  # noqa: E402
 from websockets.sync.client import connect  # noqa: E402
 
 # A real world has to be read, and its assets downloaded.
@@ -27,9 +32,14 @@ COLUMNS = (
     "real-time factor",
     "reset",
     "memory MB",
-    "end",
+    "watched",
+    "resumed s",
+    "end s",
+    "stopped s",
     "result",
 )
+PASSWORD = "a secret"
+REASON = "The lesson is over"
 
 
 class Failed(Exception):
@@ -70,18 +80,41 @@ def until_text(socket, text):
     first(socket, SOON, f"`{text}`", lambda heard: True if heard == text else None)
 
 
-def stream_of(client):
-    """The URL of the simulation's stream, and the scene to request."""
-    kind = "w3d"
+def simulations(server):
+    """The simulations of a server, as its administrator sees them."""
+    return json.loads(as_administrator(server, "status"))["simulations"]
 
-    def chosen(text):
-        nonlocal kind
+
+class Ready:
+    """What a client is told of its simulation until that is ready."""
+
+    def __init__(self, client):
+        self.kind, self.token, self.url = "w3d", None, None
+        first(client, START, "webots: and resume:", self._hears)
+
+    def _hears(self, text):
         if text.startswith(("error:", "Error:", "loading: Error:")):
             raise Failed(text.split("\n")[0])
-        kind = text.removeprefix("kind: ") if text.startswith("kind: ") else kind
-        return text.removeprefix("webots:") if text.startswith("webots:") else None
+        name, _, value = text.partition(":")
+        if name == "kind":
+            self.kind = value.strip()
+        elif name == "resume":
+            self.token = value.strip()
+        elif name == "webots":
+            self.url = value
+        return self if self.url and self.token else None
 
-    return first(client, START, "webots:", chosen), kind
+
+def as_administrator(server, path, body=None):
+    """The text of a page, or the answer to an action, of an administrator."""
+    credentials = base64.b64encode(f"admin:{PASSWORD}".encode()).decode()
+    request = urllib.request.Request(
+        server.url(path),
+        data=None if body is None else json.dumps(body).encode(),
+        headers={"Authorization": f"Basic {credentials}", "Content-Type": "application/json"},
+    )
+    with urllib.request.urlopen(request, timeout=SOON) as answer:
+        return answer.read().decode()
 
 
 def update(text):
@@ -137,39 +170,99 @@ def ancestors(pid):
             return
 
 
-def walk(fleet, row):
-    """The way of a student through the fleet; fills a row of the table."""
+def runs(ready, row, begin):
+    """Lets the simulation run and resets it."""
+    with connect(f"{ready.url}/", max_size=None) as stream:
+        stream.send(ready.kind)
+        until_text(stream, "scene load completed")
+        stream.send("real-time:-1")
+        now = moved(stream)
+        row["moving s"] = f"{time.monotonic() - begin:.1f}"
+        row["real-time factor"] = f"{speed(stream, now):.2f}"
+        stream.send("reset")
+        until_text(stream, "reset finished")
+        stream.send("real-time:-1")
+        if moved(stream) > now + 1000 * SPAN:
+            raise Failed("the time goes on after a reset")
+        row["reset"] = "yes"
+
+
+def is_watched(server, simulation, kind, client):
+    """An administrator sees the scene, and the client is told so."""
+    page = as_administrator(server, f"watch?id={simulation['id']}")
+    path = re.search('data-stream="([^"]+)"', page)[1]
+    with connect(f"ws://{server.address}/{path}", max_size=None) as watcher:
+        watcher.send(f"{kind};broadcast")
+        until_text(watcher, "scene load completed")
+        until_text(client, "watched: 1")
+    until_text(client, "watched: 0")
+
+
+def is_resumed(server, client, token, simulation):
+    """The client comes back to its simulation, whose Webots has gone on."""
+    client.send(json.dumps({"resume": token}))
+    first(client, SOON, "webots:", lambda text: text.startswith("webots:") or None)
+    if simulations(server)[0]["pid"] != simulation["pid"]:
+        raise Failed("another Webots was started")
+
+
+def has_ended(server, simulation, begin):
+    """The seconds until nothing of the simulation is left."""
+    until("the simulation has ended", lambda: not simulations(server))
+    until("its process has ended", lambda: not pathlib.Path(f"/proc/{simulation['pid']}").exists())
+    return f"{time.monotonic() - begin:.1f}"
+
+
+def student(fleet, row):
+    """A student's way: starts, plays, is watched, loses the connection, leaves."""
     server = fleet.simulation
     begin = time.monotonic()
     with connect(f"ws://{server.address}/client", max_size=None) as client:
-        client.send(json.dumps({"start": {"url": fleet.url}}))
-        url, kind = stream_of(client)
+        client.send(json.dumps({"start": {"url": fleet.url, "resumable": True}}))
+        ready = Ready(client)
         row["ready s"] = f"{time.monotonic() - begin:.1f}"
-        (simulation,) = server.status()["simulations"]
-        with connect(f"{url}/", max_size=None) as stream:
-            stream.send(kind)
+        (simulation,) = simulations(server)
+        runs(ready, row, begin)
+        row["memory MB"] = memory(simulation["pid"])
+        is_watched(server, simulation, ready.kind, client)
+        row["watched"] = "yes"
+        # The connection is lost without a word.
+        client.socket.shutdown(socket.SHUT_RDWR)
+    until("the server has noticed", lambda: "awayUntil" in simulations(server)[0])
+    begin = time.monotonic()
+    with connect(f"ws://{server.address}/client", max_size=None) as client:
+        is_resumed(server, client, ready.token, simulation)
+        row["resumed s"] = f"{time.monotonic() - begin:.1f}"
+        begin = time.monotonic()
+    row["end s"] = has_ended(server, simulation, begin)
+
+
+def stopped(fleet, row):
+    """An administrator ends the simulation: the client is told why; with a relay, so is its stream."""
+    server = fleet.simulation
+    with connect(f"ws://{server.address}/client", max_size=None) as client:
+        client.send(json.dumps({"start": {"url": fleet.url, "resumable": True}}))
+        ready = Ready(client)
+        (simulation,) = simulations(server)
+        with connect(f"{ready.url}/", max_size=None) as stream:
+            stream.send(ready.kind)
             until_text(stream, "scene load completed")
-            stream.send("real-time:-1")
-            now = moved(stream)
-            row["moving s"] = f"{time.monotonic() - begin:.1f}"
-            row["real-time factor"] = f"{speed(stream, now):.2f}"
-            row["memory MB"] = memory(simulation["pid"])
-            stream.send("reset")
-            until_text(stream, "reset finished")
-            stream.send("real-time:-1")
-            if moved(stream) > now + 1000 * SPAN:
-                raise Failed("the time goes on after a reset")
-            row["reset"] = "yes"
-    left = time.monotonic()
-    until("the simulation has ended", lambda: not server.status()["simulations"])
-    until("its process has ended", lambda: not pathlib.Path(f"/proc/{simulation['pid']}").exists())
-    row["end"] = f"{time.monotonic() - left:.1f} s"
+            begin = time.monotonic()
+            as_administrator(server, f"simulations/{simulation['id']}/stop", {"reason": REASON})
+            first(client, SOON, "the reason", lambda text: '"stopped-by-administrator"' in text or None)
+            try:
+                first(stream, SOON, "the end of the stream", lambda _: None)
+            except ConnectionClosed as closed:
+                code = closed.rcvd.code if closed.rcvd else 1006
+            if row["stream"] == "relay" and code != 1000:
+                raise Failed(f"the stream has ended with {code}") from None
+    row["stopped s"] = has_ended(server, simulation, begin)
 
 
 def tried(isolation, streaming, world, program):
     """A row of the table."""
     row = {"isolation": isolation, "stream": streaming, "world": world.stem, "result": "ok"}
-    keys = {"isolation": isolation, "streaming": streaming}
+    keys = {"isolation": isolation, "streaming": streaming, "adminPassword": PASSWORD}
     if program:
         keys["webots"] = program
     else:
@@ -177,8 +270,9 @@ def tried(isolation, streaming, world, program):
         keys |= {"webotsHome": home, "webots": f"{home}/webots"}
     try:
         with OneWorld(world, keys) as fleet:
-            walk(fleet, row)
-    except (Failed, AssertionError, OSError) as error:
+            student(fleet, row)
+            stopped(fleet, row)
+    except (Failed, AssertionError, OSError, ConnectionClosed) as error:
         row["result"] = str(error).split("\n")[0][:120]
     return row
 
