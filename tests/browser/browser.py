@@ -30,13 +30,16 @@ OWN_SPEED = "GL Driver Message (OpenGL, Performance"
 
 
 class Browser:
-    """A Chromium with its own profile; a context manager."""
+    """A Chromium with its own profile, and further switches; a context manager."""
+
+    def __init__(self, switches=()):
+        self.switches = [*SWITCHES, *switches]
 
     def __enter__(self):
         self.profile = tempfile.TemporaryDirectory(prefix="chromium-")
         self.playwright = sync_playwright().start()
         self.context = None
-        self.chromium = self.playwright.chromium.launch(executable_path=CHROMIUM, args=SWITCHES)
+        self.chromium = self.playwright.chromium.launch(executable_path=CHROMIUM, args=self.switches)
         return self
 
     def __exit__(self, *_):

@@ -34,6 +34,8 @@ class BrowserTest(unittest.TestCase):
     host = "127.0.0.1"
     # Whether console errors are allowed: offline, the browser reports unreachable URLs.
     may_complain = False
+    # Further switches of the browser, the same for all classes of a file.
+    switches = ()
     browser = None
 
     @classmethod
@@ -41,7 +43,7 @@ class BrowserTest(unittest.TestCase):
         cls.fleet = cls.enterClassContext(cls.make_fleet())
         # One browser suffices because each page has its own profile.
         if BrowserTest.browser is None:
-            BrowserTest.browser = unittest.enterModuleContext(Browser())
+            BrowserTest.browser = unittest.enterModuleContext(Browser(cls.switches))
             unittest.addModuleCleanup(setattr, BrowserTest, "browser", None)
 
     @classmethod

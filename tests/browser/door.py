@@ -3,15 +3,11 @@
 import contextlib
 import http.server
 import re
-import shutil
-import subprocess
 import threading
 
-import trustme
-from fleet import ROOT, Fleet, free_ports, until
+from fleet import ROOT, Fleet, free_ports
+from web_server import WebServer, adapted
 
-# On Debian, web servers are in /usr/sbin, which only root has in its PATH.
-NGINX = shutil.which("nginx") or "/usr/sbin/nginx"
 COOKIE = "_oauth2_proxy"
 MACHINES = ["127.0.0.2", "127.0.0.3"]
 
@@ -35,21 +31,13 @@ class SignIn(http.server.BaseHTTPRequestHandler):
         pass
 
 
-def adapted(text, **changes):
-    """Adapts rules to this machine; the text must contain each pattern."""
-    for what, (pattern, replacement) in changes.items():
-        text, count = re.subn(pattern, lambda _: replacement, text, flags=re.DOTALL)
-        assert count, f"{what}: {pattern} is not in {text}"
-    return text
-
-
 class OneDoor(Fleet):
-    """A fleet of two machines, 127.0.0.2 and 127.0.0.3, behind one https door where visitors sign in.
+    """A fleet of two machines, 127.0.0.2 and 127.0.0.3, behind one https door where visitors sign in, or need not.
 
     Streams are relayed, so that only the simulation servers' own ports are forwarded.
     """
 
-    def __init__(self, places, session=None, simulation=None):
+    def __init__(self, places, session=None, simulation=None, signs_in=True):
         self.exits = contextlib.ExitStack()
         sign_in = http.server.ThreadingHTTPServer(("127.0.0.1", 0), SignIn)
         self.exits.callback(sign_in.server_close)
@@ -72,7 +60,7 @@ class OneDoor(Fleet):
             },
         )
         try:
-            self._open(plain, sign_in.server_port)
+            self._open(plain, sign_in.server_port if signs_in else None)
         except BaseException:
             self.close()
             raise
@@ -83,24 +71,16 @@ class OneDoor(Fleet):
 
     def _open(self, plain, sign_in):
         """Starts nginx."""
-        folder = self.folder / "nginx"
-        folder.mkdir()
-        certificate = trustme.CA().issue_cert("localhost")
-        certificate.cert_chain_pems[0].write_to_path(folder / "chain.pem")
-        certificate.private_key_pem.write_to_path(folder / "key.pem")
-        users = adapted(
-            (ROOT / "deploy/nginx-users.conf").read_text(),
-            sign_in=("127.0.0.1:4180", f"127.0.0.1:{sign_in}"),
-            # The session server connects to simulation servers directly, and visitors come from this machine.
-            unsigned=("allow 127.0.0.1;", ""),
-            ports=(r"2000\|3000", "|".join(str(port) for _, port in self.hosts)),
-        )
+        self.web = WebServer("nginx", self.folder / "nginx")
+        self.exits.callback(self.web.stop)
+        folder = self.web.folder
+        users = "" if sign_in is None else self._users(sign_in)
         (folder / "users.conf").write_text(users)
         servers = "|".join(str(port) for _, port in self.hosts)
         site = adapted(
             (ROOT / "deploy/nginx-door.conf").read_text(),
-            certificate=("/etc/letsencrypt/live/fleet.example.org/fullchain.pem", f"{folder}/chain.pem"),
-            key=("/etc/letsencrypt/live/fleet.example.org/privkey.pem", f"{folder}/key.pem"),
+            certificate=("/etc/letsencrypt/live/fleet.example.org/fullchain.pem", str(self.web.chain)),
+            key=("/etc/letsencrypt/live/fleet.example.org/privkey.pem", str(self.web.key)),
             name=("fleet.example.org", "localhost"),
             any_address=(r"listen \[::\]:[^\n]*", ""),
             plain=("listen 80;", f"listen 127.0.0.1:{plain};"),
@@ -117,24 +97,17 @@ class OneDoor(Fleet):
             log=("/var/log/nginx/access.log", f"{folder}/access.log"),
             errors=("/var/log/nginx/error.log", f"{folder}/error.log"),
         )
-        (folder / "site.conf").write_text(site)
-        temporary = "".join(
-            f"{name}_temp_path {folder}/{name};\n" for name in ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
+        self.web.start(site)
+
+    def _users(self, sign_in):
+        """The rules that let in who has signed in."""
+        return adapted(
+            (ROOT / "deploy/nginx-users.conf").read_text(),
+            sign_in=("127.0.0.1:4180", f"127.0.0.1:{sign_in}"),
+            # The session server connects to simulation servers directly, and visitors come from this machine.
+            unsigned=("allow 127.0.0.1;", ""),
+            ports=(r"2000\|3000", "|".join(str(port) for _, port in self.hosts)),
         )
-        (folder / "nginx.conf").write_text(
-            f"user root;\ndaemon off;\nworker_processes 1;\npid {folder}/pid;\nerror_log {folder}/error.log warn;\n"
-            f"events {{ worker_connections 1024; }}\nhttp {{\n{temporary}include {folder}/site.conf;\n}}\n"
-        )
-        with (folder / "output.txt").open("w") as output:
-            nginx = subprocess.Popen(
-                [NGINX, "-e", folder / "error.log", "-c", folder / "nginx.conf"],
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=output,
-            )
-        self.exits.callback(nginx.wait)
-        self.exits.callback(nginx.terminate)
-        until("nginx runs", lambda: (folder / "pid").exists() or nginx.poll() is not None)
 
     def url(self, path):
         return f"https://{self.host}/{path}"
@@ -144,8 +117,7 @@ class OneDoor(Fleet):
         return self.url(f"{server.config['server']}/{server.port}")
 
     def logs(self):
-        files = [self.folder / "nginx" / name for name in ("output.txt", "error.log", "access.log")]
-        return super().logs() + "".join(f"\n--- {file.name} ---\n{file.read_text()}" for file in files if file.exists())
+        return super().logs() + self.web.logs()
 
     def close(self):
         self.exits.close()

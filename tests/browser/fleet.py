@@ -56,7 +56,7 @@ def until(what, condition):
 class Server:
     """A running program with its configuration and log."""
 
-    def __init__(self, program, folder, config):
+    def __init__(self, program, folder, config, environment):
         self.program, self.folder, self.port = program, folder, config["port"]
         folder.mkdir(parents=True, exist_ok=True)
         self.file = folder / "config.json"
@@ -71,7 +71,7 @@ class Server:
         }
         self.write()
         self.log = folder / "output.txt"
-        environment = {**os.environ, "DEMO_SIMULATOR_BIND": "127.0.0.1"}
+        environment = {**os.environ, "DEMO_SIMULATOR_BIND": "127.0.0.1", **environment}
         environment.pop("WEBOTS_HOME", None)
         with self.log.open("a") as log:
             self.process = subprocess.Popen(
@@ -158,6 +158,9 @@ class Client:
 class Fleet:
     """The fleet; a context manager."""
 
+    # Of its servers, besides this program's own.
+    environment = {}
+
     def __init__(self, session=None, simulation=None, strangers=()):
         """Starts it; the arguments are further keys of the configurations, and addresses that don't answer."""
         self.folder = pathlib.Path(tempfile.mkdtemp(prefix="fleet-browser-"))
@@ -242,7 +245,7 @@ class Fleet:
 
     def start(self, program, name, config):
         """Starts a server, which is stopped with the fleet."""
-        server = Server(program, self.folder / name, config)
+        server = Server(program, self.folder / name, config, self.environment)
         self.servers.append(server)
         return server
 

@@ -13,10 +13,12 @@ import shutil
 import struct
 import zlib
 
-from door import OneDoor
-from fleet import Fleet
+from fleet import SOON, Fleet
+from machine import Machine
 
 PARTS = pathlib.Path(os.environ.get("WEBOTS_REAL_PARTS", "/nonexistent"))
+# In seconds: without a GPU the engine is slow.
+PATIENCE = 5 * SOON
 MISSING = "WEBOTS_REAL_PARTS names no folder with Webots' viewer and an export, see tests/browser/real.py"
 # Where Webots' viewer loads its own files from; the page that draws an export from its files is there too.
 SITE = "https://cyberbotics.com/wwi/R2025a/"
@@ -126,5 +128,5 @@ class RealFleet(Real, Fleet):
     pass
 
 
-class RealDoor(Real, OneDoor):
+class RealMachine(Real, Machine):
     pass

@@ -1,4 +1,5 @@
-//! Files of the world's project, as Webots serves them: at the path of a request, without a check of `..`.
+//! Files of the world's project, as Webots serves them: at the path of a request, without a check of `..`; the pages of
+//! robot windows without the folder `plugins`.
 
 use std::fs;
 use std::hash::{DefaultHasher, Hash as _, Hasher as _};
@@ -26,7 +27,12 @@ pub(crate) fn answer(project: &Path, head: &str) -> Answer {
         return not_found(Some(format!("Unsupported file type '/{path}'.")));
     };
     // An absolute path would replace the project's: Webots concatenates texts.
-    let file = PathBuf::from(format!("{}/{path}", project.display()));
+    let folder = if path.starts_with("robot_windows/") {
+        "/plugins"
+    } else {
+        ""
+    };
+    let file = PathBuf::from(format!("{}{folder}/{path}", project.display()));
     let Ok(mut content) = fs::read(&file) else {
         let is_of_webots = ["js", "css", "html"]
             .iter()

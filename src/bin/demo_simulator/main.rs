@@ -22,6 +22,7 @@ mod motion;
 mod phases;
 mod port;
 mod protocol;
+mod robot_windows;
 mod run;
 mod scene;
 mod simulation;

@@ -10,6 +10,7 @@
 //!
 //! The constants and functions below create what the simulator sends.
 
+use crate::robot_windows::RobotWindow;
 use crate::world::WorldNames;
 
 /// A request of a client. Timeouts are in milliseconds of simulation time; infinite for never.
@@ -102,6 +103,11 @@ pub(crate) fn world(names: &WorldNames) -> String {
 /// The scene.
 pub(crate) fn model(xml: &str) -> String {
     format!("model:{xml}")
+}
+
+/// The window of a robot.
+pub(crate) fn robot_window(window: &RobotWindow) -> String {
+    format!("robot window: {}", serde_json::json!(window))
 }
 
 /// An update of the scene.

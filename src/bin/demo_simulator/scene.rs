@@ -27,6 +27,7 @@ use thiserror::Error;
 
 use crate::animation::{Animation, AnimationError};
 use crate::motion::{Pose, Robot};
+use crate::robot_windows::{self, RobotWindow};
 
 /// Size limit of a file, in bytes.
 const MAX_FILE: u64 = 32 * 1024 * 1024;
@@ -52,6 +53,8 @@ pub(crate) struct Scene {
     /// The model, as XML.
     pub(crate) model: String,
     motion: Motion,
+    /// The windows of its robots.
+    pub(crate) windows: Vec<RobotWindow>,
 }
 
 #[derive(Debug)]
@@ -100,13 +103,15 @@ impl Default for Circles {
 impl Scene {
     /// Reads the scene of a world of `project`. Blocks.
     pub(crate) fn load(world: &Path, project: &Path) -> Result<Self, SceneError> {
-        if let Some(model) = read(&world.with_extension("x3d"))? {
-            return Self::prepared(world, &model);
-        }
-        match Self::exported(&project.join("preview"))? {
-            Some(scene) => Ok(scene),
-            None => Self::built_in(world),
-        }
+        let scene = match read(&world.with_extension("x3d"))? {
+            Some(model) => Self::prepared(world, &model)?,
+            None => match Self::exported(&project.join("preview"))? {
+                Some(scene) => scene,
+                None => Self::built_in(world)?,
+            },
+        };
+        let windows = robot_windows::of_world(world);
+        Ok(Self { windows, ..scene })
     }
 
     fn prepared(world: &Path, model: &str) -> Result<Self, SceneError> {
@@ -117,6 +122,7 @@ impl Scene {
         Ok(Self {
             model: on_one_line(model),
             motion: Motion::Circles(circles),
+            windows: Vec::new(),
         })
     }
 
@@ -134,6 +140,7 @@ impl Scene {
         Ok(Some(Self {
             model,
             motion: Motion::Recorded(Animation::parse(&animation)?),
+            windows: Vec::new(),
         }))
     }
 
@@ -147,6 +154,7 @@ impl Scene {
         Ok(Self {
             model: on_one_line(&model),
             motion: Motion::Circles(serde_json::from_str(DEFAULT_MOTION)?),
+            windows: Vec::new(),
         })
     }
 
@@ -155,6 +163,7 @@ impl Scene {
         Self {
             model: on_one_line(EMPTY_MODEL),
             motion: Motion::Circles(Circles::default()),
+            windows: Vec::new(),
         }
     }
 

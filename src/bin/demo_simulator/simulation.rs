@@ -231,12 +231,14 @@ impl Simulation {
 
     fn scene_texts(&self) -> Option<Vec<String>> {
         let scene = self.scene.as_ref()?;
-        Some(vec![
+        let mut texts = vec![
             protocol::world(&self.names),
             protocol::model(&scene.model),
             protocol::update(&scene.state(self.clock.now())),
-            protocol::SCENE_COMPLETED.to_owned(),
-        ])
+        ];
+        texts.extend(scene.windows.iter().map(protocol::robot_window));
+        texts.push(protocol::SCENE_COMPLETED.to_owned());
+        Some(texts)
     }
 }
 
