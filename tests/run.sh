@@ -16,7 +16,7 @@ PATH=$PATH:/usr/sbin
 # bubblewrap sandboxes, pasta their networks; the fleet is tested behind both web servers, also with a real browser; its package and the guide
 # are tested in a Debian made by mmdebstrap; nft loads the packet filter; promtool checks the alerts, dnsmasq resolves names of simulation servers,
 # and kubectl renders the files for Kubernetes.
-tests/install.sh cc=gcc,libc6-dev git=git git-lfs=git-lfs flock=util-linux openssl=openssl python3=python3 python3-venv=python3-venv \
+tests/install.sh cc=gcc,libc6-dev node=nodejs git=git git-lfs=git-lfs flock=util-linux openssl=openssl python3=python3 python3-venv=python3-venv \
     Xvfb=xvfb bwrap=bubblewrap pasta=passt apache2=apache2-bin nginx=nginx setpriv=util-linux chromium=chromium \
     mmdebstrap=mmdebstrap dpkg-shlibdeps=dpkg-dev desktop-file-validate=desktop-file-utils xhost=x11-xserver-utils \
     systemd-analyze=systemd ip=iproute2 nft=nftables promtool=prometheus dnsmasq=dnsmasq-base kubectl=kubernetes-client

@@ -4,7 +4,7 @@ use super::daemon::{
     alone, as_ordinary, ask, check, docker, dockerfile, of_service, refused, running, server, server_built,
 };
 use super::image::NAME;
-use crate::support::{Client, arm, arm_at, is_told, until};
+use crate::support::{Client, arm, arm_at, is_told, sentences, until};
 
 #[actix_rt::test]
 async fn a_link_in_an_image_leads_no_build_to_files_of_the_machine() {
@@ -85,20 +85,21 @@ async fn a_device_made_by_a_dockerfile_opens_nothing() {
 async fn what_a_dockerfile_prints_blames_neither_docker_nor_the_server() {
     let Some(_docker) = docker().await else { return };
     let server = server(1).start().await;
-    for sentence in [
-        "Cannot connect to the Docker daemon at unix:///var/run/docker.sock. Is the docker daemon running?",
-        "error during connect: this error may indicate that the docker daemon is not running",
-        "permission denied while trying to connect to the Docker daemon socket",
-        "Error response from daemon: manifest unknown",
-        "write /x: no space left on device",
-        "This simulation server has no Webots that it can run",
-        "all places on the grid are taken",
+    let mut lists: Vec<String> = sentences::all()
+        .chunks(500)
+        .map(|list| list.join("\n") + "\n")
+        .collect();
+    // The last line decides what Docker prints as the reason.
+    let last = [
+        "Cannot connect to the Docker daemon at unix:///var/run/docker.sock",
         "Step 1/1 : FROM nothing",
-    ] {
-        let line = format!("RUN echo \"{sentence}\"; echo \"{sentence}\" >&2; exit 1 #{sentence}");
+    ];
+    lists.extend(last.map(|line| format!("{line}\n")));
+    for list in lists {
+        let dockerfile = dockerfile("COPY list /list\nRUN cat /list; cat /list >&2; exit 1");
         server
             .forge()
-            .commit("lab/arm", "main", &[("Dockerfile", &dockerfile(&line))]);
+            .commit("lab/arm", "main", &[("Dockerfile", &dockerfile), ("list", &list)]);
         let (told, code) = refused(&server, &arm()).await;
         assert!(told.contains("The image of this project can't be built"), "{told}");
         assert_eq!(code, Some(1000), "{told}");

@@ -77,7 +77,7 @@ async fn a_container_is_ready_when_its_world_is() {
     let server = daemon::server_with(&[("worlds/a.wbt", &WORLD.replacen('\n', options, 1))]);
     let server = server.start().await;
     let mut client = Client::start(&server, &arm()).await;
-    client.patiently("loading: Downloading assets: ").await;
+    client.patiently("loading: Webots: Downloading assets: ").await;
     let begin = Instant::now();
     let told = client.patiently("webots:").await;
     let url = told.strip_prefix("webots:").unwrap();

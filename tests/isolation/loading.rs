@@ -92,7 +92,7 @@ async fn whole_way(builder: Builder) {
     let progress = client
         .heard
         .iter()
-        .find(|text| text.starts_with("loading: Downloading assets: "));
+        .find(|text| text.starts_with("loading: Webots: Downloading assets: "));
     assert!(progress.is_some(), "{:?}", client.heard);
     let mut viewer = sees_the_scene(&client, &url).await;
 

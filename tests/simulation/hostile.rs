@@ -1,9 +1,9 @@
-//! Projects whose names are sentences of git, Docker, the kernel and this server: they change neither who is blamed for a
-//! failed start, nor the reason.
+//! Requests and Git hosts that say sentences of git, Docker, the kernel and this server: they change neither who is blamed
+//! for a failed start, nor the reason. `sentences` has what projects print.
 
-use super::opened::{reader, world_text};
+use super::opened::reader;
 use crate::support::wrapper::Wrapper;
-use crate::support::{Client, Forge, Server, arm, simulation_server, world};
+use crate::support::{Client, Forge, Server, arm, sentences, simulation_server, world};
 
 /// Sentences that mean something when git, Docker, the kernel or this server prints them.
 const SENTENCES: [&str; 14] = [
@@ -34,22 +34,11 @@ async fn failed_starts(server: &Server) -> u64 {
 }
 
 #[actix_rt::test]
-async fn names_that_are_messages_of_a_broken_server_are_the_projects() {
+async fn what_a_client_asks_for_blames_no_server() {
     let forge = Forge::with_arm();
     let webots = reader();
-    let long = "x".repeat(260);
-    for (number, sentence) in SENTENCES.iter().enumerate() {
-        // No file system takes a name as long as this.
-        let file = format!("{sentence}{long}");
-        let files = [("worlds/a.wbt", world_text("a")), (file.as_str(), String::new())];
-        let files = files.each_ref().map(|(name, text)| (*name, text.as_str()));
-        forge.commit(&format!("lab/long{number}"), "main", &files);
-    }
     let server = simulation_server(&webots.path(), forge.path(), 8).start().await;
-    for (number, sentence) in SENTENCES.iter().enumerate() {
-        let told = failure(&server, &world(&format!("lab/long{number}"), "main", "worlds/a.wbt")).await;
-        assert!(told.0.contains("can't be checked out"), "{told:?}");
-        assert_eq!(told.1, Some(1000), "{sentence}: {told:?}");
+    for sentence in SENTENCES {
         let escaped = sentence.replace(' ', "%20");
         let table = [
             (
@@ -78,11 +67,16 @@ async fn names_that_are_messages_of_a_broken_server_are_the_projects() {
 async fn what_a_remote_prints_does_not_decide() {
     let forge = Forge::with_arm();
     let webots = reader();
-    let said = SENTENCES.map(|sentence| format!("echo 'fatal: {sentence}' >&2; echo 'remote: {sentence}' >&2;"));
+    let said = sentences::all()
+        .iter()
+        .map(|line| format!("fatal: {line}\nremote: {line}\n"))
+        .collect::<String>();
+    let file = tempfile::NamedTempFile::new().unwrap();
+    std::fs::write(file.path(), said).unwrap();
     // Each query fails, with all sentences on its standard error.
     let wrapper = Wrapper::git(&format!(
-        "case \" $* \" in *\" ls-remote \"*) {} exit 128;; esac",
-        said.concat().replace('\'', "\"")
+        "case \" $* \" in *\" ls-remote \"*) cat {} >&2; exit 128;; esac",
+        file.path().display()
     ));
     let builder = simulation_server(&webots.path(), forge.path(), 2).env("PATH", &wrapper.path());
     let server = builder.start().await;

@@ -23,6 +23,7 @@ mod ready;
 mod relay;
 mod resuming;
 pub mod scene;
+mod sentences;
 mod soak;
 mod spares;
 mod stopping;

@@ -177,11 +177,11 @@ impl Startup {
     }
 }
 
-/// The progress `STATUS:PERCENT`, as text.
+/// The progress `STATUS:PERCENT`, as text. Whatever the status is, clients can't take the text for an error.
 fn in_words(progress: &str) -> String {
     match progress.rsplit_once(':') {
-        Some((status, percent)) => format!("{}: {percent} %", status.trim()),
-        None => progress.to_owned(),
+        Some((status, percent)) => format!("Webots: {}: {percent} %", status.trim()),
+        None => format!("Webots: {progress}"),
     }
 }
 
@@ -272,7 +272,7 @@ mod tests {
             stream.write_all(b"PROCESSING").await.unwrap();
         };
         socket.send(Frame::text("loading:Downloading assets:40")).await.unwrap();
-        let progress = StartupEvent::Loading("Downloading assets: 40 %".to_owned());
+        let progress = StartupEvent::Loading("Webots: Downloading assets: 40 %".to_owned());
         assert_eq!(events.recv().await, Some(progress));
         socket
             .send(Frame::text("world:worlds/a.wbt:worlds/a.wbt"))
