@@ -55,7 +55,7 @@
 //! - **client**: who holds a WebSocket of either server; **viewer**: who shows the stream of a Webots.
 //! - **reason**: why a request was refused, a start has failed or a simulation has ended, as a code
 //!   ([`shared::domain::Reason`]); a **failure** ([`shared::domain::Failure`]) has also its sentence and the output of others.
-//! - **stage**: the state of a simulation as pages show it ([`simulation::snapshot::Stage`]); it follows from the state of its actor.
+//! - **stage**: the state of a simulation as pages show it ([`shared::domain::Stage`]); it follows from the state of its actor.
 //! - **spare**: a simulation that is kept ready without a client (key `ready`).
 //! - **ready**: Webots has its world, so that viewers may connect. Until then it may **listen**.
 //!

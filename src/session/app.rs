@@ -10,6 +10,7 @@ use tokio::sync::watch;
 
 use super::config::SessionConfig;
 use super::state::{AppState, PLACED};
+use crate::session::class::Roster;
 use crate::session::fleet::{GetStatus, Reconfigure, Registry};
 use crate::session::web::configure;
 use crate::shared::config;
@@ -153,7 +154,8 @@ fn assemble(
         "How long clients have waited in the line until it was their turn",
         &WAITED,
     )?;
-    let registry = Registry::start(Arc::clone(&config), available_sender, waited);
+    let roster = Arc::new(Roster::default());
+    let registry = Registry::start(Arc::clone(&config), available_sender, waited, Arc::clone(&roster));
     let key = config.fleet_key.as_ref().map(|key| FleetKey::new(key.reveal()));
     let key = key.unwrap_or_else(FleetKey::random);
     let admin_auth = AdminAuth::new(AuthSettings {
@@ -165,11 +167,14 @@ fn assemble(
         ssl: config.ssl,
         trusted_proxies: config.trusted_proxies.clone(),
         user_header: config.user_header.clone(),
-        home: "monitor",
+        home: "class",
     });
     Ok(AppState {
         key,
         registry,
+        roster,
+        run: rand::random(),
+        line_seen: tokio::sync::Mutex::default(),
         available,
         client_urls: ClientUrls {
             ssl: config.ssl,

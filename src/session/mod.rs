@@ -1,6 +1,7 @@
 //! The session server: the entry point to a fleet of simulation servers.
 
 pub mod app;
+pub mod class;
 pub mod config;
 pub mod fleet;
 pub mod line;

@@ -2,14 +2,15 @@
 
 use std::net::IpAddr;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use actix::prelude::*;
 use actix_web::error::ErrorServiceUnavailable;
-use tokio::sync::watch;
+use tokio::sync::{Mutex, watch};
 
 use super::config::SessionConfig;
-use crate::session::fleet::{FleetStatus, GetStatus, Pick, Registry, Wait};
+use crate::session::class::Roster;
+use crate::session::fleet::{FleetStatus, GetStatus, GetWaiting, Pick, Registry, Wait};
 use crate::session::line::Place;
 use crate::shared::domain::{ClientUrls, Failure, FleetKey, ProjectUrl, PublicAddress, Reason};
 use crate::shared::http::{AdminAuth, ConnectionKind, ConnectionLimiter, LiveUpdates, Metrics, SharedPage};
@@ -18,10 +19,19 @@ use crate::shared::run::Phase;
 /// The label of requests for which a simulation server is chosen; the label of the others is the code of their reason.
 pub const PLACED: &str = "placed";
 
+/// How long the roster keeps who waits.
+const LINE_AGE: Duration = Duration::from_millis(500);
+
 /// The shared state.
 pub struct AppState {
     /// The registry of simulation servers.
     pub registry: Addr<Registry>,
+    /// All simulations of the fleet, and who waits.
+    pub roster: Arc<Roster>,
+    /// This run of the server, to which the versions of the roster belong.
+    pub run: u64,
+    /// When the roster was last told who waits.
+    pub line_seen: Mutex<Option<Instant>>,
     /// Whether a simulation server can take a client; the registry publishes it.
     pub available: watch::Receiver<bool>,
     /// Signs tickets and passes.
@@ -65,6 +75,17 @@ impl AppState {
             .send(GetStatus)
             .await
             .map_err(|_| ErrorServiceUnavailable("Error: the server stops."))
+    }
+
+    /// Tells the roster who waits in the line, unless it was told just now.
+    pub async fn look_at_line(&self) {
+        let mut seen = self.line_seen.lock().await;
+        if seen.is_none_or(|at| at.elapsed() >= LINE_AGE)
+            && let Ok(waiting) = self.registry.send(GetWaiting).await
+        {
+            self.roster.set_waiting(waiting);
+            *seen = Some(Instant::now());
+        }
     }
 
     /// Asks the registry for a simulation server for the client at the address `from`, and returns the server's URL.

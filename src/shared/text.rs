@@ -2,6 +2,9 @@
 
 use icu_properties::props::{BinaryProperty, DefaultIgnorableCodePoint};
 
+/// Longest name of a client, in characters.
+const MAX_NAME: usize = 60;
+
 /// Returns a text without line breaks, terminal control sequences, direction marks and invisible characters.
 ///
 /// Control characters become spaces. Invisible characters, including direction marks, become U+FFFD.
@@ -15,6 +18,12 @@ pub fn one_line(text: &str) -> String {
         letter => letter,
     };
     text.chars().map(visible).collect()
+}
+
+/// The name that a client has chosen, as one short line; `None` if nothing is left of it.
+pub fn chosen_name(text: &str) -> Option<String> {
+    let name: String = one_line(text).trim().chars().take(MAX_NAME).collect();
+    (!name.is_empty()).then_some(name)
 }
 
 /// Returns a text as one line of at most `most` characters, with `...` if it was cut.

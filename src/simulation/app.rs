@@ -306,6 +306,7 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
         live: LiveUpdates::default(),
         administrators: LiveUpdates::default(),
         usage: UsageMonitor::default(),
+        class_page: watch::Sender::default(),
         disk_monitor,
         started: Instant::now(),
         config,

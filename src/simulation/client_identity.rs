@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use crate::shared::text::one_line;
+use crate::shared::text::{chosen_name, one_line};
 
 /// The identity of a client. Only administrators see it: on pages, in the server's log and in `simulations.csv`.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -15,17 +15,14 @@ pub struct ClientIdentity {
 
 /// Longest user name, in characters.
 const MAX_USER_LENGTH: usize = 200;
-/// Longest label, in characters.
-const MAX_LABEL_LENGTH: usize = 60;
 
 impl ClientIdentity {
     /// Truncates the names, each as one line; an empty name becomes `None`.
     pub fn new(user: Option<&str>, label: Option<&str>) -> Self {
-        let cut = |text: &str, most| one_line(text).trim().chars().take(most).collect::<String>();
-        let cut = |text: Option<&str>, most| text.map(|text| cut(text, most)).filter(|text| !text.is_empty());
+        let cut = |user: &str| one_line(user).trim().chars().take(MAX_USER_LENGTH).collect::<String>();
         Self {
-            user: cut(user, MAX_USER_LENGTH),
-            label: cut(label, MAX_LABEL_LENGTH),
+            user: user.map(cut).filter(|user| !user.is_empty()),
+            label: label.and_then(chosen_name),
         }
     }
 }

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use serde::Serialize;
 
-use crate::shared::domain::{Instances, ProjectUrl};
+use crate::shared::domain::{Instances, ProjectUrl, Stage};
 use crate::shared::run::seconds_since_1970;
 use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::simulation_id::SimulationId;
@@ -26,24 +26,6 @@ impl SceneKind {
             Self::W3d => "w3d",
         }
     }
-}
-
-/// The states of a simulation, as pages and programs see them.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Stage {
-    /// In the queue.
-    Queued,
-    /// Its project is checked out.
-    CheckingOut,
-    /// Webots is starting.
-    Launching,
-    /// Webots runs, the simulation is paused.
-    Idle,
-    /// The simulation runs.
-    Running,
-    /// Webots is ending.
-    Stopping,
 }
 
 /// All simulations at one moment.

@@ -1,5 +1,6 @@
 //! The state that the routes, the pages and the web clients of a simulation server share. `app` creates it.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -18,11 +19,17 @@ use crate::shared::domain::{
 };
 use crate::shared::http::{AddressQuota, AdminAuth, ConnectionLimiter, LiveUpdates, Metrics, SharedPage};
 use crate::shared::run::Phase;
+use crate::shared::text::excerpt;
 use crate::simulation::checkout::CheckoutService;
 use crate::simulation::container::ContainerService;
 use crate::simulation::isolation::{DiskMonitor, Launcher};
-use crate::simulation::machine::{LoadMonitor, Readings, Spread, UsageMonitor};
+use crate::simulation::machine::{self, LoadMonitor, Readings, Spread, UsageMonitor, Usages};
 use crate::simulation::process::RunDir;
+use crate::simulation::snapshot::Snapshot;
+use crate::simulation::{container, protocol};
+
+/// Longest reason of a stop, in characters.
+const MAX_REASON_LENGTH: usize = 300;
 
 /// Threads that start Webots: `spawn` blocks until `execve`, which takes long on a busy machine. They live as long as
 /// the server, because bubblewrap exits with the thread that has started it.
@@ -88,6 +95,8 @@ pub struct AppState {
     pub administrators: LiveUpdates,
     /// CPU and memory of each simulation.
     pub usage: UsageMonitor,
+    /// The page of a session server of the fleet that lists the simulations of all servers.
+    pub class_page: watch::Sender<Option<url::Url>>,
     /// When the server was started.
     pub started: Instant,
 }
@@ -139,6 +148,46 @@ impl AppState {
         if is_new {
             log::info!("draining: no new clients, the server ends when the last has gone");
         }
+    }
+
+    /// Stops the simulations with these ids, for a reason, which may be empty; `by` is who stops them, for the log. Returns
+    /// the ids of those that are there.
+    pub fn stop(&self, ids: &[String], reason: &str, by: &str) -> Vec<String> {
+        let reason = excerpt(reason.trim(), MAX_REASON_LENGTH);
+        let stopped = self.slots.stop(ids, &protocol::stopped_by_teacher(&reason));
+        for id in &stopped {
+            log::info!(
+                "{id}: {by} stops it, reason: {}",
+                if reason.is_empty() { "none" } else { &reason }
+            );
+        }
+        stopped
+    }
+
+    /// The URL of the page that lists the simulations of all servers, if a session server of the fleet has told one.
+    pub fn class_page(&self) -> Option<String> {
+        self.class_page.borrow().as_ref().map(url::Url::to_string)
+    }
+
+    /// What each simulation uses, as it was measured at most two seconds ago.
+    pub async fn usages(&self, snapshot: &Snapshot) -> Usages {
+        if snapshot.simulations.is_empty() {
+            return Usages::new();
+        }
+        let usage = self.usage.clone();
+        let simulations = snapshot.simulations.iter();
+        let read = if let Some(containers) = &self.containers {
+            // The process is `docker`, which waits for the containers.
+            let roots: BTreeMap<u16, i32> = simulations
+                .filter_map(|simulation| Some((simulation.port?, simulation.pid?)))
+                .collect();
+            let owner = containers.run.clone();
+            actix_rt::task::spawn_blocking(move || usage.read(|| container::measure(&owner, &roots)))
+        } else {
+            let roots: Vec<i32> = simulations.filter_map(|simulation| simulation.pid).collect();
+            actix_rt::task::spawn_blocking(move || usage.read(|| machine::usages(&roots)))
+        };
+        read.await.unwrap_or_default()
     }
 
     /// Whether new clients are refused.

@@ -10,6 +10,7 @@ export const words = {
   page: {
     skip: '跳到正文',
     pages: '页面',
+    class: '班级',
     monitor: '监控',
     viewer: '查看器',
     simulation: '仿真',

@@ -15,6 +15,7 @@ export const words = {
   page: {
     skip: 'Skip to the content',
     pages: 'Pages',
+    class: 'Class',
     monitor: 'Monitor',
     viewer: 'Viewer',
     simulation: 'Simulation',

@@ -10,6 +10,7 @@ export const words = {
   page: {
     skip: 'Aller au contenu',
     pages: 'Pages',
+    class: 'Classe',
     monitor: 'Moniteur',
     viewer: 'Visualiseur',
     simulation: 'Simulation',

@@ -10,6 +10,7 @@ export const words = {
   page: {
     skip: 'Zum Inhalt springen',
     pages: 'Seiten',
+    class: 'Klasse',
     monitor: 'Übersicht',
     viewer: 'Ansicht',
     simulation: 'Simulation',

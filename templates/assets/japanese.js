@@ -10,6 +10,7 @@ export const words = {
   page: {
     skip: '本文へ移動',
     pages: 'ページ',
+    class: 'クラス',
     monitor: 'モニター',
     viewer: 'ビューアー',
     simulation: 'シミュレーション',

@@ -2,6 +2,7 @@
 // contents of elements) and tables (their rows), as HTML that the server renders from the same templates as the page.
 
 import { find, setText } from './dom.js';
+import { makeSortable, sort } from './table.js';
 import { showTimes } from './times.js';
 
 /** Gets the numbers of an event, and whether events may have been missed before. @typedef {(sample: number[], fresh: boolean) => void} Listener */
@@ -17,8 +18,6 @@ const lamp = find('live', HTMLElement);
 const known = new WeakMap();
 /** The HTML of the cells of rows. @type {WeakMap<Element, string[]>} */
 const cells = new WeakMap();
-/** Natural order: 2 comes before 10. */
-const alphabet = new Intl.Collator(undefined, { numeric: true });
 /** @type {EventSource | undefined} */
 let source;
 /** Time of the last message from the server; it sends one every 15 seconds. */
@@ -126,47 +125,6 @@ function fillPart(part, html) {
 }
 
 /**
- * @param {HTMLTableRowElement} row
- * @param {number} column
- */
-function cellValue(row, column) {
-  return row.children[column]?.getAttribute('data-value') ?? '';
-}
-
-/**
- * The cells of a table's head.
- * @param {HTMLTableElement | null} table
- */
-function headsOf(table) {
-  return [...(table?.tHead?.rows[0]?.cells ?? [])];
-}
-
-/**
- * Sorts the rows by the column that the header marks, and moves only those that are out of place.
- * @param {HTMLTableSectionElement} body
- */
-function sort(body) {
-  const heads = headsOf(body.closest('table'));
-  const column = heads.findIndex((head) => head.hasAttribute('aria-sort'));
-  const rows = [...body.rows];
-  const wanted = [...rows].sort((one, other) => Number(one.dataset.place) - Number(other.dataset.place));
-  const head = heads[column];
-  if (head) {
-    const sign = head.getAttribute('aria-sort') === 'descending' ? -1 : 1;
-    wanted.sort((one, other) => {
-      const [a, b] = [cellValue(one, column), cellValue(other, column)];
-      const order = head.dataset.sort === 'number' ? Number(a) - Number(b) : alphabet.compare(a, b);
-      return sign * order;
-    });
-  }
-  wanted.forEach((row, place) => {
-    if (body.rows[place] !== row) {
-      body.insertBefore(row, body.rows[place] ?? null);
-    }
-  });
-}
-
-/**
  * Shows the rows that have all the words of the table's filter, if it has one.
  * @param {HTMLTableSectionElement} body
  */
@@ -190,10 +148,10 @@ function filter(body) {
 }
 
 /**
- * @param {HTMLTableElement} table
+ * Notes what the server has rendered.
  * @param {HTMLTableSectionElement} body
  */
-function makeSortable(table, body) {
+function noteRows(body) {
   [...body.rows].forEach((row, place) => {
     row.dataset.place = String(place);
     cells.set(
@@ -201,24 +159,6 @@ function makeSortable(table, body) {
       [...row.children].map((cell) => cell.outerHTML),
     );
   });
-  const heads = headsOf(table);
-  for (const head of heads) {
-    if (!head.dataset.sort) {
-      continue;
-    }
-    const button = document.createElement('button');
-    button.type = 'button';
-    button.textContent = head.textContent;
-    button.addEventListener('click', () => {
-      const turn = head.getAttribute('aria-sort') === 'ascending' ? 'descending' : 'ascending';
-      for (const other of heads) {
-        other.removeAttribute('aria-sort');
-      }
-      head.setAttribute('aria-sort', turn);
-      sort(body);
-    });
-    head.replaceChildren(button);
-  }
 }
 
 /** @param {MessageEvent} event */
@@ -289,6 +229,7 @@ function rest() {
 for (const table of document.querySelectorAll('table')) {
   const [body] = table.tBodies;
   if (body && table.querySelector('th[data-sort]')) {
+    noteRows(body);
     makeSortable(table, body);
   }
 }

@@ -10,6 +10,7 @@ export const words = {
   page: {
     skip: 'Ir al contenido',
     pages: 'Páginas',
+    class: 'Clase',
     monitor: 'Monitor',
     viewer: 'Visor',
     simulation: 'Simulación',

@@ -61,6 +61,7 @@ class AClass(BrowserTest):
         """The teacher's pages: the monitor of each machine, opened from the fleet's monitor."""
         fleet = self.visit("teacher", "monitor")
         fleet.sign_in(self.fleet.url("").rstrip("/"), PASSWORD)
+        fleet.tab.goto(self.fleet.url("monitor"))
         expect(fleet.tab.locator("#servers .state.up, #servers .state.full")).to_have_count(2)
         machines = []
         for link in fleet.tab.locator("#servers th a").all():
@@ -68,6 +69,7 @@ class AClass(BrowserTest):
             machine.sign_in(link.get_attribute("href").removesuffix("/monitor"), PASSWORD)
             expect(machine.tab.locator("#live")).to_have_text("Live")
             machines.append(machine)
+        fleet.tab.goto(self.fleet.url("class"))
         return fleet, machines
 
     def test_a_teacher_has_a_class_of_thirty_in_hand(self):

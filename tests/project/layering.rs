@@ -10,7 +10,7 @@ use super::copy::{root, walk};
 /// layers before it; those of `session` and `simulation` also from all of `shared`, but never from each other.
 const ROOMS: [(&str, &str); 3] = [
     ("shared", "text config domain run http"),
-    ("session", "placement line config mail fleet state web app"),
+    ("session", "placement line config mail class fleet state web app"),
     (
         "simulation",
         "client_identity simulation_id snapshot ends attachment slots spare_wishes relay protocol process machine config checkout \

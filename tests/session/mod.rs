@@ -3,6 +3,7 @@
 mod stand_in;
 
 mod announcing;
+mod class;
 mod discovery;
 mod door;
 mod fleet_line;

@@ -7,11 +7,11 @@ use actix_rt::task::JoinHandle;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use webots_fleet::shared::config;
+use webots_fleet::shared::domain::Stage;
 use webots_fleet::shared::http::ConnectionKind;
 use webots_fleet::shared::run::AppError;
 use webots_fleet::simulation::app::{self, Application};
 use webots_fleet::simulation::config::SimulationConfig;
-use webots_fleet::simulation::snapshot::Stage;
 use webots_fleet::simulation::state::AppState;
 
 use crate::support::{Builder, Client, arm, instance_folders_in, instances_below, server_that_is, until};

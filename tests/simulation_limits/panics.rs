@@ -7,13 +7,13 @@ use actix::prelude::*;
 use actix_web::{App, HttpRequest, HttpResponse, HttpServer, web};
 use actix_web_actors::ws::WsResponseBuilder;
 use tokio::sync::mpsc::{UnboundedSender, unbounded_channel};
+use webots_fleet::shared::domain::Stage;
 use webots_fleet::shared::http::ConnectionKind;
 use webots_fleet::simulation::attachment::{Connection, ToClient};
 use webots_fleet::simulation::client::{Session, WebClient};
 use webots_fleet::simulation::client_identity::ClientIdentity;
 use webots_fleet::simulation::machine::LoadMonitor;
 use webots_fleet::simulation::protocol::Start;
-use webots_fleet::simulation::snapshot::Stage;
 use webots_fleet::simulation::state::AppState;
 
 use crate::inside::Inside;

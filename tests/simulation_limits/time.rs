@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use webots_fleet::shared::domain::Reason;
-use webots_fleet::simulation::snapshot::Stage;
+use webots_fleet::shared::domain::Stage;
 
 use crate::inside::Inside;
 use crate::support::until;

@@ -10,7 +10,10 @@ use prometheus::Histogram;
 use super::server_record::ServerRecord;
 use super::server_table::{ServerTable, accepts, admission};
 use super::slot_link::{LinkChange, LinkEvent};
-use crate::session::line::{Dispatcher, Entered, Entry, LineStatus, Moment, Place, Progress, Served, Ticket, Turn};
+use crate::session::class::{ClassEntry, ClassState};
+use crate::session::line::{
+    Dispatcher, Entered, Entry, LineStatus, Moment, Place, Progress, Served, Ticket, Turn, WaitingClient,
+};
 use crate::shared::domain::{Failure, ProjectUrl, PublicAddress, Reason};
 
 /// Asks for a slot, and waits for it in the line. The answer is the place, unless it is the client's turn already.
@@ -29,6 +32,8 @@ pub struct Wait {
     pub from: Option<IpAddr>,
     /// The client's user, if it is known.
     pub user: Option<String>,
+    /// The name that the client has chosen.
+    pub label: Option<String>,
 }
 
 /// A client waits no longer.
@@ -104,6 +109,7 @@ impl LineKeeper {
             connection: wait.connection,
             address: wait.from,
             user: wait.user,
+            label: wait.label,
         };
         let is_up = |server: &PublicAddress| {
             let record = servers.records.get(server);
@@ -189,6 +195,24 @@ impl LineKeeper {
         for (client, place) in self.dispatcher.renewals(now) {
             client.do_send(LineEvent::Ticket(place));
         }
+    }
+
+    /// Who waits.
+    pub(super) fn waiting(&self) -> Vec<ClassEntry> {
+        let entry = |one: WaitingClient| ClassEntry {
+            id: format!("waiting-{:x}", one.place.number),
+            server: None,
+            world: one.world.to_string(),
+            user: one.user.map(str::to_owned),
+            label: one.label.map(str::to_owned),
+            state: ClassState::Waiting,
+            since: one.place.since / 1000,
+            waited: None,
+            away_until: None,
+            cpu: None,
+            real_time: None,
+        };
+        self.dispatcher.waiting().map(entry).collect()
     }
 
     /// What is known of the line.

@@ -18,6 +18,7 @@ use super::server_record::{Answer, FleetStatus, Intake, ServerRecord, ServerStat
 use super::server_table::{ServerTable, admission};
 use super::slot_link::LinkEvent;
 use super::state_history::StateHistory;
+use crate::session::class::{ClassEntry, Roster};
 use crate::session::config::SessionConfig;
 use crate::session::line::Place;
 use crate::shared::domain::{Admission, Failure, Load, ProjectUrl, PublicAddress, Reason, ServerReport};
@@ -37,6 +38,11 @@ pub struct Pick {
 #[derive(Message)]
 #[rtype(result = "Arc<FleetStatus>")]
 pub struct GetStatus;
+
+/// Requests the clients that wait in the line.
+#[derive(Message)]
+#[rtype(result = "Vec<ClassEntry>")]
+pub struct GetWaiting;
 
 /// Replaces the configuration: the servers, the placement policy, and how servers are probed. What was learned stays.
 #[derive(Message)]
@@ -64,12 +70,18 @@ const TICK: Duration = Duration::from_millis(250);
 
 impl Registry {
     /// Starts the registry and its monitors. It publishes in `available` whether a server can take a client, and observes
-    /// in `waited` how long clients have waited in the line.
-    pub fn start(config: Arc<SessionConfig>, available: watch::Sender<bool>, waited: Histogram) -> Addr<Self> {
+    /// in `waited` how long clients have waited in the line. Simulation servers tell `roster` which simulations they have.
+    pub fn start(
+        config: Arc<SessionConfig>,
+        available: watch::Sender<bool>,
+        waited: Histogram,
+        roster: Arc<Roster>,
+    ) -> Addr<Self> {
         Self::create(|ctx| {
             let parent = Parent {
                 probes: ctx.address().recipient(),
                 links: ctx.address().recipient(),
+                roster,
             };
             let servers = ServerTable::new(&config, parent);
             Self {
@@ -278,6 +290,14 @@ impl Handler<GetStatus> for Registry {
             changes: self.changes.recent.clone(),
             line: self.line.status(),
         }))
+    }
+}
+
+impl Handler<GetWaiting> for Registry {
+    type Result = MessageResult<GetWaiting>;
+
+    fn handle(&mut self, _: GetWaiting, _: &mut Self::Context) -> Self::Result {
+        MessageResult(self.line.waiting())
     }
 }
 

@@ -27,6 +27,7 @@ use tokio::time::{sleep_until, timeout};
 
 use super::resolver::HostResolver;
 use super::slot_link::{LinkEvent, SlotLink};
+use crate::session::class::Roster;
 use crate::session::config::SessionConfig;
 use crate::shared::domain::{Failure, FleetKey, Load, PublicAddress, Reason, ServerReport, Wishes};
 use crate::shared::http::tls;
@@ -96,6 +97,8 @@ pub struct Parent {
     pub probes: Recipient<ProbeResult>,
     /// Receives what happens to the link.
     pub links: Recipient<LinkEvent>,
+    /// Learns which simulations the server has.
+    pub roster: Arc<Roster>,
 }
 
 /// Ends the monitor.
@@ -142,6 +145,8 @@ impl ServerMonitor {
             client: client.clone(),
             key: FleetKey::new(key.reveal()),
             events: parent.links.clone(),
+            roster: Arc::clone(&parent.roster),
+            page: format!("{}/class", config.http_url()),
         });
         Self {
             link,

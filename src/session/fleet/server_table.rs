@@ -214,6 +214,7 @@ mod tests {
         let parent = Parent {
             probes: found.clone().recipient(),
             links: found.recipient(),
+            roster: Arc::default(),
         };
         let mut table = ServerTable::new(&config, parent);
         table.apply(&config);

@@ -1,8 +1,12 @@
-//! The WebSocket to `/slots` of a simulation server, over which it reserves slots for the line. Part of the monitor.
+//! The WebSocket to `/slots` of a simulation server, over which it reserves slots for the line, and tells which simulations
+//! it has. Part of the monitor.
 //!
 //! It is opened again whenever it has ended. A server without `/slots` or with another `fleetKey` takes part in the line
 //! by its reports alone.
 
+use std::collections::HashMap;
+use std::future::pending;
+use std::sync::Arc;
 use std::time::Duration;
 
 use actix::prelude::*;
@@ -15,9 +19,13 @@ use futures_util::{SinkExt, StreamExt};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use tokio::sync::mpsc::UnboundedReceiver;
+use tokio::sync::oneshot;
 use tokio::time::{sleep, timeout};
 
-use crate::shared::domain::{FleetKey, Hello, Offers, PublicAddress, Wishes};
+use crate::session::class::{Roster, StopRequest};
+use crate::shared::domain::{
+    FleetKey, Follow, Hello, Offers, PublicAddress, StopOrder, Stopped, ToSessionServer, ToSimulationServer, Wishes,
+};
 
 /// What happens to a link.
 #[derive(Message, Debug)]
@@ -54,6 +62,20 @@ pub(super) struct SlotLink {
     pub(super) key: FleetKey,
     /// Receives what happens.
     pub(super) events: Recipient<LinkEvent>,
+    /// Learns which simulations run there.
+    pub(super) roster: Arc<Roster>,
+    /// The URL of the page that lists them.
+    pub(super) page: String,
+}
+
+/// What a server does for the roster, as long as its link lasts.
+struct Followed {
+    server: PublicAddress,
+    roster: Arc<Roster>,
+    requests: UnboundedReceiver<StopRequest>,
+    /// The requests that wait for an answer, by their numbers.
+    pending: HashMap<u64, oneshot::Sender<Vec<String>>>,
+    number: u64,
 }
 
 /// Why a link has ended.
@@ -69,6 +91,8 @@ enum LinkError {
 
 type Socket = Framed<BoxedSocket, Codec>;
 
+/// Longest message, in bytes: one has at most fifty simulations, whose texts are bounded.
+const MAX_MESSAGE: usize = 1024 * 1024;
 /// Timeout of a new connection, and of the first messages on it.
 const CONNECT: Duration = Duration::from_secs(5);
 /// A server that sends nothing for this long is gone. It pings more often.
@@ -110,7 +134,7 @@ impl SlotLink {
 
     /// Opens a link and keeps it until it ends. Returns without an error when its monitor has ended.
     async fn open(&self, wishes: &mut UnboundedReceiver<Wishes>) -> Result<(), LinkError> {
-        let opening = timeout(CONNECT, self.client.ws(&self.url).connect()).await;
+        let opening = timeout(CONNECT, self.client.ws(&self.url).max_frame_size(MAX_MESSAGE).connect()).await;
         let opened = opening.map_err(|_| LinkError::Broken("no connection in time".to_owned()))?;
         let (_, mut socket) = opened.map_err(|error| match error {
             WsClientError::InvalidResponseStatus(status) if status != StatusCode::SERVICE_UNAVAILABLE => {
@@ -127,15 +151,36 @@ impl SlotLink {
         })?;
         // Wishes for an earlier link.
         while wishes.try_recv().is_ok() {}
+        let mut followed = hello.roster.then(|| Followed::new(self));
         self.tell(LinkChange::Up(hello));
         self.tell(LinkChange::Offers(first));
+        let mut watching = self.roster.watching();
+        if followed.is_some() {
+            watching.mark_changed();
+        }
         loop {
             tokio::select! {
-                offers = receive(&mut socket, SILENCE) => self.tell(LinkChange::Offers(offers?)),
+                message = receive(&mut socket, SILENCE) => match message? {
+                    ToSessionServer::Offers(offers) => self.tell(LinkChange::Offers(offers)),
+                    ToSessionServer::Roster(update) => self.roster.update(&self.server, update),
+                    ToSessionServer::Stopped(stopped) => {
+                        if let Some(followed) = &mut followed {
+                            followed.answer(stopped);
+                        }
+                    }
+                },
                 next = wishes.recv() => match next {
                     Some(next) => send(&mut socket, &next).await?,
                     None => return Ok(()),
                 },
+                order = next_order(&mut followed) => send(&mut socket, &ToSimulationServer::Stop(order)).await?,
+                Ok(()) = watching.changed(), if followed.is_some() => {
+                    let follow = Follow {
+                        figures: *watching.borrow_and_update() > 0,
+                        page: self.page.clone(),
+                    };
+                    send(&mut socket, &ToSimulationServer::Follow(follow)).await?;
+                }
             }
         }
     }
@@ -145,6 +190,50 @@ impl SlotLink {
             server: self.server.clone(),
             change,
         });
+    }
+}
+
+impl Followed {
+    fn new(link: &SlotLink) -> Self {
+        Self {
+            requests: link.roster.link(link.server.clone()),
+            server: link.server.clone(),
+            roster: Arc::clone(&link.roster),
+            pending: HashMap::new(),
+            number: 0,
+        }
+    }
+
+    fn answer(&mut self, Stopped { number, ids }: Stopped) {
+        if let Some(done) = self.pending.remove(&number) {
+            // Nobody may wait for it any more.
+            done.send(ids).ok();
+        }
+    }
+}
+
+impl Drop for Followed {
+    fn drop(&mut self) {
+        self.roster.unlink(&self.server);
+    }
+}
+
+/// The next order for the server; never, if it takes none.
+async fn next_order(followed: &mut Option<Followed>) -> StopOrder {
+    let Some(followed) = followed else {
+        return pending().await;
+    };
+    let Some(request) = followed.requests.recv().await else {
+        return pending().await;
+    };
+    followed.pending.retain(|_, done| !done.is_closed());
+    followed.number += 1;
+    followed.pending.insert(followed.number, request.done);
+    StopOrder {
+        number: followed.number,
+        ids: request.ids,
+        reason: request.reason,
+        by: request.by,
     }
 }
 

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use super::link::{LISTED, Link};
 use super::rate::{Rate, estimate};
 use super::ticket::Ticket;
-use super::waiting_line::{Entry, Group, Place, Progress, WaitingLine};
+use super::waiting_line::{Entry, Group, Place, Progress, WaitingClient, WaitingLine};
 use crate::session::placement::LoadBalancer;
 use crate::shared::domain::{Admission, Hello, Offers, Pass, ProjectUrl, Wishes};
 
@@ -392,6 +392,11 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
         self.line.len() == 0
     }
 
+    /// All who wait, in order.
+    pub fn waiting(&self) -> impl Iterator<Item = WaitingClient<'_>> {
+        self.line.clients()
+    }
+
     /// What is known of the line at this time, in milliseconds since 1970.
     pub fn status(&self, now: u64) -> LineStatus {
         let mut found: Vec<WaitingFor> = Vec::new();
@@ -611,6 +616,7 @@ mod tests {
             connection: number,
             address: None,
             user: None,
+            label: None,
         }
     }
 
@@ -648,6 +654,7 @@ mod tests {
                         server: ServerRun(server as u64),
                         pass: 10.0,
                         keeps_ready: true,
+                        roster: false,
                     };
                     fleet.dispatcher.link(server, &hello);
                 }

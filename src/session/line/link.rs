@@ -103,6 +103,7 @@ mod tests {
             server: ServerRun(1),
             pass: 10.0,
             keeps_ready: true,
+            roster: false,
         })
     }
 

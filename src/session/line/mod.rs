@@ -16,4 +16,4 @@ mod waiting_line;
 
 pub use dispatcher::{Dispatcher, Entered, LineStatus, Moment, Served, Turn, WaitingFor};
 pub use ticket::Ticket;
-pub use waiting_line::{Entry, Place, Progress};
+pub use waiting_line::{Entry, Place, Progress, WaitingClient};

@@ -29,6 +29,21 @@ pub struct Entry<Client> {
     pub address: Option<IpAddr>,
     /// Its user, if a trusted reverse proxy names one.
     pub user: Option<String>,
+    /// The name that it has chosen; it is not checked.
+    pub label: Option<String>,
+}
+
+/// A client in the line, for administrators.
+#[derive(Debug, Clone, Copy)]
+pub struct WaitingClient<'line> {
+    /// Its place.
+    pub place: Place,
+    /// Its world.
+    pub world: &'line ProjectUrl,
+    /// Its user.
+    pub user: Option<&'line str>,
+    /// The name that it has chosen.
+    pub label: Option<&'line str>,
 }
 
 /// What a client in the line hears.
@@ -51,6 +66,8 @@ pub(super) struct Group {
 /// A client in the line.
 #[derive(Debug)]
 pub(super) struct Waiting<Client> {
+    world: ProjectUrl,
+    label: Option<String>,
     pub(super) group: Arc<Group>,
     pub(super) client: Client,
     connection: u64,
@@ -102,11 +119,13 @@ impl<Client: Clone> WaitingLine<Client> {
         }
         let repository = entry.world.repository().to_lowercase();
         let (group, count) = self.groups.entry(repository.clone()).or_insert_with(|| {
-            let world = entry.world;
+            let world = entry.world.clone();
             (Arc::new(Group { world, repository }), 0)
         });
         *count += 1;
         let waiting = Waiting {
+            world: entry.world,
+            label: entry.label,
             group: Arc::clone(group),
             client: entry.client,
             connection: entry.connection,
@@ -154,6 +173,16 @@ impl<Client: Clone> WaitingLine<Client> {
     pub(super) fn place_of(&self, number: u64) -> Option<Place> {
         let since = *self.since.get(&number)?;
         Some(Place { since, number })
+    }
+
+    /// All who wait, in order, for administrators.
+    pub(super) fn clients(&self) -> impl Iterator<Item = WaitingClient<'_>> {
+        self.waiting.iter().map(|(place, waiting)| WaitingClient {
+            place: *place,
+            world: &waiting.world,
+            user: waiting.user.as_deref(),
+            label: waiting.label.as_deref(),
+        })
     }
 
     /// All who wait, in order.
@@ -251,6 +280,7 @@ mod tests {
             connection: client.into(),
             address: None,
             user: user.map(str::to_owned),
+            label: None,
         }
     }
 

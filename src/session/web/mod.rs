@@ -1,5 +1,6 @@
 //! The interface to browsers and programs: routes, pages, and the WebSocket of a web client.
 
+mod class_routes;
 mod metrics;
 mod page_routes;
 pub mod pages;

@@ -31,7 +31,9 @@ const ASSETS: &[Asset] = &[
     asset!("stage.js"),
     asset!("kept.js"),
     asset!("turn.js"),
-    asset!("session_monitor.js"),
+    asset!("class.css"),
+    asset!("class.js"),
+    asset!("announce.js"),
 ];
 
 /// Adds the routes to an app.

@@ -12,7 +12,7 @@ use serde::Deserialize;
 use super::refusal::{self, REASON_HEADER};
 use super::status::status_page;
 use super::web_client::WebClient;
-use super::{metrics, page_routes};
+use super::{class_routes, metrics, page_routes};
 use crate::session::state::AppState;
 use crate::shared::http::routing::{self, GET, POST, READ, json_body, path, retry_after};
 use crate::shared::http::{CONTENT_TYPE, ConnectionKind, sign_in, websocket};
@@ -45,6 +45,7 @@ fn add(app: &mut web::ServiceConfig) {
         .service(path("/load", READ, load))
         .configure(page_routes::configure)
         .configure(sign_in::configure)
+        .configure(class_routes::configure)
         .service(path("/status", READ, status_json))
         .service(path("/metrics", READ, metrics_text))
         .service(path("/health", READ, health))

@@ -25,7 +25,7 @@ use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::websocket::wrong_message;
 use crate::shared::http::{ConnectionPermit, Peer};
 use crate::shared::run::{Phase, closing};
-use crate::shared::text::client_text;
+use crate::shared::text::{chosen_name, client_text};
 
 /// The actor.
 pub struct WebClient {
@@ -126,6 +126,7 @@ impl WebClient {
             connection: self.connection,
             from: self.peer.rate_limit_key(),
             user: self.user.clone(),
+            label: request.name.clone(),
         };
         let wants_reason = request.wants_reason;
         let server = Arc::clone(&self.server);
@@ -191,6 +192,8 @@ struct ServerRequest {
     world: Option<String>,
     /// Whether it understands a text with the reason before that of an error.
     wants_reason: bool,
+    /// The name that the client has chosen, for administrators.
+    name: Option<String>,
 }
 
 impl Request {
@@ -205,18 +208,22 @@ impl Request {
             wait: Value,
             #[serde(default)]
             ticket: Value,
+            #[serde(default)]
+            name: Value,
         }
         let text = text.trim();
         let Ok(wanted) = serde_json::from_str::<Wanted>(text) else {
             return Self::Pick(ServerRequest {
                 world: text.contains("://").then(|| text.to_owned()),
                 wants_reason: false,
+                name: None,
             });
         };
         let url = wanted.url;
         let request = ServerRequest {
             world: url.map(|url| url.as_str().map_or_else(|| url.to_string(), str::to_owned)),
             wants_reason: wanted.reason == true,
+            name: wanted.name.as_str().and_then(chosen_name),
         };
         match wanted.wait {
             Value::Bool(true) => Self::Wait(request, wanted.ticket.as_str().map(str::to_owned)),
@@ -351,6 +358,7 @@ mod tests {
         ServerRequest {
             world: world.map(str::to_owned),
             wants_reason,
+            name: None,
         }
     }
 

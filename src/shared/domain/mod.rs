@@ -9,6 +9,7 @@ mod pass;
 mod project_url;
 mod ready;
 mod reason;
+mod roster;
 mod server_report;
 mod slot_link;
 mod url_prefix;
@@ -22,6 +23,9 @@ pub use pass::{Pass, ReservationId, ServerRun};
 pub use project_url::{ProjectUrl, ProjectUrlError, Reading};
 pub use ready::{KeepReady, ReadyCount, ReadyEntry, ReadyStatus, View};
 pub use reason::{Blame, Failure, Reason, Retry};
+pub use roster::{
+    Follow, RosterUpdate, SimulationReport, Stage, StopOrder, Stopped, ToSessionServer, ToSimulationServer,
+};
 pub use server_report::{Instances, ServerReport};
 pub use slot_link::{Hello, Offer, Offers, Proof, Wish, Wishes};
 pub use url_prefix::UrlPrefix;

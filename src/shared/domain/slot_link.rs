@@ -26,6 +26,9 @@ pub struct Hello {
     /// Whether it keeps simulations ready on request ([`KeepReady`](super::KeepReady)).
     #[serde(default)]
     pub keeps_ready: bool,
+    /// Whether it tells its simulations, too (`roster`).
+    #[serde(default)]
+    pub roster: bool,
 }
 
 /// The first message of a session server: it has the fleet's key.
@@ -129,6 +132,7 @@ mod tests {
             server: ServerRun(6),
             pass: 10.0,
             keeps_ready: true,
+            roster: true,
         };
         let key = FleetKey::new("a secret of a fleet");
         let proof = hello.prove(&key);

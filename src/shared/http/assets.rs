@@ -20,6 +20,7 @@ pub const COMMON: &[Asset] = &[
     asset!("style.css"),
     asset!("icon.svg"),
     asset!("live.js"),
+    asset!("table.js"),
     asset!("times.js"),
     asset!("dom.js"),
     asset!("language.js"),

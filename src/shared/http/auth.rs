@@ -142,6 +142,14 @@ impl AdminAuth {
         if is_cross_site(request) {
             return Err(AuthError::OtherSite);
         }
+        self.owner(request)
+    }
+
+    /// The administrator who sends a request, and may change something.
+    ///
+    /// # Errors
+    /// Why the request is refused.
+    pub fn owner(&self, request: &HttpRequest) -> Result<Administrator, AuthError> {
         let reader = self.reader(request)?;
         match reader.may {
             Permission::Act => Ok(reader),

@@ -2,6 +2,7 @@
 
 mod arrival;
 mod resume;
+mod roster_feed;
 mod session;
 mod slot_link;
 mod spare;

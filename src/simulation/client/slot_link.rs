@@ -1,18 +1,24 @@
-//! Actor: the WebSocket on `/slots` of one session server, for whose line this server reserves slots.
+//! Actor: the WebSocket on `/slots` of one session server, for whose line this server reserves slots. If it wants, it is
+//! also told which simulations run here, and stops some.
 //!
 //! Created by the route for each connection; ends with it. The session server proves first that it has the fleet's key.
 //! What it wants replaces what it wanted before, and ends with the connection.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use actix::prelude::*;
 use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
-use crate::shared::domain::{FleetKey, Hello, KeepReady, Proof, Wishes};
+use super::roster_feed::RosterFeed;
+use crate::shared::domain::{
+    FleetKey, Follow, Hello, KeepReady, Proof, Stopped, ToSessionServer, ToSimulationServer, Wishes,
+};
 use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::{ConnectionPermit, Peer};
 use crate::shared::run::{Phase, closing};
+use crate::shared::text::one_line;
 use crate::simulation::slots::{LinkId, Reserved};
 use crate::simulation::state::AppState;
 
@@ -22,6 +28,8 @@ pub struct SlotLink {
     peer: Peer,
     key: FleetKey,
     state: State,
+    /// What it was told of the simulations here, once it follows them.
+    roster: Option<RosterFeed>,
     liveness: Liveness,
     _permit: ConnectionPermit,
 }
@@ -34,15 +42,10 @@ enum State {
     Trusted(LinkId),
 }
 
-/// What a session server sends.
-#[derive(Deserialize)]
-#[serde(untagged)]
-enum FromSessionServer {
-    Ready(KeepReady),
-    Wishes(Wishes),
-}
-
 type Context = WebsocketContext<SlotLink>;
+
+/// Interval between two looks at the simulations.
+const LOOK: Duration = Duration::from_millis(250);
 
 impl SlotLink {
     /// A session server that has just connected; `permit` counts it.
@@ -52,12 +55,14 @@ impl SlotLink {
             server: server.server_run,
             pass: server.config.timing.pass.as_secs_f64(),
             keeps_ready: true,
+            roster: true,
         };
         Self {
             server,
             peer,
             key,
             state: State::Challenged(hello),
+            roster: None,
             liveness: Liveness::default(),
             _permit: permit,
         }
@@ -86,9 +91,11 @@ impl SlotLink {
                 self.state = State::Trusted(id);
                 self.server.slots.open_link(id, ctx.address().recipient());
             }
-            State::Trusted(id) => match serde_json::from_str::<FromSessionServer>(text) {
-                Ok(FromSessionServer::Ready(KeepReady { keep_ready })) => self.server.spare_wishes.ask(*id, keep_ready),
-                Ok(FromSessionServer::Wishes(wishes)) if self.server.takes_nobody() => {
+            State::Trusted(id) => match serde_json::from_str(text) {
+                Ok(ToSimulationServer::Ready(KeepReady { keep_ready })) => {
+                    self.server.spare_wishes.ask(*id, keep_ready);
+                }
+                Ok(ToSimulationServer::Wishes(wishes)) if self.server.takes_nobody() => {
                     let nothing = Wishes {
                         first: Vec::new(),
                         all: 0,
@@ -96,13 +103,62 @@ impl SlotLink {
                     };
                     self.server.slots.wish(*id, &nothing);
                 }
-                Ok(FromSessionServer::Wishes(wishes)) => self.server.slots.wish(*id, &wishes),
+                Ok(ToSimulationServer::Wishes(wishes)) => self.server.slots.wish(*id, &wishes),
+                Ok(ToSimulationServer::Follow(follow)) => self.follow(&follow, ctx),
+                Ok(ToSimulationServer::Stop(order)) => {
+                    let by = format!("session server {}, {}", self.peer, one_line(&order.by));
+                    let ids = self.server.stop(&order.ids, &order.reason, &by);
+                    let number = order.number;
+                    Self::send(&ToSessionServer::Stopped(Stopped { number, ids }), ctx);
+                }
                 Err(error) => {
                     log::warn!("client {}: {error}", self.peer);
                     Self::close(CloseCode::Policy, ctx);
                 }
             },
         }
+    }
+
+    /// Tells all simulations, and from now on what changes.
+    fn follow(&mut self, follow: &Follow, ctx: &mut Context) {
+        let page = url::Url::parse(&follow.page).ok();
+        self.server
+            .class_page
+            .send_replace(page.filter(|page| matches!(page.scheme(), "http" | "https")));
+        if self.roster.is_none() {
+            ctx.run_interval(LOOK, Self::tell_changes);
+        }
+        self.roster.get_or_insert_default().has_figures = follow.figures;
+        self.tell_changes(ctx);
+        if follow.figures {
+            self.measure(ctx);
+        }
+    }
+
+    fn tell_changes(&mut self, ctx: &mut Context) {
+        let Some(roster) = &mut self.roster else { return };
+        for update in roster.updates(&self.server.slots.snapshot().simulations) {
+            Self::send(&ToSessionServer::Roster(update), ctx);
+        }
+        if roster.is_due() {
+            self.measure(ctx);
+        }
+    }
+
+    /// Measures what simulations use. The figures follow with the next look at the simulations.
+    fn measure(&mut self, ctx: &mut Context) {
+        if let Some(roster) = &mut self.roster {
+            roster.begin();
+        }
+        let server = Arc::clone(&self.server);
+        async move { server.usages(&server.slots.snapshot()).await }
+            .into_actor(self)
+            .map(|usages, link, _| {
+                if let Some(roster) = &mut link.roster {
+                    roster.usages = usages;
+                }
+            })
+            .spawn(ctx);
     }
 
     fn close(code: CloseCode, ctx: &mut Context) {

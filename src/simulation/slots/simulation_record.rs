@@ -7,13 +7,13 @@ use std::time::{Instant, SystemTime};
 use actix::{Message, Recipient};
 use tokio::sync::Semaphore;
 
-use crate::shared::domain::{Failure, ProjectUrl, Reason, View};
+use crate::shared::domain::{Failure, ProjectUrl, Reason, Stage, View};
 use crate::shared::http::Peer;
 use crate::shared::run::{seconds_since_1970, timestamp};
 use crate::shared::text::{excerpt, without_paths};
 use crate::simulation::attachment::{NewClient, Token};
 use crate::simulation::ends::{End, Ended, lost};
-use crate::simulation::snapshot::{Simulation, Stage};
+use crate::simulation::snapshot::Simulation;
 
 /// A simulation of this server.
 pub(super) struct SimulationRecord {

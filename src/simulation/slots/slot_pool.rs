@@ -16,11 +16,11 @@ use parking_lot::Mutex;
 use super::port;
 use super::reservations::{Held, LinkId, Reservations, Reserved};
 use super::simulation_record::{Party, SimulationRecord, SlotEvent, SpareKind};
-use crate::shared::domain::{Failure, Instances, Reason, ReservationId, View, Wish, Wishes};
+use crate::shared::domain::{Failure, Instances, Reason, ReservationId, Stage, View, Wish, Wishes};
 use crate::shared::http::Peer;
 use crate::simulation::ends::Ends;
 use crate::simulation::simulation_id::SimulationId;
-use crate::simulation::snapshot::{Simulation, Snapshot, Stage};
+use crate::simulation::snapshot::{Simulation, Snapshot};
 
 /// The slots of this server, and the simulations that have one or wait for one.
 pub struct SlotPool(pub(super) Mutex<Slots>);
@@ -182,16 +182,19 @@ impl SlotPool {
         self.change(id, |record| change(&mut record.simulation));
     }
 
-    /// Stops the simulation with this id; `why` is the text for its client. Returns whether there is one.
-    pub fn stop(&self, id: &str, why: String) -> bool {
+    /// Stops the simulations with these ids; `why` is the text for their clients. Returns the ids of those that are there.
+    pub fn stop(&self, ids: &[String], why: &str) -> Vec<String> {
         let slots = self.0.lock();
-        let found = slots
+        let with_ids = slots
             .records
             .values()
-            .find(|record| record.simulation.id.to_string() == id);
-        found
-            .inspect(|record| record.listener.do_send(SlotEvent::Stopped(why)))
-            .is_some()
+            .map(|record| (record.simulation.id.to_string(), record));
+        let chosen = with_ids.filter(|(id, _)| ids.contains(id));
+        let stopped = chosen.map(|(id, record)| {
+            record.listener.do_send(SlotEvent::Stopped(why.to_owned()));
+            id
+        });
+        stopped.collect()
     }
 
     /// The numbers of simulations by state.

@@ -9,11 +9,11 @@ use actix::Recipient;
 use super::simulation_record::{SimulationRecord, SlotEvent, SpareKind};
 use super::slot_pool::{SlotPool, Slots, may_have, parties};
 use crate::shared::domain::ReservationId;
+use crate::shared::domain::Stage;
 use crate::shared::http::Peer;
 use crate::shared::run::seconds_since_1970;
 use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::simulation_id::SimulationId;
-use crate::simulation::snapshot::Stage;
 
 /// A simulation without a client, for the one that keeps their number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

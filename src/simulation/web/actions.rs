@@ -5,12 +5,7 @@ use actix_web::{HttpRequest, HttpResponse, web};
 use serde::Deserialize;
 
 use crate::shared::http::routing::{POST, json_body, path};
-use crate::shared::text::excerpt;
-use crate::simulation::protocol;
 use crate::simulation::state::AppState;
-
-/// Longest reason, in characters.
-const MAX_REASON_LENGTH: usize = 300;
 
 /// Adds the paths to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
@@ -45,14 +40,11 @@ async fn stop(
         Ok(order) => order,
         Err(refusal) => return Ok(refusal),
     };
-    let id = id.into_inner();
-    let reason = excerpt(reason.trim(), MAX_REASON_LENGTH);
-    if !server.slots.stop(&id, protocol::stopped_by_teacher(&reason)) {
+    if server
+        .stop(&[id.into_inner()], &reason, &administrator.to_string())
+        .is_empty()
+    {
         return Err(ErrorNotFound("Error: there is no such simulation; it may have ended."));
     }
-    log::info!(
-        "{id}: {administrator} stops it, reason: {}",
-        if reason.is_empty() { "none" } else { &reason }
-    );
     Ok(HttpResponse::Accepted().body("stopping"))
 }

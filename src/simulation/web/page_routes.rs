@@ -1,8 +1,6 @@
 //! Routes of the simulation server's pages, with their assets and event stream, and of Webots' own viewer: the monitor, and
 //! the page on which an administrator watches a simulation.
 
-use std::collections::BTreeMap;
-
 use actix_files::NamedFile;
 use actix_web::error::{ErrorInternalServerError, ErrorNotFound};
 use actix_web::http::header::{self, HeaderValue};
@@ -16,10 +14,8 @@ use crate::asset;
 use crate::shared::http::assets::{self, Asset};
 use crate::shared::http::routing::{GET, READ, path};
 use crate::shared::http::{ConnectionKind, FOREIGN_SCRIPTS, OWN_FILES, PageView, VIEWER, html, sign_in};
-use crate::simulation::container;
 use crate::simulation::ends::{last_lines, output_file};
-use crate::simulation::machine::{self, Usages};
-use crate::simulation::snapshot::{Simulation, Snapshot};
+use crate::simulation::snapshot::Simulation;
 use crate::simulation::state::AppState;
 
 /// Assets of this server's page, besides those of all pages.
@@ -38,6 +34,8 @@ const MAX_TAIL: u64 = 96 * 1024;
 #[template(path = "simulation/watch.html")]
 struct Watch<'a> {
     simulation: &'a Simulation,
+    /// The page of the class, if a session server of the fleet has one.
+    class: Option<String>,
     /// The path of the stream, with a token for one connection.
     stream: String,
     /// Webots' own viewer, if this server has it.
@@ -79,26 +77,8 @@ async fn monitor(request: HttpRequest, server: web::Data<AppState>) -> actix_web
 
 async fn view(server: &AppState, visitor: Visitor) -> Result<PageView, askama::Error> {
     let snapshot = server.slots.snapshot();
-    let usages = usages(server, &snapshot).await;
+    let usages = server.usages(&snapshot).await;
     pages::view(server, &snapshot, &usages, visitor)
-}
-
-async fn usages(server: &AppState, snapshot: &Snapshot) -> Usages {
-    if snapshot.simulations.is_empty() {
-        return Usages::new();
-    }
-    let usage = server.usage.clone();
-    let simulations = snapshot.simulations.iter();
-    let read = if let Some(containers) = &server.containers {
-        // The process is `docker`, which waits for the containers.
-        let roots: BTreeMap<u16, i32> = simulations.filter_map(|one| Some((one.port?, one.pid?))).collect();
-        let owner = containers.run.clone();
-        actix_rt::task::spawn_blocking(move || usage.read(|| container::measure(&owner, &roots)))
-    } else {
-        let roots: Vec<i32> = simulations.filter_map(|one| one.pid).collect();
-        actix_rt::task::spawn_blocking(move || usage.read(|| machine::usages(&roots)))
-    };
-    read.await.unwrap_or_default()
 }
 
 async fn events(request: HttpRequest, server: web::Data<AppState>) -> actix_web::Result<HttpResponse> {
@@ -199,6 +179,7 @@ async fn watch(
     let installed = webots_viewer::folder(&server.config).map(|_| webots_viewer::PATH);
     let page = Watch {
         simulation,
+        class: server.class_page(),
         stream: format!("stream/{}", token.reveal()),
         script: installed.filter(|_| which.viewer != "small"),
     };

@@ -6,13 +6,13 @@ use askama::Template;
 use url::Url;
 
 use super::access::Visitor;
-use crate::shared::domain::{Instances, ReadyStatus, View};
+use crate::shared::domain::{Instances, ReadyStatus, Stage, View};
 use crate::shared::http::{PageView, TableRow};
 use crate::shared::run::timestamp;
 use crate::shared::text::one_line;
 use crate::simulation::ends::Ended;
 use crate::simulation::machine::{Readings, Usage, Usages};
-use crate::simulation::snapshot::{Simulation, Snapshot, Stage};
+use crate::simulation::snapshot::{Simulation, Snapshot};
 use crate::simulation::state::AppState;
 
 /// The whole page `/monitor`.

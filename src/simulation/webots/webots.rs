@@ -16,13 +16,13 @@ use super::launch_spec::LaunchSpec;
 use super::launched::{self, Exit, Launched, Reached};
 use super::output::{OutputEvent, Tail};
 use super::startup::StartupEvent;
+use crate::shared::domain::Stage;
 use crate::shared::domain::{Blame, Failure, Reason};
 use crate::shared::run::seconds_since_1970;
 use crate::simulation::container::SimulationContainers;
 use crate::simulation::ends::{End, StopReason, lost};
 use crate::simulation::process::ProcessGroup;
 use crate::simulation::slots::port;
-use crate::simulation::snapshot::Stage;
 
 /// Requests Webots' end.
 #[derive(Message)]

@@ -1,0 +1,354 @@
+//! The class: simulations and who waits, of all servers, at the session server, and actions that it forwards.
+
+use std::io::Read;
+
+use flate2::read::MultiGzDecoder;
+use futures_util::StreamExt;
+use serde_json::{Value, json};
+
+use super::stand_in::{Manner, StandIn};
+use super::until_states;
+use crate::support::http::{PASSWORD, get_as_administrator};
+use crate::support::program::{Builder, Server, demo_server, session_server};
+use crate::support::{Client, SOON, arm, until};
+
+const KEY: &str = "a key for a whole fleet";
+const READER: &str = "fedcba9876543210fedcba9876543210";
+const TOKEN: &str = "0123456789abcdef0123456789abcdef";
+const TOLD: &str = "loading: Error: Your teacher has stopped this simulation";
+
+/// Simulation servers with the key of the fleet, and no password.
+fn keyed(places: u16) -> Builder {
+    demo_server(places).set("fleetKey", KEY)
+}
+
+async fn fleet(servers: &[String]) -> Server {
+    let tokens = json!([
+        {"name": "backup", "token": TOKEN, "may": "act"},
+        {"name": "board", "token": READER, "may": "read"},
+    ]);
+    let session = session_server(servers)
+        .set("adminPassword", PASSWORD)
+        .set("fleetKey", KEY);
+    session.set("apiTokens", tokens).start().await
+}
+
+async fn start(server: &Server, name: &str) -> Client {
+    let mut client = Client::connect(&server.websocket("/client")).await;
+    client
+        .send(&json!({"start": {"url": arm(), "name": name}}).to_string())
+        .await;
+    client.until("webots:").await;
+    client
+}
+
+async fn class(session: &Server) -> Vec<Value> {
+    let answer = get_as_administrator(&session.url("/simulations")).await;
+    assert_eq!(answer.status, 200, "{}", answer.text());
+    answer.json().as_array().unwrap().clone()
+}
+
+async fn until_class(session: &Server, count: usize) -> Vec<Value> {
+    until(&format!("{count} are in the class"), async || {
+        class(session).await.len() == count
+    })
+    .await;
+    class(session).await
+}
+
+async fn send(session: &Server, path: &str, token: &str, body: &Value) -> (u16, String) {
+    let request = awc::Client::builder().timeout(SOON).finish().post(session.url(path));
+    let request = request.insert_header(("Authorization", format!("Bearer {token}")));
+    let mut answer = request.send_body(body.to_string()).await.unwrap();
+    let text = answer.body().await.unwrap();
+    (answer.status().as_u16(), String::from_utf8_lossy(&text).into_owned())
+}
+
+#[actix_rt::test]
+async fn the_class_is_one_list_and_its_actions_are_forwarded() {
+    let servers = [keyed(3).start().await, keyed(3).start().await];
+    let session = fleet(&servers.each_ref().map(Server::address)).await;
+    until_class(&session, 0).await;
+    let mut nora = start(&servers[0], "Nora 14").await;
+    let mut noah = start(&servers[0], "Noah").await;
+    let mut other = start(&servers[1], "<b>Nora</b>").await;
+    let list = until_class(&session, 3).await;
+    let one = list.iter().find(|one| one["label"] == "Nora 14").unwrap();
+    assert_eq!(one["id"], nora.id());
+    assert_eq!(one["server"], servers[0].address());
+    assert_eq!(
+        (one["world"].as_str(), one["user"].as_str()),
+        (Some(arm().as_str()), None)
+    );
+    until("its state follows", async || {
+        class(&session)
+            .await
+            .iter()
+            .all(|one| one["state"] == "idle" || one["state"] == "running")
+    })
+    .await;
+
+    // One, by its id, with a reason.
+    let path = format!("/simulations/{}/stop", nora.id());
+    assert_eq!(send(&session, &path, READER, &json!({})).await.0, 403);
+    let (status, text) = send(&session, &path, TOKEN, &json!({"reason": "<b>Back"})).await;
+    assert_eq!(status, 202, "{text}");
+    assert_eq!(
+        nora.until("loading: Error:").await,
+        format!("{TOLD}: \u{2039}b\u{203a}Back")
+    );
+    until_class(&session, 2).await;
+    assert_eq!(send(&session, &path, TOKEN, &json!({})).await.0, 404);
+    until("the log names who has stopped it", async || {
+        servers[0].log().contains("token \"backup\" stops it, reason: <b>Back")
+    })
+    .await;
+
+    // Those that some conditions name.
+    let none = json!({"world": arm(), "label": "nobody"});
+    let (status, text) = send(&session, "/simulations/stop", TOKEN, &none).await;
+    assert_eq!((status, text.as_str()), (202, r#"{"failed":[],"stopped":[]}"#));
+    for wrong in [
+        json!({}),
+        json!({"reason": "x"}),
+        json!({"all": true}),
+        json!({"ids": "x"}),
+    ] {
+        assert_eq!(
+            send(&session, "/simulations/stop", TOKEN, &wrong).await.0,
+            400,
+            "{wrong}"
+        );
+    }
+    let (status, text) = send(
+        &session,
+        "/simulations/stop",
+        TOKEN,
+        &json!({"server": servers[0].address()}),
+    )
+    .await;
+    assert_eq!((status, text.contains(noah.id())), (202, true), "{text}");
+    assert_eq!(noah.until("loading: Error:").await, TOLD);
+    other.until(".").await;
+    let ids = json!({"ids": [other.id(), "1-1"], "reason": "over"});
+    let (status, text) = send(&session, "/simulations/stop", TOKEN, &ids).await;
+    assert_eq!(
+        (status, text),
+        (
+            202,
+            format!("{{\"failed\":[\"1-1\"],\"stopped\":[\"{}\"]}}", other.id())
+        )
+    );
+    until_class(&session, 0).await;
+}
+
+#[actix_rt::test]
+async fn who_waits_is_in_the_class_too() {
+    let server = keyed(1).start().await;
+    let session = fleet(&[server.address()]).await;
+    let _first = start(&server, "Anna").await;
+    until_class(&session, 1).await;
+    let mut line = Client::connect(&session.websocket("/session")).await;
+    let wait = json!({"url": arm(), "wait": true, "name": " Ben\n<script> "});
+    line.send(&wait.to_string()).await;
+    line.until("ticket:").await;
+    let list = until_class(&session, 2).await;
+    let ben = list.iter().find(|one| one["state"] == "waiting").unwrap();
+    assert_eq!(
+        (ben["label"].as_str(), ben["world"].as_str()),
+        (Some("Ben <script>"), Some(arm().as_str()))
+    );
+    assert!(ben.get("server").is_none(), "{ben}");
+    line.leave().await;
+    until_class(&session, 1).await;
+}
+
+#[actix_rt::test]
+async fn a_server_that_is_gone_has_no_simulations_in_the_class() {
+    let mut server = keyed(2).start().await;
+    let session = fleet(&[server.address()]).await;
+    let _client = start(&server, "Anna").await;
+    let list = until_class(&session, 1).await;
+    server.signal(nix::sys::signal::Signal::SIGKILL);
+    server.ended().await;
+    until_class(&session, 0).await;
+    let path = format!("/simulations/{}/stop", list[0]["id"].as_str().unwrap());
+    assert_eq!(send(&session, &path, TOKEN, &json!({})).await.0, 404);
+}
+
+/// The text of the events of the page, until this is in it. Returns it, and the number of bytes that were received.
+async fn events(session: &Server, headers: &[(&str, &str)], wanted: &str) -> (String, usize) {
+    let client = awc::Client::builder().disable_timeout().finish();
+    let request = client.get(session.url("/class/events")).basic_auth("admin", PASSWORD);
+    let request = headers.iter().fold(request.no_decompress(), |request, header| {
+        request.insert_header(*header)
+    });
+    let mut answer = request.send().await.unwrap();
+    assert_eq!(answer.status(), 200);
+    let mut bytes = Vec::new();
+    let read = async {
+        loop {
+            bytes.extend(answer.next().await.unwrap().unwrap());
+            let mut text = String::new();
+            if answer.headers().contains_key("content-encoding") {
+                // It has no end yet.
+                let mut read = Vec::new();
+                MultiGzDecoder::new(&*bytes).read_to_end(&mut read).ok();
+                text = String::from_utf8_lossy(&read).into_owned();
+            } else {
+                text.push_str(&String::from_utf8_lossy(&bytes));
+            }
+            if text.contains(wanted) {
+                return (text, bytes.len());
+            }
+        }
+    };
+    actix_rt::time::timeout(SOON, read)
+        .await
+        .unwrap_or_else(|_| panic!("no {wanted}"))
+}
+
+#[actix_rt::test]
+async fn a_page_is_told_what_has_changed() {
+    let server = keyed(3).start().await;
+    let session = fleet(&[server.address()]).await;
+    let _first = start(&server, "Anna").await;
+    until_class(&session, 1).await;
+    let (text, _) = events(&session, &[], "Anna").await;
+    assert!(
+        text.contains("\"all\":true") && text.contains("\"servers\":[{"),
+        "{text}"
+    );
+    let id = text
+        .lines()
+        .find_map(|line| line.strip_prefix("id: "))
+        .unwrap()
+        .to_owned();
+    // A page that comes back is told what is new.
+    let second = start(&server, "Ben").await;
+    until_class(&session, 2).await;
+    let (text, _) = events(&session, &[("Last-Event-ID", &id)], "Ben").await;
+    assert!(text.contains("\"all\":false") && text.contains(second.id()), "{text}");
+    let (text, _) = events(&session, &[("Last-Event-ID", "7-7")], "Ben").await;
+    assert!(
+        text.contains("\"all\":true") && text.contains("Anna"),
+        "that of another run: {text}"
+    );
+    let (text, _) = events(&session, &[("Accept-Encoding", "gzip")], "Ben").await;
+    assert!(text.contains("Anna"), "{text}");
+    // Somebody looks, so there are figures.
+    let (text, _) = events(&session, &[], "\"cpu\":").await;
+    assert!(text.contains("\"cpu\":"), "{text}");
+    // Strangers and other sites get nothing.
+    for path in ["/class/events", "/simulations", "/class"] {
+        assert_eq!(
+            crate::support::http::get(&session.url(path)).await.status,
+            401,
+            "{path}"
+        );
+    }
+}
+
+#[actix_rt::test]
+async fn servers_that_tell_nothing_are_shown_as_what_they_are() {
+    let python = StandIn::start(Manner::Load("3.0".to_owned()));
+    let alone = demo_server(1).start().await;
+    let foreign = demo_server(1).set("fleetKey", "another key for a fleet").start().await;
+    let known = keyed(1).start().await;
+    let servers = [python.address(), alone.address(), foreign.address(), known.address()];
+    let session = fleet(&servers).await;
+    until_states(&session, &["up", "up", "up", "up"]).await;
+    let _hidden = start(&alone, "Anna").await;
+    let _seen = start(&known, "Ben").await;
+    let list = until_class(&session, 1).await;
+    assert_eq!(list[0]["label"], "Ben");
+    let mut lines = Value::Null;
+    until("its servers are known", async || {
+        let (text, _) = events(&session, &[], "\"servers\":").await;
+        let event = text.lines().find_map(|line| line.strip_prefix("data: ")).unwrap();
+        lines = serde_json::from_str::<Value>(event).unwrap()["servers"].clone();
+        lines
+            .as_array()
+            .is_some_and(|lines| lines.iter().filter(|line| line["note"] == "").count() == 1)
+    })
+    .await;
+    for (number, note) in [
+        (0, "as the Python server"),
+        (1, "no fleetKey"),
+        (2, "no fleetKey"),
+        (3, ""),
+    ] {
+        let said = lines[number]["note"].as_str().unwrap();
+        assert!(
+            said.contains(note) && (note.is_empty() == said.is_empty()),
+            "{number}: {said}"
+        );
+    }
+}
+
+#[actix_rt::test]
+async fn an_administrator_signs_in_once_for_the_whole_fleet() {
+    let server = keyed(1).start().await;
+    let session = fleet(&[server.address()]).await;
+    let client = start(&server, "Anna").await;
+    until_class(&session, 1).await;
+    let get = async |url: String, headers: &[(&str, &str)]| {
+        let client = awc::Client::builder().disable_redirects().finish();
+        let request = headers
+            .iter()
+            .fold(client.get(url), |request, header| request.insert_header(*header));
+        let mut answer = request.send().await.unwrap();
+        let text = |name| {
+            answer
+                .headers()
+                .get(name)
+                .map(|value| value.to_str().unwrap().to_owned())
+        };
+        let (to, cookie) = (text("location"), text("set-cookie"));
+        let body = answer.body().await.unwrap();
+        (
+            answer.status().as_u16(),
+            to,
+            cookie,
+            String::from_utf8_lossy(&body).into_owned(),
+        )
+    };
+    let token = format!("Bearer {TOKEN}");
+    let reader = format!("Bearer {READER}");
+    let visit = session.url(&format!("/visit?id={}", client.id()));
+    assert_eq!(get(visit.clone(), &[]).await.0, 401);
+    // What leads to an entry must not give a program more than it may.
+    assert_eq!(get(visit.clone(), &[("Authorization", &reader)]).await.0, 403);
+    let (status, to, ..) = get(visit, &[("Authorization", &token)]).await;
+    let to = to.unwrap();
+    assert_eq!(status, 303);
+    assert!(to.starts_with(&server.url("/sign-in?entry=")), "{to}");
+    let (status, _, cookie, page) = get(to.clone(), &[]).await;
+    assert_eq!(status, 200);
+    assert!(page.contains(&format!("0; url=watch?id={}", client.id())), "{page}");
+    let cookie = cookie.unwrap().split(';').next().unwrap().to_owned();
+    let watch = server.url(&format!("/watch?id={}", client.id()));
+    let (status, _, _, page) = get(watch.clone(), &[("Cookie", &cookie)]).await;
+    assert_eq!(status, 200, "{page}");
+    // The page links back to the class.
+    assert!(page.contains("/class\" data-words=\"class\""), "{page}");
+    assert_eq!(
+        get(watch, &[]).await.0,
+        403,
+        "without a password nobody can sign in here otherwise"
+    );
+    // Another entry, and another server.
+    let forged = to.replacen("entry=", "entry=A", 1);
+    assert_eq!(get(forged, &[]).await.1.as_deref(), Some("sign-in"));
+    let foreign = demo_server(1).set("fleetKey", "another key for a fleet").start().await;
+    let elsewhere = to.replace(&server.address(), &foreign.address());
+    assert_eq!(get(elsewhere, &[]).await.1.as_deref(), Some("sign-in"));
+    let (status, to, ..) = get(
+        session.url(&format!("/visit?server={}", server.address())),
+        &[("Authorization", &token)],
+    )
+    .await;
+    assert!(status == 303 && to.unwrap().contains("to=monitor"));
+    let evil = session.url("/visit?server=evil.example");
+    assert_eq!(get(evil, &[("Authorization", &token)]).await.0, 404);
+}
