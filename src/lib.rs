@@ -12,6 +12,7 @@
 //! | [`shared::http`] | pages, live updates, WebSockets, limits, certificates, metrics |
 //! | [`session::placement`] | which server gets the next client: the load of a server and the key that servers are sorted by (`backend`), the choice of the first (`load_balancer`), cost |
 //! | [`session::line`] | the clients that wait for a slot of the fleet: tickets (`ticket`), the order (`waiting_line`), who gets the next slot of which server (`dispatcher`) |
+//! | [`session::class`] | all simulations of the fleet and who waits, with the number of each change, and the links to servers for actions (`roster`) |
 //! | [`session::mail`] | notices: to whom (`smtp`, one address, from the key `administrator` in `config/session_config`) and how (`channel`), what is in them (`notice_text`), when they are sent (`outbox`) |
 //! | [`session::fleet`] | the registry and the monitors of simulation servers, and what connects them with the line (`line_keeper`, `slot_link`) |
 //! | [`session::web`] | routes, pages, `/status`, Prometheus metrics (gauges in `metrics`, counters in `app`) and the WebSocket of the session server |
