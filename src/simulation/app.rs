@@ -257,17 +257,7 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
         starts.with_label_values(&[refusal.code()]);
     }
     let fleet_key = config.fleet_key.as_ref().map(|key| FleetKey::new(key.reveal()));
-    let admin_auth = AdminAuth::new(AuthSettings {
-        password: config.admin_password.clone(),
-        tokens: config.api_tokens.clone(),
-        key: fleet_key.clone().unwrap_or_else(FleetKey::random),
-        has_fleet: fleet_key.is_some(),
-        port: config.port,
-        ssl: config.ssl,
-        trusted_proxies: config.trusted_proxies.clone(),
-        user_header: config.user_header.clone(),
-        home: "monitor",
-    });
+    let admin_auth = admin_auth(&config, fleet_key.as_ref());
     let spare_wishes = SpareWishes::default();
     spare_wishes.configure(config.ready.clone());
     let failed_starts = Arc::default();
@@ -310,6 +300,21 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
         disk_monitor,
         started: Instant::now(),
         config,
+    })
+}
+
+/// Tells administrators from others.
+fn admin_auth(config: &SimulationConfig, fleet_key: Option<&FleetKey>) -> AdminAuth {
+    AdminAuth::new(AuthSettings {
+        password: config.admin_password.clone(),
+        tokens: config.api_tokens.clone(),
+        key: fleet_key.cloned().unwrap_or_else(FleetKey::random),
+        has_fleet: fleet_key.is_some(),
+        port: config.port,
+        ssl: config.ssl,
+        trusted_proxies: config.trusted_proxies.clone(),
+        user_header: config.user_header.clone(),
+        home: "monitor",
     })
 }
 

@@ -27,7 +27,8 @@ async fn fleet(servers: &[String]) -> Server {
         {"name": "backup", "token": TOKEN, "may": "act"},
         {"name": "board", "token": READER, "may": "read"},
     ]);
-    let session = session_server(servers).set("loadThreshold", 1000)
+    let session = session_server(servers)
+        .set("loadThreshold", 1000)
         .set("adminPassword", PASSWORD)
         .set("fleetKey", KEY);
     session.set("apiTokens", tokens).start().await

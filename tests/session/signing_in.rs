@@ -30,7 +30,11 @@ fn action(server: &Server) -> (String, u16) {
 
 /// The page that follows a sign-in.
 fn home(server: &Server) -> &'static str {
-    if server.log().contains("session server") { "class" } else { "monitor" }
+    if server.log().contains("session server") {
+        "class"
+    } else {
+        "monitor"
+    }
 }
 
 async fn send(url: &str, headers: &[(&str, &str)], body: &str) -> StatusCode {
