@@ -2,14 +2,18 @@
 
 use std::fmt;
 
+use serde::Serialize;
+
 use crate::shared::text::{chosen_name, one_line};
 
 /// The identity of a client. Only administrators see it: on pages, in the server's log and in `simulations.csv`.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 pub struct ClientIdentity {
     /// The user name that a trusted reverse proxy sends.
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub user: Option<String>,
     /// The name that the client has chosen; it is not checked.
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub label: Option<String>,
 }
 

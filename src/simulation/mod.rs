@@ -16,6 +16,7 @@ pub mod process;
 pub mod protocol;
 pub(crate) mod readiness;
 mod relay;
+pub(crate) mod simulated_time;
 pub(crate) mod simulation_id;
 pub(crate) mod slots;
 pub mod snapshot;

@@ -206,8 +206,7 @@ pub fn nothing_to_reset() -> Failure {
 }
 
 /// Why an administrator has stopped a simulation, as its client reads it.
-pub fn stopped_by_teacher(reason: &str) -> String {
-    let words = "Your teacher has stopped this simulation";
+pub fn stopped_by_administrator(words: &str, reason: &str) -> String {
     if reason.is_empty() {
         words.to_owned()
     } else {

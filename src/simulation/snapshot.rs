@@ -7,6 +7,7 @@ use serde::Serialize;
 use crate::shared::domain::{Instances, ProjectUrl, Stage};
 use crate::shared::run::seconds_since_1970;
 use crate::simulation::client_identity::ClientIdentity;
+use crate::simulation::simulated_time::SimulatedTime;
 use crate::simulation::simulation_id::SimulationId;
 
 /// The 3D scene that a Webots streams. It does not answer a viewer that requests the other.
@@ -51,7 +52,7 @@ pub struct Simulation {
     #[serde(skip)]
     pub repository: String,
     /// Its client's identity, only for administrators.
-    #[serde(skip)]
+    #[serde(flatten)]
     pub identity: ClientIdentity,
     /// Its state.
     pub stage: Stage,
@@ -77,6 +78,9 @@ pub struct Simulation {
     /// The 3D scene that its Webots streams, once that is known; none for a video.
     #[serde(skip)]
     pub scene: Option<SceneKind>,
+    /// How fast it runs, if its stream is relayed.
+    #[serde(skip)]
+    pub time: SimulatedTime,
     /// The file that its output is kept in.
     pub log: Option<PathBuf>,
 }
@@ -99,6 +103,7 @@ impl Simulation {
             away_until: None,
             version: None,
             scene: None,
+            time: SimulatedTime::default(),
             log: None,
         }
     }

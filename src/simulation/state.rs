@@ -154,7 +154,10 @@ impl AppState {
     /// the ids of those that are there.
     pub fn stop(&self, ids: &[String], reason: &str, by: &str) -> Vec<String> {
         let reason = excerpt(reason.trim(), MAX_REASON_LENGTH);
-        let stopped = self.slots.stop(ids, &protocol::stopped_by_teacher(&reason));
+        let stopped = self.slots.stop(
+            ids,
+            &protocol::stopped_by_administrator(&self.config.stop_text, &reason),
+        );
         for id in &stopped {
             log::info!(
                 "{id}: {by} stops it, reason: {}",

@@ -387,6 +387,32 @@ setInterval(() => {
   }
 }, 5000);
 
+/* The records of a lesson: by default, of the last two hours. */
+
+const [from, to] = [find('from', HTMLInputElement), find('to', HTMLInputElement)];
+
+/** The local time as the field has it. @param {Date} time */
+const inField = (time) => new Date(time.getTime() - 60_000 * time.getTimezoneOffset()).toISOString().slice(0, 16);
+
+function drawRecords() {
+  const span = new URLSearchParams();
+  for (const [name, { value }] of /** @type {[string, HTMLInputElement][]} */ ([
+    ['from', from],
+    ['to', to],
+  ])) {
+    const time = new Date(value).getTime();
+    if (!Number.isNaN(time)) {
+      span.set(name, String(Math.round(time / 1000)));
+    }
+  }
+  find('records', HTMLAnchorElement).href = `simulations.csv?${span}`;
+}
+
+from.value = inField(new Date(Date.now() - 2 * 3_600_000));
+from.addEventListener('input', drawRecords);
+to.addEventListener('input', drawRecords);
+drawRecords();
+
 const table = body.closest('table');
 if (table) {
   makeSortable(table, body);

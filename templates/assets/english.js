@@ -28,6 +28,8 @@ export const words = {
     'to-session-server': 'to the session server …',
     url: 'URL of a world',
     'url-help': 'The page of a .wbt file on its forge: below /blob/ or /tree/, in a folder worlds.',
+    name: 'Your name',
+    'name-help': 'The administrator sees it.',
     'shown-by': 'Shown by',
     automatic: 'the viewer that fits',
     webots: 'Webots’ own viewer',
@@ -48,7 +50,7 @@ export const words = {
     launch: 'Launch',
     'about-launch': 'of the simulator',
     'about-simulation': 'runs for you until you leave',
-    watched: 'Your teacher is watching.',
+    watched: 'The administrator is watching.',
     'about-tabs':
       'Each tab has a simulation of its own: two tabs are two simulations. A page that is loaded again, or whose connection breaks, finds its simulation again; that ends with “Disconnect”, or some time after its tab was closed.',
     'simulation-server': 'Simulation server',
@@ -191,7 +193,7 @@ export const words = {
     smaller: 'Try a smaller project, or ask the administrator for a higher limit.',
     project: 'It comes from the world or its project. Change that, or connect again.',
     takenOver: 'Another tab, or another window, shows it now. Connect here for a simulation of this tab’s own.',
-    teacher: 'Ask your teacher before you connect again.',
+    teacher: 'Ask the administrator before you connect again.',
     firewall:
       'A firewall may be in the way: the ports above the simulation server’s own have to be open, or forwarded.',
   },

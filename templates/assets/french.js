@@ -23,6 +23,8 @@ export const words = {
     'to-session-server': 'au serveur de sessions…',
     url: 'URL d’un monde',
     'url-help': 'La page d’un fichier .wbt sur sa forge : sous /blob/ ou /tree/, dans un dossier worlds.',
+    name: 'Votre nom',
+    'name-help': 'L’administrateur le voit.',
     'shown-by': 'Affiché par',
     automatic: 'le visualiseur adapté',
     webots: 'le visualiseur de Webots',
@@ -43,7 +45,7 @@ export const words = {
     launch: 'Démarrage',
     'about-launch': 'du simulateur',
     'about-simulation': 'tourne pour vous jusqu’à votre départ',
-    watched: 'Votre enseignant regarde.',
+    watched: 'L’administrateur regarde.',
     'about-tabs':
       'Chaque onglet a sa propre simulation : deux onglets, deux simulations. Une page rechargée, ou dont la connexion est coupée, retrouve sa simulation ; cela prend fin avec « Se déconnecter », ou quelque temps après la fermeture de l’onglet.',
     'simulation-server': 'Serveur de simulation',
@@ -195,7 +197,7 @@ export const words = {
     finished: 'Webots s’est terminé.',
     'time-limit': 'Le temps de la simulation est écoulé.',
     idle: 'La simulation est restée trop longtemps en pause.',
-    'stopped-by-administrator': 'Votre enseignant a arrêté la simulation.',
+    'stopped-by-administrator': 'L’administrateur a arrêté la simulation.',
     'server-stopped': 'Le serveur a été arrêté.',
     crashed: 'Webots a planté.',
     hung: 'Webots ne répondait plus.',
@@ -224,7 +226,7 @@ export const words = {
     project: 'Cela vient du monde ou de son projet. Modifiez-le, ou reconnectez-vous.',
     takenOver:
       'Un autre onglet ou une autre fenêtre l’affiche maintenant. Connectez-vous ici pour une simulation propre à cet onglet.',
-    teacher: 'Demandez à votre enseignant avant de vous reconnecter.',
+    teacher: 'Demandez à l’administrateur avant de vous reconnecter.',
     firewall:
       'Un pare-feu fait peut-être obstacle : les ports au-dessus de celui du serveur de simulation doivent être ouverts ou redirigés.',
   },

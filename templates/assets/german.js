@@ -23,6 +23,8 @@ export const words = {
     'to-session-server': 'mit dem Sitzungsserver …',
     url: 'URL einer Welt',
     'url-help': 'Die Seite einer .wbt-Datei auf ihrer Forge: unter /blob/ oder /tree/, in einem Ordner worlds.',
+    name: 'Dein Name',
+    'name-help': 'Die Administration sieht ihn.',
     'shown-by': 'Gezeigt von',
     automatic: 'der passenden Ansicht',
     webots: 'der Ansicht von Webots',
@@ -43,7 +45,7 @@ export const words = {
     launch: 'Start',
     'about-launch': 'des Simulators',
     'about-simulation': 'läuft für dich, bis du gehst',
-    watched: 'Deine Lehrkraft sieht zu.',
+    watched: 'Die Administration sieht zu.',
     'about-tabs':
       'Jeder Tab hat seine eigene Simulation: zwei Tabs sind zwei Simulationen. Nach dem Neuladen oder einer Störung der Verbindung findet die Seite ihre Simulation wieder; das endet mit „Trennen“ oder einige Zeit, nachdem der Tab geschlossen wurde.',
     'simulation-server': 'Simulationsserver',
@@ -196,7 +198,7 @@ export const words = {
     finished: 'Webots hat sich beendet.',
     'time-limit': 'Die Zeit der Simulation ist um.',
     idle: 'Die Simulation war zu lange angehalten.',
-    'stopped-by-administrator': 'Deine Lehrkraft hat die Simulation beendet.',
+    'stopped-by-administrator': 'Die Administration hat die Simulation beendet.',
     'server-stopped': 'Der Server wurde angehalten.',
     crashed: 'Webots ist abgestürzt.',
     hung: 'Webots reagierte nicht mehr.',
@@ -223,7 +225,7 @@ export const words = {
     project: 'Es liegt an der Welt oder ihrem Projekt. Ändere sie, oder verbinde dich neu.',
     takenOver:
       'Ein anderer Tab oder ein anderes Fenster zeigt sie jetzt. Verbinde dich hier, um eine eigene Simulation zu starten.',
-    teacher: 'Frage deine Lehrkraft, bevor du dich neu verbindest.',
+    teacher: 'Frage die Administration, bevor du dich neu verbindest.',
     firewall:
       'Vielleicht ist eine Firewall im Weg: Die Ports oberhalb des Ports des Simulationsservers müssen offen oder weitergeleitet sein.',
   },

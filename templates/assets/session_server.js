@@ -111,13 +111,16 @@ export class SessionServer {
    * no answer.
    * @param {number} id
    * @param {string} world
+   * @param {string | undefined} name of the visitor
    */
-  ask(id, world) {
+  ask(id, world, name) {
     if (this.#socket.readyState !== WebSocket.OPEN) {
       return;
     }
     this.#asked = { id, world };
-    this.#socket.send(JSON.stringify({ url: world, reason: true, wait: true, ticket: this.#store.ticketFor(world) }));
+    this.#socket.send(
+      JSON.stringify({ url: world, name, reason: true, wait: true, ticket: this.#store.ticketFor(world) }),
+    );
   }
 
   /** Gives up the place in the line. */

@@ -23,6 +23,8 @@ export const words = {
     'to-session-server': 'con el servidor de sesiones…',
     url: 'URL de un mundo',
     'url-help': 'La página de un archivo .wbt en su forja: bajo /blob/ o /tree/, en una carpeta worlds.',
+    name: 'Tu nombre',
+    'name-help': 'El administrador lo ve.',
     'shown-by': 'Mostrado por',
     automatic: 'el visor adecuado',
     webots: 'el visor de Webots',
@@ -43,7 +45,7 @@ export const words = {
     launch: 'Arranque',
     'about-launch': 'del simulador',
     'about-simulation': 'funciona para ti hasta que salgas',
-    watched: 'Tu profesor está mirando.',
+    watched: 'El administrador está mirando.',
     'about-tabs':
       'Cada pestaña tiene su propia simulación: dos pestañas son dos simulaciones. Una página que se recarga, o cuya conexión se corta, vuelve a encontrar su simulación; eso termina con «Desconectar», o algún tiempo después de cerrar la pestaña.',
     'simulation-server': 'Servidor de simulación',
@@ -195,7 +197,7 @@ export const words = {
     finished: 'Webots ha terminado.',
     'time-limit': 'El tiempo de la simulación se ha agotado.',
     idle: 'La simulación estuvo en pausa demasiado tiempo.',
-    'stopped-by-administrator': 'Tu profesor ha detenido la simulación.',
+    'stopped-by-administrator': 'El administrador ha detenido la simulación.',
     'server-stopped': 'El servidor se ha detenido.',
     crashed: 'Webots ha fallado.',
     hung: 'Webots dejó de responder.',
@@ -224,7 +226,7 @@ export const words = {
     project: 'Se debe al mundo o a su proyecto. Cámbialo, o conéctate de nuevo.',
     takenOver:
       'Otra pestaña u otra ventana la muestra ahora. Conéctate aquí para tener una simulación propia de esta pestaña.',
-    teacher: 'Pregunta a tu profesor antes de conectarte de nuevo.',
+    teacher: 'Pregunta al administrador antes de conectarte de nuevo.',
     firewall:
       'Puede que un cortafuegos lo impida: los puertos por encima del puerto del servidor de simulación tienen que estar abiertos o redirigidos.',
   },

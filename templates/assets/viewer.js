@@ -7,6 +7,13 @@ import { wordsOfPage } from './language.js';
 /** @typedef {import('./embed.js').StateDetail} StateDetail */
 
 const search = new URLSearchParams(location.search);
+/** Where the browser keeps the visitor's name. */
+const NAME = 'webots-fleet name';
+/** Only visitors whom nobody else names have it. */
+const nameField = document.getElementById('name');
+if (nameField instanceof HTMLInputElement) {
+  nameField.value = search.get('name') ?? keptName();
+}
 const words = await wordsOfPage(search.get('lang'));
 const place = find('place', HTMLElement);
 const simulation = new WebotsSimulation();
@@ -14,9 +21,9 @@ simulation.id = 'simulation';
 simulation.lang = words.language;
 simulation.world = search.get('url') ?? '';
 for (const [name, value] of [
-  ['name', search.get('name')],
+  ['name', nameField instanceof HTMLInputElement ? nameField.value : search.get('name')],
   ['viewer-script', place.dataset.script],
-  ['autostart', search.get('start') === '1' ? '' : null],
+  ['autostart', search.get('start') === '1' && !lacksName() ? '' : null],
   ['autoplay', search.get('play') === '1' ? '' : null],
 ]) {
   if (name && value !== null && value !== undefined) {
@@ -60,6 +67,10 @@ if (form instanceof HTMLFormElement) {
   form.addEventListener('submit', (event) => {
     event.preventDefault();
     const world = address.value.trim();
+    if (nameField instanceof HTMLInputElement) {
+      keepName(nameField.value.trim());
+      simulation.setAttribute('name', nameField.value.trim());
+    }
     // A link that starts the same world.
     search.set('url', world);
     history.replaceState(null, '', `?${search}`);
@@ -103,6 +114,29 @@ function drawLinks(opensTabs) {
       anchor.rel = opensTabs ? 'noopener' : '';
     }
   }
+}
+
+/** The name that this browser was given last; a browser may refuse to keep anything. */
+function keptName() {
+  try {
+    return localStorage.getItem(NAME) ?? '';
+  } catch {
+    return '';
+  }
+}
+
+/** @param {string} name */
+function keepName(name) {
+  try {
+    localStorage.setItem(NAME, name);
+  } catch {
+    // It is asked for again.
+  }
+}
+
+/** Whether a name is necessary, and not given. */
+function lacksName() {
+  return nameField instanceof HTMLInputElement && nameField.required && nameField.value.trim() === '';
 }
 
 place.replaceChildren(simulation);

@@ -106,7 +106,7 @@ export class VisitRunner {
     const { words, stage } = this.#panel;
     switch (effect.do) {
       case 'ask':
-        return this.#sessionServer.ask(effect.id, effect.world);
+        return this.#sessionServer.ask(effect.id, effect.world, this.#choices().name);
       case 'connect':
         return this.#open(effect);
       case 'send':

@@ -127,7 +127,7 @@ class AClass(BrowserTest):
             row.get_by_role("link", name="Watch").click()
         watching = opened.value
         expect(watching.locator("#state")).to_have_text("Watching")
-        expect(student.tab.locator("#watched")).to_have_text("Your teacher is watching.")
+        expect(student.tab.locator("#watched")).to_have_text("The administrator is watching.")
         before = watching.locator("#clock").inner_text()
         until("the teacher sees time pass", lambda: watching.locator("#clock").inner_text() != before)
         watching.close()
@@ -187,7 +187,7 @@ class AClass(BrowserTest):
         dialog.get_by_role("button", name="Stop it").click()
         expect(dialog).to_be_hidden()
         expect(student.tab.locator("#problem")).to_contain_text(
-            "Your teacher has stopped this simulation: Please come to my desk"
+            "The administrator has stopped this simulation: Please come to my desk"
         )
         expect(machine.tab.locator("#ends tr").first).to_contain_text("anna@school.example")
 

@@ -65,7 +65,7 @@ class Languages(BrowserTest):
         expect(watching.tab.locator("h1")).to_have_text("シミュレーションの見学")
         expect(watching.tab.locator("#mode")).to_have_text("実時間")
         self.assertEqual(watching.faults(), [])
-        expect(tab.locator("#watched")).to_have_text("Deine Lehrkraft sieht zu.")
+        expect(tab.locator("#watched")).to_have_text("Die Administration sieht zu.")
         tab.get_by_role("button", name="Trennen", exact=True).click()
         expect(tab.locator("#stage")).to_have_text("Du hast die Simulation verlassen; sie ist beendet.")
         until("the simulation is gone", lambda: not servers[0].status()["simulations"])

@@ -1,11 +1,9 @@
 """The page of the class at the session server: everybody of all servers, behind one sign-in."""
 
-import re
 import unittest
 
-from browser import Page
 from case import BrowserTest
-from fleet import WORLD, until
+from fleet import WORLD
 from playwright.sync_api import expect
 from students import start_all
 

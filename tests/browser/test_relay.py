@@ -33,7 +33,7 @@ class Relayed(BrowserTest):
         sent = self.sent_over_streams(teacher)
         teacher.tab.goto(server.url(address))
         expect(teacher.tab.locator("#state")).to_have_text("Watching")
-        expect(student.tab.locator("#watched")).to_have_text("Your teacher is watching.")
+        expect(student.tab.locator("#watched")).to_have_text("The administrator is watching.")
         expect(teacher.tab.get_by_role("button", name="Home view")).to_be_visible()
         for name in ["Play", "Pause", "Step", "Reset"]:
             expect(teacher.tab.get_by_role("button", name=name, exact=True)).to_be_hidden()

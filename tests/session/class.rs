@@ -15,7 +15,7 @@ use crate::support::{Client, SOON, arm, until};
 const KEY: &str = "a key for a whole fleet";
 const READER: &str = "fedcba9876543210fedcba9876543210";
 const TOKEN: &str = "0123456789abcdef0123456789abcdef";
-const TOLD: &str = "loading: Error: Your teacher has stopped this simulation";
+const TOLD: &str = "loading: Error: The administrator has stopped this simulation";
 
 /// Simulation servers with the key of the fleet, and no password.
 fn keyed(places: u16) -> Builder {
@@ -352,4 +352,54 @@ async fn an_administrator_signs_in_once_for_the_whole_fleet() {
     assert!(status == 303 && to.unwrap().contains("to=monitor"));
     let evil = session.url("/visit?server=evil.example");
     assert_eq!(get(evil, &[("Authorization", &token)]).await.0, 404);
+}
+
+#[actix_rt::test]
+async fn a_lesson_is_one_list_of_all_servers() {
+    let servers = [keyed(2).start().await, keyed(2).start().await];
+    let python = StandIn::start(Manner::Load("3.0".to_owned()));
+    let [first, second] = servers.each_ref().map(Server::address);
+    let session = fleet(&[first.clone(), second.clone(), python.address()]).await;
+    let mut ids = Vec::new();
+    for (server, name) in [(&servers[0], "Anna"), (&servers[1], "=1+1"), (&servers[0], "Ben")] {
+        let client = start(server, name).await;
+        ids.push(client.id().to_owned());
+        client.leave().await;
+    }
+    let mut text = String::new();
+    until("all have ended", async || {
+        let answer = get_as_administrator(&session.url("/simulations.csv")).await;
+        assert_eq!(answer.header("webots-missing"), Some(python.address().as_str()));
+        text = answer.text();
+        text.lines().count() == 4
+    })
+    .await;
+    let lines: Vec<&str> = text.lines().collect();
+    assert!(
+        lines[0].ends_with(",waited (s),duration (s),real time (%),server"),
+        "{text}"
+    );
+    for ((line, id), (server, name)) in
+        lines[1..]
+            .iter()
+            .zip(&ids)
+            .zip([(&first, "Anna"), (&second, "'=1+1"), (&first, "Ben")])
+    {
+        assert!(
+            line.starts_with(id.as_str()) && line.ends_with(&format!(",{server}")),
+            "{text}"
+        );
+        assert!(line.contains(&format!("\"{name}\"")), "{line}");
+        let duration = line.rsplit(',').nth(2).unwrap();
+        assert!(duration.parse::<u64>().is_ok(), "{line}");
+    }
+    let past = get_as_administrator(&session.url("/simulations.csv?from=0&to=1000")).await;
+    assert_eq!(past.text().lines().count(), 1, "{}", past.text());
+    // Of one server, for session servers only while it has no password.
+    let own = servers[0].url("/simulations.csv");
+    assert_eq!(get_as_administrator(&own).await.status, 403);
+    assert_eq!(
+        crate::support::http::get(&session.url("/simulations.csv")).await.status,
+        401
+    );
 }

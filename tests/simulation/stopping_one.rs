@@ -9,7 +9,7 @@ use super::scene::{ALL, Scene, nothing_left};
 use crate::support::http::{self, PASSWORD, post};
 use crate::support::{Builder, Client, SOON, Server, demo_server};
 
-const TOLD: &str = "loading: Error: Your teacher has stopped this simulation";
+const TOLD: &str = "loading: Error: The administrator has stopped this simulation";
 
 fn with_password(builder: Builder) -> Builder {
     builder.set("adminPassword", PASSWORD)
@@ -216,7 +216,7 @@ async fn a_client_that_is_away_hears_of_the_stop_when_it_comes_back() {
     assert_eq!(stop(&server, &id, r#"{"reason": "That is enough"}"#).await, 202);
     nothing_left(&server, 1).await;
     let mut back = Client::resuming(&server, &token).await;
-    let told = "this simulation has ended: Your teacher has stopped this simulation: That is enough";
+    let told = "this simulation has ended: The administrator has stopped this simulation: That is enough";
     assert_eq!(back.until("").await, format!("loading: Error: {told}"));
     assert_eq!(back.closed().await, Some(1000));
 }

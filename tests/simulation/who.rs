@@ -144,9 +144,9 @@ async fn a_user_is_believed_from_a_trusted_web_server_only() {
 }
 
 #[actix_rt::test]
-async fn strangers_get_no_paths_process_ids_or_name_of_the_machine() {
+async fn strangers_get_no_paths_process_ids_names_of_users_or_of_the_machine() {
     let server = with_users(1).start().await;
-    let mut client = start(&server, &[], None).await;
+    let mut client = start(&server, &[("x-forwarded-user", "anna")], Some("Anna")).await;
     client.until("webots:").await;
     let strangers: Value = serde_json::from_str(&http::get(&server.url("/status")).await.text()).unwrap();
     let answer = get_with_password(&server.url("/status"), PASSWORD).await;
@@ -155,6 +155,11 @@ async fn strangers_get_no_paths_process_ids_or_name_of_the_machine() {
         let simulation = &status["simulations"][0];
         assert_eq!(simulation["pid"].is_i64(), is_shown, "{simulation}");
         assert_eq!(simulation["log"].is_string(), is_shown, "{simulation}");
+        assert_eq!(
+            (simulation["user"] == "anna", simulation["label"] == "Anna"),
+            (is_shown, is_shown),
+            "{simulation}"
+        );
         assert_ne!(status["host"]["name"] == "", is_shown, "{}", status["host"]);
     }
 }

@@ -6,5 +6,5 @@ mod session_config;
 mod timing;
 
 pub use server_entry::ServerEntry;
-pub use session_config::{Example, SessionConfig};
+pub use session_config::{AskName, Example, SessionConfig};
 pub use timing::Timing;

@@ -74,6 +74,8 @@ pub struct SessionConfig {
     /// The header in which a reverse proxy of `trustedProxies` sends the user's name, such as `X-Forwarded-User`: a user
     /// has one place in the line. Default: none.
     pub user_header: Option<String> = None,
+    /// Whether the page `/viewer` starts simulations only of visitors who give a name. Default: `optional`.
+    pub ask_name: AskName = AskName::Optional,
     /// Folder of `session/output.log`. Default: `log`.
     pub log_dir: ExpandedPath = ExpandedPath("log".into()),
     /// Log to standard output. Default: false.
@@ -107,6 +109,16 @@ pub struct SessionConfig {
     /// All other durations.
     pub timing: Timing = Timing::default(),
 }
+}
+
+/// The key `askName`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum AskName {
+    /// A visitor may give a name.
+    Optional,
+    /// A visitor must give a name, unless a web server with sign-in names the user.
+    Required,
 }
 
 /// An example on the page `/viewer`.

@@ -12,7 +12,8 @@ mod slot_link;
 mod state_history;
 
 pub use line_keeper::{LineEvent, StopWaiting, Wait};
-pub use registry::{GetStatus, GetWaiting, Pick, Reconfigure, Registry};
+pub use registry::{GetMonitors, GetStatus, GetWaiting, Pick, Reconfigure, Registry};
+pub use server_monitor::GetRecords;
 pub use server_record::{
     Answer, FleetStatus, Intake, NameStatus, ServerRecord, ServerState, ServerStatus, StateChange, StateName,
 };

@@ -13,7 +13,7 @@ use tokio::sync::watch;
 
 use super::line_keeper::{LineKeeper, StopWaiting, Wait};
 use super::name_table::look_up_all;
-use super::server_monitor::{Parent, ProbeResult};
+use super::server_monitor::{GetRecords, Parent, ProbeResult};
 use super::server_record::{Answer, FleetStatus, Intake, ServerRecord, ServerState, ServerStatus};
 use super::server_table::{ServerTable, admission};
 use super::slot_link::LinkEvent;
@@ -43,6 +43,11 @@ pub struct GetStatus;
 #[derive(Message)]
 #[rtype(result = "Vec<ClassEntry>")]
 pub struct GetWaiting;
+
+/// Requests the monitors of all servers, for requests of records.
+#[derive(Message)]
+#[rtype(result = "Vec<(PublicAddress, Recipient<GetRecords>)>")]
+pub struct GetMonitors;
 
 /// Replaces the configuration: the servers, the placement policy, and how servers are probed. What was learned stays.
 #[derive(Message)]
@@ -290,6 +295,14 @@ impl Handler<GetStatus> for Registry {
             changes: self.changes.recent.clone(),
             line: self.line.status(),
         }))
+    }
+}
+
+impl Handler<GetMonitors> for Registry {
+    type Result = MessageResult<GetMonitors>;
+
+    fn handle(&mut self, _: GetMonitors, _: &mut Self::Context) -> Self::Result {
+        MessageResult(self.servers.monitors())
     }
 }
 

@@ -45,6 +45,10 @@ pub struct ProbeResult {
     pub answer: Result<ServerReport, Failure>,
 }
 
+/// Size limit of the records of a server, in bytes.
+const MAX_RECORDS: usize = 64 * 1024 * 1024;
+/// Timeout of these.
+const RECORDS: Duration = Duration::from_secs(30);
 /// Size limit of an answer, in bytes.
 const MAX_ANSWER_SIZE: usize = 1024 * 1024;
 /// The highest plausible load, in percent.
@@ -99,6 +103,16 @@ pub struct Parent {
     pub links: Recipient<LinkEvent>,
     /// Learns which simulations the server has.
     pub roster: Arc<Roster>,
+}
+
+/// Requests the records of ended simulations of a span of time.
+#[derive(Message, Clone)]
+#[rtype(result = "Result<Bytes, Failure>")]
+pub struct GetRecords {
+    /// The query of the request.
+    pub query: String,
+    /// Lets an administrator in.
+    pub token: String,
 }
 
 /// Ends the monitor.
@@ -229,6 +243,28 @@ impl Handler<Ask> for ServerMonitor {
             // The link ends with this monitor.
             sender.send(wishes).ok();
         }
+    }
+}
+
+impl Handler<GetRecords> for ServerMonitor {
+    type Result = ResponseFuture<Result<Bytes, Failure>>;
+
+    fn handle(&mut self, GetRecords { query, token }: GetRecords, _: &mut Self::Context) -> Self::Result {
+        let target = Rc::clone(&self.target);
+        Box::pin(async move {
+            let url = format!("{}/simulations.csv?{query}", target.url);
+            let fetching = async {
+                let request = target.client.get(url).bearer_auth(token);
+                let answer = request.send().await.map_err(no_answer)?;
+                if !answer.status().is_success() {
+                    return Err(bad_answer(format!("status {}", answer.status())));
+                }
+                let body = answer.timeout(NEVER).body().limit(MAX_RECORDS);
+                body.await.map_err(bad_answer)
+            };
+            let late = |_| Err(Failure::new(Reason::NoAnswer, "it did not send its records in time"));
+            timeout(RECORDS, fetching).await.unwrap_or_else(late)
+        })
     }
 }
 

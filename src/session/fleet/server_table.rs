@@ -9,7 +9,7 @@ use rustls::ClientConfig;
 
 use super::name_table::NameTable;
 use super::refusal::refusal;
-use super::server_monitor::{Ask, Parent, ServerMonitor, Stop};
+use super::server_monitor::{Ask, GetRecords, Parent, ServerMonitor, Stop};
 use super::server_record::ServerRecord;
 use super::slot_link::{LinkChange, LinkEvent};
 use crate::session::config::SessionConfig;
@@ -129,6 +129,14 @@ impl ServerTable {
         if let Some(monitor) = self.monitors.get(server) {
             monitor.do_send(Ask(wishes));
         }
+    }
+
+    /// The monitors of all servers, for requests of records.
+    pub fn monitors(&self) -> Vec<(PublicAddress, Recipient<GetRecords>)> {
+        let monitors = self.monitors.iter();
+        monitors
+            .map(|(server, monitor)| (server.clone(), monitor.clone().recipient()))
+            .collect()
     }
 
     /// The addresses of all servers, in the order of the configuration.

@@ -5,23 +5,26 @@ use std::convert::Infallible;
 use std::io::Write;
 use std::time::Duration;
 
+use actix::Recipient;
 use actix_rt::time::sleep;
-use actix_web::error::{ErrorBadRequest, ErrorNotFound};
+use actix_web::error::{ErrorBadRequest, ErrorNotFound, ErrorServiceUnavailable};
 use actix_web::http::header;
 use actix_web::web::Bytes;
 use actix_web::{HttpRequest, HttpResponse, Result, web};
 use askama::Template;
 use flate2::Compression;
 use flate2::write::GzEncoder;
+use futures_util::future::join_all;
 use futures_util::stream::{self, StreamExt};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 
 use crate::session::class::{Changes, ClassEntry, Key, Matching, Watching};
-use crate::session::fleet::{FleetStatus, ServerStatus, StateName};
+use crate::session::fleet::{FleetStatus, GetMonitors, GetRecords, ServerStatus, StateName};
 use crate::session::state::AppState;
 use crate::shared::domain::PublicAddress;
 use crate::shared::http::routing::{GET, POST, READ, json_body, path};
+use crate::shared::http::time_span::{TimeSpan, csv_file};
 use crate::shared::http::{ConnectionKind, ConnectionPermit, OWN_FILES, html, sign_in};
 use crate::shared::run::closing;
 use crate::shared::text::one_line;
@@ -49,6 +52,7 @@ pub fn configure(app: &mut web::ServiceConfig) {
         .service(path("/class/events", GET, events))
         .service(path("/visit", GET, visit))
         .service(path("/simulations", READ, simulations))
+        .service(path("/simulations.csv", GET, records))
         .service(path("/simulations/stop", POST, stop_many))
         .service(path("/simulations/{id}/stop", POST, stop));
 }
@@ -65,6 +69,54 @@ async fn simulations(request: HttpRequest, server: web::Data<AppState>) -> Resul
     server.admin_auth.reader(&request)?;
     server.look_at_line().await;
     Ok(HttpResponse::Ok().json(server.roster.all()))
+}
+
+/// The records of a span of time, of all servers, in the order of their beginnings.
+async fn records(
+    request: HttpRequest,
+    span: web::Query<TimeSpan>,
+    server: web::Data<AppState>,
+) -> Result<HttpResponse> {
+    server.admin_auth.reader(&request)?;
+    let monitors = server.registry.send(GetMonitors).await;
+    let monitors = monitors.map_err(|_| ErrorServiceUnavailable("Error: the server stops."))?;
+    let order = GetRecords {
+        query: span.query(),
+        token: sign_in::entry_token(&server.admin_auth, &request),
+    };
+    let fetch = |(address, monitor): (PublicAddress, Recipient<GetRecords>)| {
+        let answer = monitor.send(order.clone());
+        async { (address, answer.await) }
+    };
+    let (mut lines, mut missing) = (Vec::new(), Vec::new());
+    let mut heading = String::new();
+    for (address, answer) in join_all(monitors.into_iter().map(fetch)).await {
+        let text = answer.ok().and_then(std::result::Result::ok);
+        let Some((first, rest)) = text
+            .as_deref()
+            .and_then(|text| std::str::from_utf8(text).ok()?.split_once('\n'))
+        else {
+            log::warn!("{address}: has not sent its records");
+            missing.push(address.to_string());
+            continue;
+        };
+        heading = format!("{first},server\n");
+        lines.extend(rest.lines().map(|line| format!("{line},{address}\n")));
+    }
+    lines.sort_by(|one, other| begin_of(one).cmp(begin_of(other)));
+    let mut response = csv_file(&heading, &lines);
+    if !missing.is_empty()
+        && let Ok(missing) = header::HeaderValue::try_from(missing.join(", "))
+    {
+        let name = header::HeaderName::from_static("webots-missing");
+        response.headers_mut().insert(name, missing);
+    }
+    Ok(response)
+}
+
+/// The second column.
+fn begin_of(line: &str) -> &str {
+    line.split(',').nth(1).unwrap_or_default()
 }
 
 /// The body of a request to stop simulations.

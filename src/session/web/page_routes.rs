@@ -8,6 +8,7 @@ use askama::Template;
 
 use super::pages::{self, Monitor, Viewer, WebotsViewer};
 use crate::asset;
+use crate::session::config::AskName;
 use crate::session::fleet::FleetStatus;
 use crate::session::state::AppState;
 use crate::shared::http::assets::{self, Asset};
@@ -83,11 +84,18 @@ fn view(server: &AppState, status: &FleetStatus) -> askama::Result<PageView> {
     )
 }
 
-async fn viewer(server: web::Data<AppState>) -> HttpResponse {
+async fn viewer(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
+    let config = &server.config;
+    let user = config
+        .user_header
+        .as_ref()
+        .and_then(|header| config.trusted_proxies.trusted_header(&request, header));
     let script = server.config.viewer_script.as_ref().map(url::Url::as_str);
     html(
         Viewer {
             examples: &server.config.examples,
+            asks_name: user.is_none(),
+            needs_name: config.ask_name == AskName::Required,
             script,
         }
         .render(),

@@ -66,6 +66,10 @@ struct Changes<'status> {
 pub struct Viewer<'config> {
     /// Worlds that the page offers.
     pub examples: &'config [Example],
+    /// Whether it asks for the visitor's name: nobody else tells it.
+    pub asks_name: bool,
+    /// Whether the visitor must give one.
+    pub needs_name: bool,
     /// URL of Webots' own viewer, if `viewerScript` is set.
     pub script: Option<&'config str>,
 }

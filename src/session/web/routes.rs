@@ -15,7 +15,7 @@ use super::web_client::WebClient;
 use super::{class_routes, metrics, page_routes};
 use crate::session::state::AppState;
 use crate::shared::http::routing::{self, GET, POST, READ, json_body, path, retry_after};
-use crate::shared::http::{CONTENT_TYPE, ConnectionKind, sign_in, websocket};
+use crate::shared::http::{CONTENT_TYPE, ConnectionKind, openapi, sign_in, websocket};
 use crate::shared::text::one_line;
 
 /// The body of `POST /announcement`.
@@ -46,6 +46,7 @@ fn add(app: &mut web::ServiceConfig) {
         .configure(page_routes::configure)
         .configure(sign_in::configure)
         .configure(class_routes::configure)
+        .configure(openapi::configure)
         .service(path("/status", READ, status_json))
         .service(path("/metrics", READ, metrics_text))
         .service(path("/health", READ, health))

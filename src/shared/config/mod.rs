@@ -13,5 +13,5 @@ pub use loading::{Configuration, LoadedConfig, load, require};
 pub use secret::Secret;
 pub use value::{
     ExpandedPath, expand, expanded, is_web_url, minutes, one_or_many, optional_whole, percent, seconds,
-    seconds_or_zero, whole,
+    seconds_or_zero, sentence, whole,
 };

@@ -93,6 +93,21 @@ where
     value.map(whole::<MIN, MAX, _, _>).transpose().map_err(D::Error::custom)
 }
 
+/// Reads a text of one line, from 1 to 200 characters.
+///
+/// # Errors
+/// When the value is something else.
+pub fn sentence<'de, D: Deserializer<'de>>(deserializer: D) -> Result<String, D::Error> {
+    let text = String::deserialize(deserializer)?;
+    let is_line = (1..=200).contains(&text.trim().chars().count()) && !text.chars().any(char::is_control);
+    is_line.then(|| text.trim().to_owned()).ok_or_else(|| {
+        not_allowed(
+            &Value::String(text),
+            format_args!("a text of one line, of 1 to 200 letters"),
+        )
+    })
+}
+
 /// Reads a percentage from 0 to `MAX`.
 ///
 /// # Errors

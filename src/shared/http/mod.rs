@@ -9,12 +9,14 @@ mod limits;
 mod live_updates;
 pub mod liveness;
 mod metrics;
+pub mod openapi;
 mod origin;
 mod page;
 mod peer;
 pub mod routing;
 pub mod server;
 pub mod sign_in;
+pub mod time_span;
 pub mod tls;
 pub mod websocket;
 

@@ -55,17 +55,22 @@ pub fn refuse(error: AuthError, request: &HttpRequest, to: &str) -> HttpResponse
 /// The query of a URL that leads the browser of an administrator to a page of another server of the fleet, without
 /// signing in there.
 pub fn entry(auth: &AdminAuth, request: &HttpRequest, to: &str) -> String {
+    let entry = entry_token(auth, request);
+    form_urlencoded::Serializer::new(String::new())
+        .append_pair("entry", &entry)
+        .append_pair("to", to)
+        .finish()
+}
+
+/// What lets an administrator in at another server of the fleet: in a URL, or to read something as a token.
+pub fn entry_token(auth: &AdminAuth, request: &HttpRequest) -> String {
     let name = auth.reader(request).map(|one| one.name).unwrap_or_default();
     let entry = SignIn {
         name,
         browser: rand::random(),
         until: seconds_since_1970() + ENTRY,
     };
-    let entry = entry.write(&auth.settings.key, Use::Entry);
-    form_urlencoded::Serializer::new(String::new())
-        .append_pair("entry", &entry)
-        .append_pair("to", to)
-        .finish()
+    entry.write(&auth.settings.key, Use::Entry)
 }
 
 async fn sign_in(request: HttpRequest, payload: web::Payload, auth: web::Data<AdminAuth>) -> HttpResponse {

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, HashSet};
 use std::time::{Duration, Instant};
 
 use crate::shared::domain::{RosterUpdate, SimulationReport};
-use crate::simulation::machine::{Usage, Usages};
+use crate::simulation::machine::Usages;
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::snapshot::Simulation;
 
@@ -15,6 +15,8 @@ pub(super) struct RosterFeed {
     pub(super) has_figures: bool,
     /// The last figures.
     pub(super) usages: Usages,
+    /// How fast simulations ran at the last measurement, in percent.
+    factors: BTreeMap<SimulationId, u32>,
     /// When the last measurement began.
     measured: Option<Instant>,
     /// The simulations as they were told; `None` before the first update.
@@ -41,6 +43,10 @@ impl RosterFeed {
 
     /// What has changed.
     pub(super) fn updates(&mut self, simulations: &[Simulation]) -> Vec<RosterUpdate> {
+        if self.is_due() {
+            let factor = |one: &Simulation| Some((one.id, in_steps(100.0 * one.time.recent()?)));
+            self.factors = simulations.iter().filter_map(factor).collect();
+        }
         let is_first = self.told.is_none();
         let mut told = self.told.take().unwrap_or_default();
         let there: HashSet<SimulationId> = simulations.iter().map(|one| one.id).collect();
@@ -49,8 +55,9 @@ impl RosterFeed {
         told.retain(|id, _| there.contains(id));
         let mut changed = Vec::new();
         for simulation in simulations {
-            let usage = simulation.pid.and_then(|pid| self.usages.get(&pid));
-            let report = report(simulation, usage.filter(|_| self.has_figures));
+            let usage = simulation.pid.and_then(|pid| self.usages.get(&pid)?.cpu).map(in_steps);
+            let figures = (usage, self.factors.get(&simulation.id).copied());
+            let report = report(simulation, if self.has_figures { figures } else { (None, None) });
             if told.get(&simulation.id) != Some(&report) {
                 told.insert(simulation.id, report.clone());
                 changed.push(report);
@@ -74,7 +81,8 @@ impl RosterFeed {
     }
 }
 
-fn report(simulation: &Simulation, usage: Option<&Usage>) -> SimulationReport {
+/// `figures`: the percentages of a core and of real time.
+fn report(simulation: &Simulation, (cpu, real_time): (Option<u32>, Option<u32>)) -> SimulationReport {
     SimulationReport {
         id: simulation.id.to_string(),
         world: simulation.world.clone(),
@@ -84,8 +92,8 @@ fn report(simulation: &Simulation, usage: Option<&Usage>) -> SimulationReport {
         since: simulation.since,
         waited: simulation.waited.map(|seconds| (seconds * 10.0).round() / 10.0),
         away_until: simulation.away_until,
-        cpu: usage.and_then(|usage| usage.cpu).map(in_steps),
-        real_time: None,
+        cpu,
+        real_time,
     }
 }
 

@@ -16,7 +16,7 @@ use super::urls::Streaming;
 use crate::shared::config::keys::keys;
 use crate::shared::config::{
     ApiToken, Configuration, ExpandedPath, Secret, check_api_tokens, check_fleet_key, expanded, minutes, one_or_many,
-    optional_whole, percent, require, seconds, whole,
+    optional_whole, percent, require, seconds, sentence, whole,
 };
 use crate::shared::domain::{PublicUrl, ReadyEntry, UrlPrefix, complete_host};
 use crate::shared::http::{Origin, TrustedProxies};
@@ -120,6 +120,9 @@ pub struct SimulationConfig {
     pub idle_timeout: f64 = 0.0,
     /// Write `simulation/monitor.csv`. Default: true.
     pub monitor_log_enabled: bool = true,
+    /// Months for which the lines of `simulations.csv` are kept after the month in which the simulation ended. Default: 12.
+    #[serde(deserialize_with = "whole::<1, 120, _, _>")]
+    pub record_months: u32 = 12,
     /// Whether a world's URL may name any commit by its hash, not only one that is in a branch or tag. Git hosts also
     /// serve commits of forks and pull requests, which the repository's owner never accepted. Default: false.
     pub any_commit: bool = false,
@@ -168,6 +171,10 @@ pub struct SimulationConfig {
     pub allowed_origins: Vec<Origin> = Vec::new(),
     /// Password for actions such as `/drain`. Default: none, and actions are off.
     pub admin_password: Option<Secret> = None,
+    /// What the client of a simulation is told that an administrator stops, before the reason. Default: `The administrator
+    /// has stopped this simulation`.
+    #[serde(deserialize_with = "sentence")]
+    pub stop_text: String = "The administrator has stopped this simulation".to_owned(),
     /// Tokens of programs, each with what it may do. Default: none.
     #[serde(deserialize_with = "one_or_many")]
     pub api_tokens: Vec<ApiToken> = Vec::new(),

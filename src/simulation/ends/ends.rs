@@ -38,11 +38,12 @@ const BETWEEN_LOOKS: Duration = Duration::from_hours(1);
 const FLUSH: Duration = Duration::from_secs(1);
 
 impl Ends {
-    /// Starts the thread. `logs` is the directory of the server's log, `level` the isolation level of simulations.
+    /// Starts the thread. `logs` is the directory of the server's log, `level` the isolation level of
+    /// simulations; the lines of ended simulations are kept for `months`.
     ///
     /// # Errors
     /// When a thread can't be started, or a counter `webots_simulation_ends_total` exists.
-    pub fn start(logs: PathBuf, level: String, metrics: &Metrics) -> std::io::Result<Self> {
+    pub fn start(logs: PathBuf, level: String, months: u32, metrics: &Metrics) -> std::io::Result<Self> {
         let counter = metrics
             .counter("webots_simulation_ends_total", "Simulations that have ended", "reason")
             .map_err(std::io::Error::other)?;
@@ -52,7 +53,7 @@ impl Ends {
         let (writer, jobs) = channel();
         std::thread::Builder::new()
             .name("ends".to_owned())
-            .spawn(move || write_all(&logs, &level, &jobs))?;
+            .spawn(move || write_all(&logs, &level, months, &jobs))?;
         Ok(Self {
             counter,
             latest: Arc::default(),
@@ -92,10 +93,11 @@ impl Ends {
     }
 }
 
-fn write_all(logs: &Path, level: &str, jobs: &Receiver<Job>) {
+fn write_all(logs: &Path, level: &str, months: u32, jobs: &Receiver<Job>) {
     loop {
         // Once per batch of jobs.
         kept_output::prune(logs);
+        csv::prune(logs, months);
         let first = match jobs.recv_timeout(BETWEEN_LOOKS) {
             Ok(job) => job,
             Err(RecvTimeoutError::Timeout) => continue,
@@ -113,7 +115,7 @@ fn write_all(logs: &Path, level: &str, jobs: &Receiver<Job>) {
 
 fn write(logs: &Path, level: &str, ended: &Ended) {
     if ended.client.is_some()
-        && let Err(error) = csv::append(&logs.join("simulations.csv"), level, ended)
+        && let Err(error) = csv::append(logs, level, ended)
     {
         log::warn!("{}: its end is not in simulations.csv: {error}", ended.simulation.id);
     }

@@ -1,6 +1,6 @@
 //! How simulations have ended: counted, in `simulations.csv`, on the monitor, and with their output in files.
 
-mod csv;
+pub mod csv;
 mod ended;
 mod ends;
 mod kept_output;

@@ -220,7 +220,7 @@ mod tests {
     use crate::simulation::ends::Ends;
 
     fn monitor(spread: Spread) -> (LoadMonitor, watch::Receiver<Arc<Readings>>) {
-        let ends = Ends::start(PathBuf::from("/nonexistent"), String::new(), &Metrics::default()).unwrap();
+        let ends = Ends::start(PathBuf::from("/nonexistent"), String::new(), 12, &Metrics::default()).unwrap();
         let slots = SlotPool::new(2001..=2001, 1, None, None, Duration::from_secs(10), ends);
         LoadMonitor::new(slots, Path::new("/"), None, Arc::new(spread)).unwrap()
     }

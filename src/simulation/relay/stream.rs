@@ -1,5 +1,5 @@
 //! One stream between a client and its Webots. The bytes are copied as they are: frames, their kinds and close codes are not
-//! parsed, except for the last frame of a simulation that the server ends. Each direction is read only as fast as the
+//! parsed, except for the last frame of a simulation that the server ends; once a second the time of an update is looked for. Each direction is read only as fast as the
 //! other end takes it.
 
 use std::io::{self, ErrorKind, Read, Write};
@@ -9,6 +9,7 @@ use std::sync::{Arc, OnceLock};
 use actix_web::web::Bytes;
 
 use super::last_frame::LastFrame;
+use crate::simulation::simulated_time::SimulatedTime;
 
 /// A stream.
 pub struct Stream {
@@ -18,6 +19,8 @@ pub struct Stream {
     pub down: Direction,
     /// Why the server ends the simulation, once it does.
     ending: Arc<OnceLock<String>>,
+    /// How fast the simulation runs, as what it sends tells.
+    time: SimulatedTime,
     /// Dropped with the stream.
     _held: Box<dyn Send>,
 }
@@ -46,12 +49,19 @@ pub enum Source {
 }
 
 impl Stream {
-    /// A stream with these directions. `ending` tells why the server ends the simulation; `held` is dropped with the stream.
-    pub fn new(up: Direction, down: Direction, ending: Arc<OnceLock<String>>, held: Box<dyn Send>) -> Self {
+    /// A stream with these directions, of a simulation with this time. `ending` tells why the server ends the simulation;
+    /// `held` is dropped with the stream.
+    pub fn new(
+        up: Direction,
+        down: Direction,
+        (ending, time): (Arc<OnceLock<String>>, SimulatedTime),
+        held: Box<dyn Send>,
+    ) -> Self {
         Self {
             up,
             down,
             ending,
+            time,
             _held: held,
         }
     }
@@ -60,8 +70,9 @@ impl Stream {
     /// had their turn.
     pub fn copy(&mut self, buffer: &mut [u8]) -> bool {
         let ending = self.ending.get().map(String::as_str);
-        let down = self.down.copy(&self.up.from, ending, buffer);
-        let up = self.up.copy(&self.down.from, None, buffer);
+        let (down, length) = self.down.copy(&self.up.from, ending, buffer);
+        self.time.read(buffer.get(..length).unwrap_or_default());
+        let (up, _) = self.up.copy(&self.down.from, None, buffer);
         up || down
     }
 
@@ -90,34 +101,35 @@ impl Direction {
         has_closed
     }
 
-    fn copy(&mut self, to: &TcpStream, ending: Option<&str>, buffer: &mut [u8]) -> bool {
+    /// Returns whether more can be copied, and the number of bytes that were read into the buffer.
+    fn copy(&mut self, to: &TcpStream, ending: Option<&str>, buffer: &mut [u8]) -> (bool, usize) {
         if self.has_ended {
-            return false;
+            return (false, 0);
         }
         self.try_copy(to, ending, buffer).unwrap_or_else(|_| {
             self.has_ended = true;
             // That end then closes, and the other direction ends, too. An error: it has closed already.
             to.shutdown(Shutdown::Write).ok();
-            false
+            (false, 0)
         })
     }
 
     /// An error means that this direction has ended.
-    fn try_copy(&mut self, to: &TcpStream, ending: Option<&str>, buffer: &mut [u8]) -> io::Result<bool> {
+    fn try_copy(&mut self, to: &TcpStream, ending: Option<&str>, buffer: &mut [u8]) -> io::Result<(bool, usize)> {
         let written = write(to, &self.pending)?;
         drop(self.pending.split_to(written));
         if !self.pending.is_empty() || self.source == Source::Empty {
-            return Ok(false);
+            return Ok((false, 0));
         }
         let length = match self.from.read(buffer) {
             Err(error) if error.kind() == ErrorKind::WouldBlock => {
                 self.source = Source::Empty;
-                return Ok(false);
+                return Ok((false, 0));
             }
             Ok(0) | Err(_) => {
                 let last = self.last.take().ok_or(ErrorKind::UnexpectedEof)?;
                 self.pending = last.finish();
-                return Ok(true);
+                return Ok((true, 0));
             }
             Ok(length) => length,
         };
@@ -134,7 +146,7 @@ impl Direction {
         let written = write(to, read)?;
         let rest = read.get(written..).unwrap_or_default();
         self.pending = Bytes::copy_from_slice(rest);
-        Ok(rest.is_empty() && self.source != Source::Empty)
+        Ok((rest.is_empty() && self.source != Source::Empty, length))
     }
 }
 

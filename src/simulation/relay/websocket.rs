@@ -63,7 +63,7 @@ pub async fn connect(
         };
         let up = Direction::new(to_client, client.read_buffer);
         let down = Direction::new(to_webots, from_webots);
-        if let Err(error) = stream_thread.add(Stream::new(up, down, target.ending, Box::new(held))) {
+        if let Err(error) = stream_thread.add(Stream::new(up, down, (target.ending, target.time), Box::new(held))) {
             log::warn!("a stream is not relayed: {error}");
         }
     });

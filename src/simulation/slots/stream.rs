@@ -7,6 +7,7 @@ use tokio::sync::Semaphore;
 use super::simulation_record::{Access, Holder, SimulationRecord, SlotEvent};
 use super::slot_pool::SlotPool;
 use crate::simulation::attachment::Token;
+use crate::simulation::simulated_time::SimulatedTime;
 use crate::simulation::simulation_id::SimulationId;
 
 /// The stream of a token.
@@ -22,6 +23,8 @@ pub struct StreamTarget {
     pub read_only: bool,
     /// Limits the WebSockets with this token. Each of them holds a permit.
     pub connections: Arc<Semaphore>,
+    /// How fast the simulation runs.
+    pub time: SimulatedTime,
     /// Why the server ends the simulation, once it does.
     pub ending: Arc<OnceLock<String>>,
 }
@@ -59,6 +62,7 @@ impl SlotPool {
                 answers_controllers: record.answers_controllers,
                 read_only: access.holder != Holder::Client,
                 connections: Arc::clone(&access.connections),
+                time: record.simulation.time.clone(),
                 ending: Arc::clone(&record.ending),
             })
         })

@@ -3,6 +3,7 @@
 use actix_web::error::ErrorNotFound;
 use actix_web::{HttpRequest, HttpResponse, web};
 use serde::Deserialize;
+use serde_json::json;
 
 use crate::shared::http::routing::{POST, json_body, path};
 use crate::simulation::state::AppState;
@@ -40,11 +41,9 @@ async fn stop(
         Ok(order) => order,
         Err(refusal) => return Ok(refusal),
     };
-    if server
-        .stop(&[id.into_inner()], &reason, &administrator.to_string())
-        .is_empty()
-    {
+    let stopped = server.stop(&[id.into_inner()], &reason, &administrator.to_string());
+    if stopped.is_empty() {
         return Err(ErrorNotFound("Error: there is no such simulation; it may have ended."));
     }
-    Ok(HttpResponse::Accepted().body("stopping"))
+    Ok(HttpResponse::Accepted().json(json!({"stopped": stopped, "failed": []})))
 }

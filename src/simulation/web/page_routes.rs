@@ -13,8 +13,9 @@ use super::{pages, webots_viewer};
 use crate::asset;
 use crate::shared::http::assets::{self, Asset};
 use crate::shared::http::routing::{GET, READ, path};
+use crate::shared::http::time_span::{TimeSpan, csv_file};
 use crate::shared::http::{ConnectionKind, FOREIGN_SCRIPTS, OWN_FILES, PageView, VIEWER, html, sign_in};
-use crate::simulation::ends::{last_lines, output_file};
+use crate::simulation::ends::{csv, last_lines, output_file};
 use crate::simulation::snapshot::Simulation;
 use crate::simulation::state::AppState;
 
@@ -53,6 +54,7 @@ pub fn configure(app: &mut web::ServiceConfig) {
         .service(path("/events", GET, events))
         .service(path("/history", GET, history))
         .service(path("/output", GET, output))
+        .service(path("/simulations.csv", GET, records))
         .service(path("/watch", GET, watch))
         .service(path("/webots-viewer", READ, viewer))
         .service(path("/assets/{name}", READ, asset))
@@ -140,6 +142,19 @@ async fn output(
         ))
         .content_type("text/plain; charset=utf-8")
         .body(tail))
+}
+
+/// The lines of `simulations.csv` of a span of time.
+async fn records(
+    request: HttpRequest,
+    span: web::Query<TimeSpan>,
+    server: web::Data<AppState>,
+) -> actix_web::Result<HttpResponse> {
+    server.admin_auth.reader(&request)?;
+    let span = span.in_utc();
+    let logs = server.config.log_dir.0.join("simulation");
+    let lines = web::block(move || csv::lines(&logs, &span)).await?;
+    Ok(csv_file(csv::HEADING, &lines))
 }
 
 /// A file of Webots' own viewer.

@@ -9,8 +9,9 @@ use super::access::{Visitor, check_origin};
 use super::status::status_page;
 use super::{actions, metrics, page_routes, stream_routes};
 use crate::shared::http::routing::{self, GET, READ, path};
-use crate::shared::http::{CONTENT_TYPE, ConnectionKind, sign_in, websocket};
+use crate::shared::http::{CONTENT_TYPE, ConnectionKind, openapi, sign_in, websocket};
 use crate::simulation::client::{SlotLink, WebClient};
+use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::state::AppState;
 
 /// Adds all routes to an app.
@@ -24,6 +25,7 @@ fn add(app: &mut web::ServiceConfig) {
         .service(path("/load", READ, load))
         .configure(page_routes::configure)
         .configure(sign_in::configure)
+        .configure(openapi::configure)
         .configure(stream_routes::configure)
         .service(path("/status", READ, status_json))
         .service(path("/metrics", READ, metrics_text))
@@ -83,6 +85,9 @@ async fn status_json(request: HttpRequest, server: web::Data<AppState>) -> actix
     for simulation in &mut snapshot.simulations {
         if !visitor.sees_ports(&server.config) {
             simulation.port = None;
+        }
+        if visitor != Visitor::Administrator {
+            simulation.identity = ClientIdentity::default();
         }
         if visitor == Visitor::Stranger {
             simulation.pid = None;
