@@ -772,7 +772,7 @@ async fn watched_by(server: &Server, client: &Client) -> String {
     let answer = get_as_administrator(&url).await;
     assert_eq!(
         (answer.status.as_u16(), answer.header("referrer-policy")),
-        (200, Some("no-referrer"))
+        (200, Some("same-origin"))
     );
     let page = answer.text();
     let (_, rest) = page.split_once("data-stream=\"").unwrap();
