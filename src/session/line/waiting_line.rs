@@ -38,8 +38,8 @@ pub struct Entry<Client> {
 pub struct WaitingClient<'line> {
     /// Its place.
     pub place: Place,
-    /// Its world.
-    pub world: &'line ProjectUrl,
+    /// The URL of its world.
+    pub world: &'line str,
     /// Its user.
     pub user: Option<&'line str>,
     /// The name that it has chosen.
@@ -66,8 +66,9 @@ pub(super) struct Group {
 /// A client in the line.
 #[derive(Debug)]
 pub(super) struct Waiting<Client> {
-    world: ProjectUrl,
-    label: Option<String>,
+    /// The URL of its world.
+    world: Box<str>,
+    label: Option<Box<str>>,
     pub(super) group: Arc<Group>,
     pub(super) client: Client,
     connection: u64,
@@ -118,14 +119,15 @@ impl<Client: Clone> WaitingLine<Client> {
             displaced = self.remove(before).map(|waiting| waiting.client).or(displaced);
         }
         let repository = entry.world.repository().to_lowercase();
+        let world = entry.world.to_string().into_boxed_str();
         let (group, count) = self.groups.entry(repository.clone()).or_insert_with(|| {
-            let world = entry.world.clone();
+            let world = entry.world;
             (Arc::new(Group { world, repository }), 0)
         });
         *count += 1;
         let waiting = Waiting {
-            world: entry.world,
-            label: entry.label,
+            world,
+            label: entry.label.map(String::into_boxed_str),
             group: Arc::clone(group),
             client: entry.client,
             connection: entry.connection,
@@ -360,11 +362,11 @@ mod tests {
 
     #[test]
     fn a_ticket_takes_less_than_a_kilobyte() {
-        // A node of the tree, the indices and the parts on the heap, with a long name of the user.
-        let user = 60;
+        // A node of the tree, the indices and the parts on the heap, with long names and a URL.
+        let texts = 60 + 60 + 150;
         let index = 2 * (size_of::<u64>() * 2 + size_of::<Arc<str>>() + size_of::<Place>() + 16);
         let entry = 2 * (size_of::<Place>() + size_of::<Waiting<actix::Recipient<Ping>>>());
-        assert!(entry + index + user < 700, "{}", entry + index + user);
+        assert!(entry + index + texts < 900, "{}", entry + index + texts);
     }
 
     #[derive(actix::Message)]
