@@ -1,10 +1,12 @@
 """The page of the class at the session server: everybody of all servers, behind one sign-in."""
 
+import pathlib
 import unittest
 
 from case import BrowserTest
 from fleet import WORLD
 from playwright.sync_api import expect
+from roster import RosterServer
 from students import start_all
 
 PASSWORD = "open sesame"
@@ -85,6 +87,57 @@ class OneClass(BrowserTest):
         page.tab.get_by_role("button", name="Sign out").click()
         page.tab.goto(self.fleet.session.url("class"))
         expect(page.tab.get_by_label("Password")).to_be_visible()
+
+    def test_two_hundred_on_four_servers_are_in_hand(self):
+        worlds = [WORLD.format(name) for name in ("arm", "maze")]
+        of = lambda server: [(f"Student {server}{number:02}", worlds[number % 2]) for number in range(98)]
+        before = list(self.fleet.session.config["simulationServers"])
+        with RosterServer(1, of(1)) as third, RosterServer(2, of(2)) as fourth:
+            self.addCleanup(self.fleet.session.reload, simulationServers=before)
+            self.fleet.session.reload(simulationServers=[*before, third.address, fourth.address])
+            students = self.start(["anna", "ben", "chloe", "dora"])
+            page = self.teacher()
+            shown = page.tab.locator("#filtered")
+            expect(shown).to_have_text("200 in all")
+            # The page is told once, and then what changes.
+            self.assertLess(len(page.tab.content()), 1_000_000)
+            field = page.tab.get_by_label("Name, world or server")
+            field.fill("student 214")
+            expect(shown).to_have_text("1 of 200")
+            row = page.tab.locator("#class tr:visible")
+            expect(row).to_contain_text(fourth.address)
+            row.get_by_role("button", name="Stop").click()
+            dialog = page.tab.get_by_role("dialog")
+            dialog.get_by_label("Reason").fill("Enough")
+            dialog.get_by_role("button", name="Stop it").click()
+            expect(shown).to_have_text("0 of 199")
+            ((reason, by),) = fourth.reasons.values()
+            self.assertEqual(reason, "Enough")
+            self.assertIn('administrator "teacher"', by)
+            # All of one world.
+            field.fill("maze")
+            expect(shown).to_have_text("98 of 199")
+            page.tab.get_by_role("button", name="Stop all 98").click()
+            expect(dialog.locator("h2")).to_have_text("Stop these 98 simulations?")
+            dialog.get_by_role("button", name="Stop 98").click()
+            expect(shown).to_have_text("0 of 101")
+            # A real one is watched, and the records are downloaded.
+            field.fill("anna")
+            with page.context.expect_page() as opened:
+                row.get_by_role("link", name="Watch").click()
+            expect(opened.value.locator("#state")).to_have_text("Watching")
+            opened.value.close()
+            students.close()
+            field.fill("carousel")
+            expect(shown).to_have_text("0 of 97")
+            with page.tab.expect_download() as download:
+                page.tab.get_by_role("link", name="Download as CSV").click()
+            lines = pathlib.Path(download.value.path()).read_text().splitlines()
+            self.assertTrue(lines[0].endswith(",server"), lines[0])
+            for name in ("Anna", "Ben", "Chloe", "Dora"):
+                self.assertTrue(any(f'"{name} at desk' in line for line in lines), name)
+            self.assertEqual(page.faults(), [])
+        expect(page.tab.locator("#class tr")).to_have_count(0)
 
 
 if __name__ == "__main__":

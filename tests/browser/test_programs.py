@@ -64,7 +64,8 @@ class Programs(BrowserTest):
 
     def run_example(self, *command, **more):
         environment = {**os.environ, "FLEET": self.fleet.session.url("").rstrip("/"), "TOKEN": TOKEN}
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=SOON, check=False, **more)
+        options = {"env": environment, "capture_output": True, "text": True, "timeout": SOON}
+        done = subprocess.run(command, check=False, **options, **more)
         self.assertEqual(done.returncode, 0, done.stderr)
         return done.stdout
 
@@ -130,7 +131,8 @@ class Programs(BrowserTest):
             self.assertIn('"label":"Anna"', said)
             self.assertRegex(said, r'\{"failed":\[\],"stopped":\["[0-9T-]+"\]\}ok')
             self.assertIn(",server\n", (pathlib.Path(folder) / "lesson.csv").read_text())
-        until("Ben is left", lambda: [one["label"] for one in json.loads(self.ask(self.fleet.session, "simulations"))] == ["Ben"])
+        everybody = lambda: json.loads(self.ask(self.fleet.session, "simulations"))
+        until("Ben is left", lambda: [one["label"] for one in everybody()] == ["Ben"])
 
     def test_a_generated_client_stops_a_simulation_and_reads_the_class(self):
         with tempfile.TemporaryDirectory() as folder:

@@ -104,6 +104,22 @@ async fn only_the_password_stops_a_simulation() {
     client.until(".").await;
 }
 
+#[actix_rt::test]
+async fn the_sentence_of_a_stop_is_a_key() {
+    let server = with_password(demo_server(1))
+        .set("stopText", " The lab has stopped <it> ")
+        .start()
+        .await;
+    let mut client = Client::ready(&server).await;
+    assert_eq!(stop(&server, client.id(), r#"{"reason": "Lunch"}"#).await, 202);
+    let told = client.until("loading: Error:").await;
+    assert_eq!(told, "loading: Error: The lab has stopped \u{2039}it\u{203a}: Lunch");
+    for wrong in ["", " ", "two\nlines", &"x".repeat(201)] {
+        let said = demo_server(1).set("stopText", wrong).refused(2).await;
+        assert!(said.contains("stopText"), "{said}");
+    }
+}
+
 /// Sends these bytes on one connection, waits for `count` answers, and returns their statuses.
 async fn statuses(server: &Server, requests: &[String], count: usize) -> Vec<u16> {
     let mut socket = TcpStream::connect(server.address()).await.unwrap();

@@ -239,7 +239,7 @@ mod tests {
         // A panic ends the actor; its answer may come a moment earlier.
         let ended = async {
             while old.connected() {
-                tokio::task::yield_now().await
+                tokio::task::yield_now().await;
             }
         };
         tokio::time::timeout(Duration::from_secs(20), ended).await.unwrap();
