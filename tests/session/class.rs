@@ -403,3 +403,32 @@ async fn a_lesson_is_one_list_of_all_servers() {
         401
     );
 }
+
+#[actix_rt::test]
+async fn how_fast_a_simulation_runs_is_told_and_recorded() {
+    let server = keyed(1).set("streaming", "relay").start().await;
+    let session = fleet(&[server.address()]).await;
+    let mut client = Client::connect(&server.websocket("/client")).await;
+    client.send(&json!({"start": {"url": arm()}}).to_string()).await;
+    let told = client.until("webots:").await;
+    let (_, path) = told.split_once("/stream/").unwrap();
+    let viewer = Client::connect(&server.websocket(&format!("/stream/{path}"))).await;
+    let mut viewer = viewer.with_running_scene().await;
+    let read = async { while viewer.time().await >= 0.0 {} };
+    let (text, _) = tokio::select! {
+        () = read => unreachable!("the stream has no end"),
+        told = events(&session, &[], "\"realTime\":") => told,
+    };
+    let factor = text.split("\"realTime\":").nth(1).unwrap();
+    let factor: u32 = factor.split([',', '}']).next().unwrap().parse().unwrap();
+    assert!(factor <= 200 && factor.is_multiple_of(5), "{factor}");
+    drop(viewer);
+    client.leave().await;
+    until("it is recorded", async || {
+        let text = get_as_administrator(&session.url("/simulations.csv")).await.text();
+        text.lines()
+            .nth(1)
+            .is_some_and(|line| line.rsplit(',').nth(1).unwrap().parse::<u32>().is_ok())
+    })
+    .await;
+}

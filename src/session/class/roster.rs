@@ -145,11 +145,14 @@ impl Roster {
         requests
     }
 
-    /// A simulation server tells its simulations no longer.
+    /// A simulation server whose requests nobody receives any more tells its simulations no longer. Another link to it may
+    /// have begun meanwhile.
     pub fn unlink(&self, server: &PublicAddress) {
         let mut list = self.list.lock();
-        list.links.remove(server);
-        list.remove_all(Some(server));
+        if list.links.get(server).is_some_and(UnboundedSender::is_closed) {
+            list.links.remove(server);
+            list.remove_all(Some(server));
+        }
     }
 
     /// Whether a simulation server tells its simulations.
@@ -409,7 +412,12 @@ mod tests {
         let roster = Roster::default();
         let server: PublicAddress = "host:2000".parse().unwrap();
         let other: PublicAddress = "host:2001".parse().unwrap();
-        let _links = [roster.link(server.clone()), roster.link(other.clone())];
+        let _link = roster.link(server.clone());
+        let before = roster.link(other.clone());
+        let mut link = roster.link(other.clone());
+        drop(before);
+        roster.unlink(&other);
+        assert!(roster.is_linked(&other), "another link has begun");
         let three = ["1", "2", "3"].map(|id| simulation(id, Stage::Launching)).to_vec();
         roster.update(&server, update(true, three.clone(), &[]));
         roster.update(&other, update(true, three.clone(), &[]));
@@ -426,6 +434,7 @@ mod tests {
         assert_eq!(third.changed, []);
         assert_eq!(third.gone, [(Some(server.clone()), "2".to_owned())]);
         // A server whose link has ended.
+        link.close();
         roster.unlink(&other);
         assert_eq!(roster.since(Some(third.version)).gone.len(), 3);
         assert_eq!(roster.all().len(), 2);

@@ -214,6 +214,7 @@ impl Followed {
 
 impl Drop for Followed {
     fn drop(&mut self) {
+        self.requests.close();
         self.roster.unlink(&self.server);
     }
 }
