@@ -22,8 +22,7 @@ PRANK = """
     })"""
 # Makes a page record the time at which an announcement appears.
 NOTICE = """
-    () => {
-      const place = document.getElementById('announcement');
+    (place) => {
       new MutationObserver(() => { window.announced ||= place.textContent && Date.now(); })
         .observe(place, { childList: true, subtree: true, characterData: true, attributes: true });
     }"""
@@ -169,7 +168,7 @@ class AClass(BrowserTest):
         monitor = self.visit("ivan", "monitor")
         expect(monitor.tab.locator("#live")).to_have_text("Live")
         for page in [*pages, monitor]:
-            page.tab.evaluate(NOTICE)
+            page.tab.locator("#announcement").evaluate(NOTICE)
         fleet.tab.get_by_label("Text for all open viewers").fill("Please save your work.")
         button = fleet.tab.get_by_role("button", name="Announce")
         button.evaluate("button => button.addEventListener('click', () => { window.clicked = Date.now(); })")
