@@ -128,6 +128,8 @@ fn fleet() -> FleetStatus {
         servers: servers.collect(),
         names: Vec::new(),
         changes,
+        ready: Vec::new(),
+        requested: Vec::new(),
         line: LineStatus::default(),
     }
 }

@@ -7,6 +7,7 @@ mod class;
 mod discovery;
 mod door;
 mod fleet_line;
+mod keeping_ready;
 mod mail;
 mod memory;
 mod placement;

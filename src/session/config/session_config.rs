@@ -16,7 +16,7 @@ use crate::shared::config::{
     ApiToken, Configuration, ExpandedPath, Secret, check_api_tokens, check_fleet_key, expanded, is_web_url,
     one_or_many, optional_whole, percent, require, seconds, whole,
 };
-use crate::shared::domain::{PublicAddress, PublicUrl, complete_host};
+use crate::shared::domain::{PublicAddress, PublicUrl, ReadyEntry, complete_host};
 use crate::shared::http::TrustedProxies;
 
 keys! {
@@ -104,6 +104,10 @@ pub struct SessionConfig {
     /// Worlds that the page `/viewer` offers: `{"title": ..., "url": ...}`. Default: none.
     #[serde(deserialize_with = "one_or_many")]
     pub examples: Vec<Example> = Vec::new(),
+    /// Worlds of which the fleet keeps simulations ready: `{"world": ..., "count": ..., "when": ...}`; needs `fleetKey`.
+    /// Default: none.
+    #[serde(deserialize_with = "one_or_many")]
+    pub ready: Vec<ReadyEntry> = Vec::new(),
     /// URL of Webots' own viewer (`WebotsView.js`), for simulation servers that don't have it. Default: none.
     pub viewer_script: Option<url::Url> = None,
     /// All other durations.
@@ -204,6 +208,9 @@ impl Configuration for SessionConfig {
             require(is_web_url(webhook.reveal()), "webhook", || format!("it is {allowed}"))?;
         }
         self.mail_server = self.mail_server.take().filter(|host| !host.is_empty());
-        Ok(warning.into_iter().collect())
+        let no_key =
+            "ready needs fleetKey, the same as that of the simulation servers: without it, nothing is kept ready";
+        let unkept = (!self.ready.is_empty() && self.fleet_key.is_none()).then(|| no_key.to_owned());
+        Ok(warning.into_iter().chain(unkept).collect())
     }
 }

@@ -14,6 +14,7 @@ use crate::session::class::{ClassEntry, ClassState};
 use crate::session::line::{
     Dispatcher, Entered, Entry, LineStatus, Moment, Place, Progress, Served, Ticket, Turn, WaitingClient,
 };
+use crate::session::placement::ReadyWorlds;
 use crate::shared::domain::{Failure, ProjectUrl, PublicAddress, Reason};
 
 /// Asks for a slot, and waits for it in the line. The answer is the place, unless it is the client's turn already.
@@ -158,7 +159,7 @@ impl LineKeeper {
             }
             LinkChange::Offers(offers) => {
                 let turns = self.dispatcher.offered(&server, &offers, &mut servers.fleet, moment());
-                self.give(turns);
+                self.give(turns, &mut servers.ready);
             }
         }
         self.serve(servers, Some(&server));
@@ -222,7 +223,9 @@ impl LineKeeper {
 
     /// Gives turns, and tells servers who waits: this one, or all.
     fn serve(&mut self, servers: &mut ServerTable, only: Option<&PublicAddress>) {
-        let ServerTable { records, fleet, .. } = servers;
+        let ServerTable {
+            records, fleet, ready, ..
+        } = servers;
         // Until it can be asked for reservations, a server that makes some gets nobody: its slot might be another's.
         let will_reserve = |server: &PublicAddress| {
             let report = records.get(server).and_then(|record| record.state.report());
@@ -230,16 +233,17 @@ impl LineKeeper {
         };
         let served = self
             .dispatcher
-            .serve(fleet, admission(records), will_reserve, only, moment());
+            .serve(fleet, admission(records), will_reserve, ready, only, moment());
         let Served { turns, wishes } = served;
-        self.give(turns);
+        self.give(turns, ready);
         for (server, wishes) in wishes {
             servers.ask(&server, wishes);
         }
     }
 
-    fn give(&self, turns: Vec<(Recipient<LineEvent>, Turn<PublicAddress>)>) {
+    fn give(&self, turns: Vec<(Recipient<LineEvent>, Turn<PublicAddress>)>, ready: &mut ReadyWorlds<PublicAddress>) {
         for (client, turn) in turns {
+            ready.place(&turn.server, &turn.world, Instant::now());
             self.waited.observe(turn.waited.as_secs_f64());
             client.do_send(LineEvent::Turn(turn));
         }

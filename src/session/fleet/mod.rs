@@ -2,6 +2,7 @@
 
 mod line_keeper;
 mod name_table;
+mod ready_shares;
 mod refusal;
 mod registry;
 mod resolver;
@@ -12,7 +13,7 @@ mod slot_link;
 mod state_history;
 
 pub use line_keeper::{LineEvent, StopWaiting, Wait};
-pub use registry::{GetMonitors, GetStatus, GetWaiting, Pick, Reconfigure, Registry};
+pub use registry::{GetMonitors, GetStatus, GetWaiting, Pick, Reconfigure, Registry, RequestReady};
 pub use server_monitor::GetRecords;
 pub use server_record::{
     Answer, FleetStatus, Intake, NameStatus, ServerRecord, ServerState, ServerStatus, StateChange, StateName,

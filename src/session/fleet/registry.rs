@@ -13,6 +13,7 @@ use tokio::sync::watch;
 
 use super::line_keeper::{LineKeeper, StopWaiting, Wait};
 use super::name_table::look_up_all;
+use super::ready_shares::ReadyShares;
 use super::server_monitor::{GetRecords, Parent, ProbeResult};
 use super::server_record::{Answer, FleetStatus, Intake, ServerRecord, ServerState, ServerStatus};
 use super::server_table::{ServerTable, admission};
@@ -21,7 +22,7 @@ use super::state_history::StateHistory;
 use crate::session::class::{ClassEntry, Roster};
 use crate::session::config::SessionConfig;
 use crate::session::line::Place;
-use crate::shared::domain::{Admission, Failure, Load, ProjectUrl, PublicAddress, Reason, ServerReport};
+use crate::shared::domain::{Admission, Failure, Load, ProjectUrl, PublicAddress, ReadyEntry, Reason, ServerReport};
 use crate::shared::http::AddressQuota;
 
 /// Requests the least loaded simulation server that accepts this world.
@@ -54,6 +55,11 @@ pub struct GetMonitors;
 #[rtype(result = "()")]
 pub struct Reconfigure(pub Arc<SessionConfig>);
 
+/// Asks the fleet to keep simulations of a world ready. The error is a text for the administrator.
+#[derive(Message)]
+#[rtype(result = "Result<(), String>")]
+pub struct RequestReady(pub ReadyEntry);
+
 /// The actor.
 pub struct Registry {
     config: Arc<SessionConfig>,
@@ -63,6 +69,7 @@ pub struct Registry {
     quota: AddressQuota,
     servers: ServerTable,
     line: LineKeeper,
+    ready: ReadyShares,
     /// Whether a simulation server can take a client; all web clients follow it.
     available: watch::Sender<bool>,
     changes: StateHistory,
@@ -94,6 +101,7 @@ impl Registry {
                 quota: AddressQuota::new(200, 12),
                 changes: StateHistory::new(&config),
                 line: LineKeeper::new(waited, config.fleet_key.is_some()),
+                ready: ReadyShares::open(&config),
                 config,
                 servers,
                 available,
@@ -114,7 +122,9 @@ impl Registry {
 
     /// Records the result of a probe.
     fn record(&mut self, server: &PublicAddress, latency: Duration, answer: Result<ServerReport, Failure>) {
-        let ServerTable { records, fleet, .. } = &mut self.servers;
+        let ServerTable {
+            records, fleet, ready, ..
+        } = &mut self.servers;
         let Some(record) = records.get_mut(server) else { return };
         let change = match answer {
             Ok(report) => {
@@ -136,6 +146,7 @@ impl Registry {
                 );
                 let was_ejected = fleet.is_ejected(server);
                 fleet.report(server, now, &report, !is_draining);
+                ready.report(server, now, &report);
                 if fleet.is_ejected(server) && !was_ejected {
                     log::warn!("{server}: {}", ejected(report.failed_starts));
                 }
@@ -143,6 +154,7 @@ impl Registry {
             }
             Err(failure) => {
                 fleet.lose(server);
+                ready.lose(server);
                 record.failed(failure, latency)
             }
         };
@@ -154,7 +166,9 @@ impl Registry {
 
     /// Chooses a server for a client of this address.
     fn pick(&mut self, world: Option<&ProjectUrl>, from: Option<IpAddr>) -> Result<PublicAddress, Failure> {
-        let ServerTable { records, fleet, .. } = &mut self.servers;
+        let ServerTable {
+            records, fleet, ready, ..
+        } = &mut self.servers;
         let line = &self.line;
         let terms = |address: &PublicAddress, load: f64| {
             if line.claims(records, address, load) {
@@ -165,7 +179,16 @@ impl Registry {
                 None => Some(Admission::Dedicated),
             }
         };
-        let picked = fleet.pick_admitted(Instant::now(), self.quota.take(from), terms);
+        let now = Instant::now();
+        let takes_room = self.quota.take(from);
+        let ready_one = world.filter(|world| ready.has(world)).and_then(|world| {
+            let terms = |address: &PublicAddress, load| terms(address, load).filter(|_| ready.left(address, world) > 0);
+            fleet.pick_admitted(now, takes_room, terms)
+        });
+        let picked = ready_one.or_else(|| fleet.pick_admitted(now, takes_room, terms));
+        if let Some((server, world)) = picked.as_ref().zip(world) {
+            ready.place(server, world, now);
+        }
         picked.ok_or_else(|| self.servers.refusal(world))
     }
 
@@ -217,6 +240,7 @@ impl Actor for Registry {
         ctx.run_interval(TICK, |registry, _| {
             registry.servers.restart_monitors(&registry.config);
             registry.line.tick(&mut registry.servers);
+            registry.ready.tick(&registry.servers, &registry.config);
             registry.publish();
         });
         self.look_up_names(ctx);
@@ -273,8 +297,17 @@ impl Handler<LinkEvent> for Registry {
     type Result = ();
 
     fn handle(&mut self, event: LinkEvent, _: &mut Self::Context) {
+        self.ready.link(&event);
         self.line.link(&mut self.servers, event);
         self.publish();
+    }
+}
+
+impl Handler<RequestReady> for Registry {
+    type Result = Result<(), String>;
+
+    fn handle(&mut self, RequestReady(entry): RequestReady, _: &mut Self::Context) -> Self::Result {
+        self.ready.request(entry)
     }
 }
 
@@ -294,6 +327,8 @@ impl Handler<GetStatus> for Registry {
             names: self.servers.names.status(),
             changes: self.changes.recent.clone(),
             line: self.line.status(),
+            ready: self.ready.wanted(&self.config),
+            requested: self.ready.requested().to_vec(),
         }))
     }
 }

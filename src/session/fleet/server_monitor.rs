@@ -29,7 +29,7 @@ use super::resolver::HostResolver;
 use super::slot_link::{LinkEvent, SlotLink};
 use crate::session::class::Roster;
 use crate::session::config::SessionConfig;
-use crate::shared::domain::{Failure, FleetKey, Load, PublicAddress, Reason, ServerReport, Wishes};
+use crate::shared::domain::{Failure, FleetKey, Load, PublicAddress, Reason, ServerReport, ToSimulationServer};
 use crate::shared::http::tls;
 use crate::shared::text::excerpt;
 
@@ -89,10 +89,10 @@ fn client(interval: Duration, tls: Option<Arc<ClientConfig>>) -> awc::Client {
         .finish()
 }
 
-/// Tells the server who waits for its slots.
+/// Sends the server a message over its link.
 #[derive(Message)]
 #[rtype(result = "()")]
-pub struct Ask(pub Wishes);
+pub struct Ask(pub ToSimulationServer);
 
 /// The parent of a monitor, which receives what it finds.
 #[derive(Clone)]
@@ -130,8 +130,8 @@ pub struct ServerMonitor {
     parent: Parent,
     /// The link before it is opened.
     link: Option<SlotLink>,
-    /// Sends wishes over the link.
-    wishes: Option<UnboundedSender<Wishes>>,
+    /// Sends messages over the link.
+    messages: Option<UnboundedSender<ToSimulationServer>>,
 }
 
 /// What a probe needs.
@@ -164,7 +164,7 @@ impl ServerMonitor {
         });
         Self {
             link,
-            wishes: None,
+            messages: None,
             target: Rc::new(Target {
                 client,
                 url: server.http_url(config.ssl),
@@ -228,9 +228,9 @@ impl Actor for ServerMonitor {
     fn started(&mut self, ctx: &mut Self::Context) {
         self.probe_at(Instant::now(), ctx);
         if let Some(link) = self.link.take() {
-            let (sender, wishes) = unbounded_channel();
-            self.wishes = Some(sender);
-            link.keep(wishes).into_actor(self).spawn(ctx);
+            let (sender, messages) = unbounded_channel();
+            self.messages = Some(sender);
+            link.keep(messages).into_actor(self).spawn(ctx);
         }
     }
 }
@@ -238,10 +238,10 @@ impl Actor for ServerMonitor {
 impl Handler<Ask> for ServerMonitor {
     type Result = ();
 
-    fn handle(&mut self, Ask(wishes): Ask, _: &mut Self::Context) {
-        if let Some(sender) = &self.wishes {
+    fn handle(&mut self, Ask(message): Ask, _: &mut Self::Context) {
+        if let Some(sender) = &self.messages {
             // The link ends with this monitor.
-            sender.send(wishes).ok();
+            sender.send(message).ok();
         }
     }
 }

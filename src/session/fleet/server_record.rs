@@ -9,7 +9,7 @@ use serde::{Serialize, Serializer};
 
 use crate::session::line::LineStatus;
 use crate::session::mail::{Notice, NoticeKind};
-use crate::shared::domain::{Failure, PublicAddress, ServerReport};
+use crate::shared::domain::{Failure, PublicAddress, ReadyCount, ReadyEntry, ServerReport};
 use crate::shared::run::timestamp;
 
 /// What is known of a simulation server.
@@ -292,6 +292,10 @@ pub struct FleetStatus {
     pub changes: VecDeque<StateChange>,
     /// The clients that wait.
     pub line: LineStatus,
+    /// How many of each listed world are to be kept ready now.
+    pub ready: Vec<ReadyCount>,
+    /// The entries of `POST /ready`.
+    pub requested: Vec<ReadyEntry>,
 }
 
 impl FleetStatus {
@@ -299,6 +303,14 @@ impl FleetStatus {
     pub fn count(&self, state: StateName) -> usize {
         let names = self.servers.iter().map(|server| server.record.state.name());
         names.filter(|name| *name == state).count()
+    }
+
+    /// Number of simulations of this kind that clients can take at once.
+    pub fn ready(&self, one: &ReadyCount) -> u32 {
+        let reports = self.servers.iter().filter_map(|server| server.record.state.report());
+        reports
+            .map(|report| report.ready(&one.world, one.mode))
+            .fold(0, u32::saturating_add)
     }
 
     /// Number of simulation servers that answer.

@@ -13,8 +13,10 @@ use super::server_monitor::{Ask, GetRecords, Parent, ServerMonitor, Stop};
 use super::server_record::ServerRecord;
 use super::slot_link::{LinkChange, LinkEvent};
 use crate::session::config::SessionConfig;
-use crate::session::placement::LoadBalancer;
-use crate::shared::domain::{Admission, Failure, Load, ProjectUrl, PublicAddress, Wishes};
+use crate::session::placement::{LoadBalancer, ReadyWorlds};
+use crate::shared::domain::{
+    Admission, Failure, KeepReady, Load, ProjectUrl, PublicAddress, ToSimulationServer, Wishes,
+};
 use crate::shared::http::tls;
 use crate::shared::run::permanent::PanicCounter;
 
@@ -24,6 +26,8 @@ pub struct ServerTable {
     pub names: NameTable,
     /// What is known of placing clients on the servers.
     pub fleet: LoadBalancer<PublicAddress>,
+    /// What they keep ready for clients.
+    pub ready: ReadyWorlds<PublicAddress>,
     /// The actors that probe the servers, one for each.
     monitors: HashMap<PublicAddress, Addr<ServerMonitor>>,
     /// Counts the panics of all of them.
@@ -44,6 +48,7 @@ impl ServerTable {
         Self {
             names: NameTable::default(),
             fleet: LoadBalancer::new(config.policy()),
+            ready: ReadyWorlds::default(),
             monitors: HashMap::new(),
             panics: PanicCounter::default(),
             records: HashMap::new(),
@@ -84,6 +89,7 @@ impl ServerTable {
                 monitor.do_send(Stop);
             }
             self.fleet.remove(&server);
+            self.ready.lose(&server);
         }
     }
 
@@ -127,7 +133,14 @@ impl ServerTable {
     /// Tells a server who waits for its slots.
     pub fn ask(&self, server: &PublicAddress, wishes: Wishes) {
         if let Some(monitor) = self.monitors.get(server) {
-            monitor.do_send(Ask(wishes));
+            monitor.do_send(Ask(ToSimulationServer::Wishes(wishes)));
+        }
+    }
+
+    /// Tells a server what to keep ready.
+    pub fn keep_ready(&self, server: &PublicAddress, list: KeepReady) {
+        if let Some(monitor) = self.monitors.get(server) {
+            monitor.do_send(Ask(ToSimulationServer::Ready(list)));
         }
     }
 

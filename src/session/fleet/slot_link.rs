@@ -24,7 +24,7 @@ use tokio::time::{sleep, timeout};
 
 use crate::session::class::{Roster, StopRequest};
 use crate::shared::domain::{
-    FleetKey, Follow, Hello, Offers, PublicAddress, StopOrder, Stopped, ToSessionServer, ToSimulationServer, Wishes,
+    FleetKey, Follow, Hello, Offers, PublicAddress, StopOrder, Stopped, ToSessionServer, ToSimulationServer,
 };
 
 /// What happens to a link.
@@ -104,10 +104,10 @@ const LONG_PAUSE: Duration = Duration::from_secs(30);
 
 impl SlotLink {
     /// Keeps the link, for ever.
-    pub(super) async fn keep(self, mut wishes: UnboundedReceiver<Wishes>) {
+    pub(super) async fn keep(self, mut messages: UnboundedReceiver<ToSimulationServer>) {
         let mut is_warned = false;
         loop {
-            let Err(error) = self.open(&mut wishes).await else {
+            let Err(error) = self.open(&mut messages).await else {
                 return;
             };
             let is_refused = matches!(error, LinkError::WrongKey);
@@ -133,7 +133,7 @@ impl SlotLink {
     }
 
     /// Opens a link and keeps it until it ends. Returns without an error when its monitor has ended.
-    async fn open(&self, wishes: &mut UnboundedReceiver<Wishes>) -> Result<(), LinkError> {
+    async fn open(&self, messages: &mut UnboundedReceiver<ToSimulationServer>) -> Result<(), LinkError> {
         let opening = timeout(CONNECT, self.client.ws(&self.url).max_frame_size(MAX_MESSAGE).connect()).await;
         let opened = opening.map_err(|_| LinkError::Broken("no connection in time".to_owned()))?;
         let (_, mut socket) = opened.map_err(|error| match error {
@@ -149,8 +149,8 @@ impl SlotLink {
             LinkError::Broken(_) => LinkError::WrongKey,
             error => error,
         })?;
-        // Wishes for an earlier link.
-        while wishes.try_recv().is_ok() {}
+        // Those for an earlier link.
+        while messages.try_recv().is_ok() {}
         let mut followed = hello.roster.then(|| Followed::new(self));
         self.tell(LinkChange::Up(hello));
         self.tell(LinkChange::Offers(first));
@@ -169,7 +169,7 @@ impl SlotLink {
                         }
                     }
                 },
-                next = wishes.recv() => match next {
+                next = messages.recv() => match next {
                     Some(next) => send(&mut socket, &next).await?,
                     None => return Ok(()),
                 },

@@ -12,7 +12,7 @@ use super::link::{LISTED, Link};
 use super::rate::{Rate, estimate};
 use super::ticket::Ticket;
 use super::waiting_line::{Entry, Group, Place, Progress, WaitingClient, WaitingLine};
-use crate::session::placement::LoadBalancer;
+use crate::session::placement::{LoadBalancer, ReadyWorlds};
 use crate::shared::domain::{Admission, Hello, Offers, Pass, ProjectUrl, Wishes};
 
 /// A moment, by both clocks.
@@ -29,6 +29,8 @@ pub struct Moment {
 pub struct Turn<Server> {
     /// The server that takes it.
     pub server: Server,
+    /// Its world.
+    pub world: ProjectUrl,
     /// Its pass, if the server has reserved a slot.
     pub pass: Option<Pass>,
     /// How long it has waited.
@@ -243,6 +245,7 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
         fleet: &mut LoadBalancer<Server>,
         admission: impl Fn(&Server, &ProjectUrl, f64) -> Option<Admission>,
         will_reserve: impl Fn(&Server) -> bool,
+        ready: &ReadyWorlds<Server>,
         only: Option<&Server>,
         now: Moment,
     ) -> Served<Server, Client> {
@@ -251,7 +254,7 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
             mut assigned,
             starved,
             plain,
-        } = self.share(fleet, &admission, &will_reserve, now);
+        } = self.share(fleet, &admission, &will_reserve, ready, now);
         let mut turns = Vec::new();
         for (place, server) in plain {
             turns.extend(self.turn(place, &server, None, now));
@@ -293,13 +296,14 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
         Served { turns, wishes }
     }
 
-    /// Shares the room of the fleet out, in the order of the line. The room that clients of reserving servers get is
+    /// Shares the room of the fleet out, in the order of the line; servers that keep a client's world ready come first. The room that clients of reserving servers get is
     /// counted only once they have offers.
     fn share(
         &self,
         fleet: &mut LoadBalancer<Server>,
         admission: &impl Fn(&Server, &ProjectUrl, f64) -> Option<Admission>,
         will_reserve: &impl Fn(&Server) -> bool,
+        ready: &ReadyWorlds<Server>,
         now: Moment,
     ) -> Shares<Server> {
         let mut shares = Shares {
@@ -319,6 +323,8 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
             }
         }
         let groups = self.line.groups().count();
+        // The simulations that are kept ready and go to those ahead.
+        let mut used: HashMap<(Server, &ProjectUrl), usize> = HashMap::new();
         let mut starved: HashSet<*const Group> = HashSet::new();
         for (place, waiting) in self.line.iter() {
             if starved.len() == groups {
@@ -331,7 +337,19 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
                 let is_ready = self.links.contains_key(server) || !will_reserve(server);
                 admission(server, &waiting.group.world, load).filter(|_| is_ready)
             };
-            match fleet.pick_admitted(now.instant, true, terms) {
+            let world = &waiting.world;
+            let of_ready = |server: &Server, load| {
+                let gone = used.get(&(server.clone(), world)).copied().unwrap_or_default();
+                terms(server, load).filter(|_| ready.left(server, world) > gone)
+            };
+            let ready_one = ready
+                .has(world)
+                .then(|| fleet.pick_admitted(now.instant, true, of_ready))
+                .flatten();
+            if let Some(server) = &ready_one {
+                *used.entry((server.clone(), world)).or_default() += 1;
+            }
+            match ready_one.or_else(|| fleet.pick_admitted(now.instant, true, terms)) {
                 None => {
                     starved.insert(Arc::as_ptr(&waiting.group));
                     shares.starved.push(Arc::clone(&waiting.group));
@@ -361,6 +379,7 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
         let valid = pass.map_or(TURN, |(_, valid)| valid);
         let turn = Turn {
             server: server.clone(),
+            world: waiting.world,
             pass: pass.map(|(pass, _)| pass),
             waited: Duration::from_millis(now.unix.saturating_sub(place.since)),
         };
@@ -704,9 +723,14 @@ mod tests {
                 let accepts = accepts(&self.servers);
                 let admission =
                     |server: &usize, world: &ProjectUrl, _| accepts(server, world).then_some(Admission::Dedicated);
-                let Served { turns, wishes } =
-                    self.dispatcher
-                        .serve(&mut self.balancer, admission, |_| false, None, self.now);
+                let Served { turns, wishes } = self.dispatcher.serve(
+                    &mut self.balancer,
+                    admission,
+                    |_| false,
+                    &ReadyWorlds::default(),
+                    None,
+                    self.now,
+                );
                 if turns.is_empty() && wishes.is_empty() {
                     return;
                 }

@@ -70,6 +70,7 @@ pub(super) struct Waiting<Client> {
     world: Box<str>,
     label: Option<Box<str>>,
     pub(super) group: Arc<Group>,
+    pub(super) world: ProjectUrl,
     pub(super) client: Client,
     connection: u64,
     address: Option<IpAddr>,
@@ -121,7 +122,7 @@ impl<Client: Clone> WaitingLine<Client> {
         let repository = entry.world.repository().to_lowercase();
         let world = entry.world.to_string().into_boxed_str();
         let (group, count) = self.groups.entry(repository.clone()).or_insert_with(|| {
-            let world = entry.world;
+            let world = entry.world.clone();
             (Arc::new(Group { world, repository }), 0)
         });
         *count += 1;
@@ -129,6 +130,7 @@ impl<Client: Clone> WaitingLine<Client> {
             world,
             label: entry.label.map(String::into_boxed_str),
             group: Arc::clone(group),
+            world: entry.world,
             client: entry.client,
             connection: entry.connection,
             address: entry.address,
@@ -210,7 +212,7 @@ impl<Client: Clone> WaitingLine<Client> {
             waited: now.saturating_sub(place.since),
             address: waiting.address,
             user: waiting.user.as_deref().map(str::to_owned),
-            world: None,
+            world: Some(waiting.world.clone()),
         })
     }
 

@@ -8,6 +8,7 @@
 //! - `backend`: what is known of one server;
 //! - `cost`: what a client costs a server, learned from its reports;
 //! - `ejection`: which servers come last, because their starts fail;
+//! - `ready_worlds`: what servers keep ready, and which has to keep how much;
 //! - `replicas`: how many clients other session servers send.
 //!
 //! Nothing here reads a clock or does I/O: the caller passes the time.
@@ -18,7 +19,9 @@ mod cost;
 mod ejection;
 mod load_balancer;
 mod policy;
+mod ready_worlds;
 mod replicas;
 
 pub use load_balancer::LoadBalancer;
 pub use policy::PlacementPolicy;
+pub use ready_worlds::{ReadyWorlds, shares};

@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 use std::sync::Arc;
 
-use actix_web::error::ErrorInternalServerError;
+use actix_web::error::{ErrorInternalServerError, ErrorServiceUnavailable};
 use actix_web::http::{StatusCode, header};
 use actix_web::{HttpRequest, HttpResponse, Result, web};
 use percent_encoding::percent_decode_str;
@@ -13,8 +13,10 @@ use super::refusal::{self, REASON_HEADER};
 use super::status::status_page;
 use super::web_client::WebClient;
 use super::{class_routes, metrics, page_routes};
+use crate::session::fleet::RequestReady;
 use crate::session::state::AppState;
-use crate::shared::http::routing::{self, GET, POST, READ, json_body, path, retry_after};
+use crate::shared::domain::ReadyEntry;
+use crate::shared::http::routing::{self, GET, POST, READ, body, json_body, path, retry_after};
 use crate::shared::http::{CONTENT_TYPE, ConnectionKind, openapi, sign_in, websocket};
 use crate::shared::text::one_line;
 
@@ -50,7 +52,8 @@ fn add(app: &mut web::ServiceConfig) {
         .service(path("/status", READ, status_json))
         .service(path("/metrics", READ, metrics_text))
         .service(path("/health", READ, health))
-        .service(path("/announcement", POST, announcement));
+        .service(path("/announcement", POST, announcement))
+        .service(path("/ready", POST, ready));
 }
 
 fn wants_websocket(request: &HttpRequest) -> bool {
@@ -165,6 +168,32 @@ async fn announcement(request: HttpRequest, payload: web::Payload, server: web::
     log::info!("{administrator}: announces {text:?}");
     server.announcement.send_replace(text);
     HttpResponse::Ok().body("ok")
+}
+
+/// Asks the fleet to keep simulations of a world ready, which requires the administrator's password.
+async fn ready(request: HttpRequest, payload: web::Payload, server: web::Data<AppState>) -> Result<HttpResponse> {
+    let administrator = server.admin_auth.actor(&request)?;
+    let text = match body(&request, payload).await {
+        Ok(text) => text,
+        Err(refusal) => return Ok(refusal),
+    };
+    let entry: ReadyEntry = match serde_json::from_slice(&text) {
+        Ok(entry) => entry,
+        Err(error) => return Ok(HttpResponse::BadRequest().body(format!("Error: {}.", one_line(&error.to_string())))),
+    };
+    if entry.until.is_none() && entry.count > 0 {
+        return Ok(HttpResponse::BadRequest().body("Error: until is missing, so that nothing is kept ready for ever."));
+    }
+    log::info!(
+        "{administrator}: asks for {} of {} to be kept ready",
+        entry.count,
+        entry.world
+    );
+    let kept = server.registry.send(RequestReady(entry)).await;
+    match kept.map_err(|_| ErrorServiceUnavailable("Error: the server stops."))? {
+        Ok(()) => Ok(HttpResponse::Ok().body("ok")),
+        Err(why) => Ok(HttpResponse::InternalServerError().body(format!("Error: {why}."))),
+    }
 }
 
 async fn health() -> HttpResponse {

@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 use crate::session::fleet::{FleetStatus, ServerStatus};
 use crate::session::line::{LineStatus, WaitingFor};
 use crate::session::state::AppState;
-use crate::shared::domain::{ClientUrls, Failure};
+use crate::shared::domain::{ClientUrls, Failure, ReadyCount};
 
 /// The page `/status`. Loads are in percent, times in seconds; unknown values are `null`.
 pub fn status_page(server: &AppState, status: &FleetStatus) -> Value {
@@ -21,11 +21,22 @@ pub fn status_page(server: &AppState, status: &FleetStatus) -> Value {
         "names": status.names,
         "changes": status.changes,
         "line": line_status(&status.line),
+        "ready": status.ready.iter().map(|one| ready_status(one, status)).collect::<Vec<_>>(),
+        "requested": status.requested,
     })
 }
 
 /// Most repositories that are listed.
 const MAX_LISTED: usize = 50;
+
+fn ready_status(one: &ReadyCount, status: &FleetStatus) -> Value {
+    json!({
+        "world": one.world,
+        "mode": one.mode,
+        "wanted": one.count,
+        "ready": status.ready(one),
+    })
+}
 
 fn line_status(line: &LineStatus) -> Value {
     let world = |one: &WaitingFor| {
@@ -56,6 +67,7 @@ fn server_status(server: &ServerStatus, urls: &ClientUrls) -> Value {
         "inFlight": server.in_flight,
         "clientCost": server.client_cost,
         "instances": report.and_then(|report| report.instances),
+        "ready": report.map(|report| report.ready.as_slice()).unwrap_or_default(),
         "allowedRepositories": report.map(|report| report.allowed_repositories.as_slice()).unwrap_or_default(),
         "version": report.map(|report| report.version.as_str()).unwrap_or_default(),
         // Since the last good answer.

@@ -32,8 +32,8 @@ pub enum View {
 pub struct ReadyEntry {
     /// The world.
     pub world: ProjectUrl,
-    /// Number of simulations that are kept ready.
-    #[serde(deserialize_with = "whole::<1, 10_000, _, _>")]
+    /// Number of simulations that are kept ready; 0: only its repository stays in the cache.
+    #[serde(deserialize_with = "whole::<0, 10_000, _, _>")]
     pub count: u32,
     /// When: `always`, or times of the week. Default: always.
     #[serde(default = "always", deserialize_with = "one_or_many")]

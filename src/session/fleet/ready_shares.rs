@@ -1,0 +1,154 @@
+//! What the fleet keeps ready: the lists of the configuration and of `POST /ready`, and the share of each simulation
+//! server. Part of the registry.
+
+use std::collections::{BTreeMap, HashMap};
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use jiff::Timestamp;
+
+use super::server_record::ServerState;
+use super::server_table::{ServerTable, accepts};
+use super::slot_link::{LinkChange, LinkEvent};
+use crate::session::config::SessionConfig;
+use crate::session::placement::shares;
+use crate::shared::domain::{KeepReady, ProjectUrl, PublicAddress, ReadyCount, ReadyEntry, View};
+
+/// The lists, and what each server was asked for.
+pub(super) struct ReadyShares {
+    /// The entries of `POST /ready` that are not over.
+    requested: Vec<ReadyEntry>,
+    /// The file that they are kept in.
+    file: PathBuf,
+    /// The servers that keep simulations ready on request, with what they were asked for last.
+    asked: HashMap<PublicAddress, Option<Vec<ReadyCount>>>,
+    shared: Instant,
+}
+
+/// Interval between two looks at what is wanted.
+const INTERVAL: Duration = Duration::from_secs(1);
+/// Most entries of `POST /ready`.
+const MAX_REQUESTED: usize = 1000;
+
+impl ReadyShares {
+    /// Reads what was requested before the last end of the server.
+    pub(super) fn open(config: &SessionConfig) -> Self {
+        let file = config.log_dir.0.join("session/ready.json");
+        let requested = match std::fs::read_to_string(&file) {
+            Ok(text) => serde_json::from_str(&text).unwrap_or_else(|error| {
+                log::warn!("{} is ignored: {error}", file.display());
+                Vec::new()
+            }),
+            Err(_) => Vec::new(),
+        };
+        Self {
+            requested,
+            file,
+            asked: HashMap::new(),
+            shared: Instant::now(),
+        }
+    }
+
+    /// Adds an entry, or replaces that of the same world and mode; with `count` 0 removes it.
+    ///
+    /// # Errors
+    /// When there are too many, or they can't be kept.
+    pub(super) fn request(&mut self, entry: ReadyEntry) -> Result<(), String> {
+        let now = Timestamp::now();
+        let mut requested = self.requested.clone();
+        requested.retain(|one| !one.is_over(now) && (&one.world, one.mode) != (&entry.world, entry.mode));
+        if entry.count > 0 {
+            requested.push(entry);
+        }
+        if requested.len() > MAX_REQUESTED {
+            return Err(format!("{MAX_REQUESTED} worlds are requested already"));
+        }
+        keep(&self.file, &requested).map_err(|error| format!("it can't be kept: {error}"))?;
+        self.requested = requested;
+        Ok(())
+    }
+
+    /// The entries of `POST /ready`.
+    pub(super) fn requested(&self) -> &[ReadyEntry] {
+        &self.requested
+    }
+
+    /// How many of each listed world the fleet is to keep ready now.
+    pub(super) fn wanted(&self, config: &SessionConfig) -> Vec<ReadyCount> {
+        let now = Timestamp::now();
+        let mut wanted: BTreeMap<(&ProjectUrl, View), u32> = BTreeMap::new();
+        for entry in config
+            .ready
+            .iter()
+            .chain(&self.requested)
+            .filter(|entry| !entry.is_over(now))
+        {
+            let most = wanted.entry((&entry.world, entry.mode)).or_default();
+            *most = if entry.is_due(now) {
+                entry.count.max(*most)
+            } else {
+                *most
+            };
+        }
+        let count = |((world, mode), count): ((&ProjectUrl, View), u32)| ReadyCount {
+            world: world.clone(),
+            mode,
+            count,
+        };
+        wanted.into_iter().map(count).collect()
+    }
+
+    /// Something has happened to the link of a server.
+    pub(super) fn link(&mut self, LinkEvent { server, change }: &LinkEvent) {
+        match change {
+            LinkChange::Up(hello) if hello.keeps_ready => drop(self.asked.insert(server.clone(), None)),
+            LinkChange::Up(_) | LinkChange::Down | LinkChange::Refused => drop(self.asked.remove(server)),
+            LinkChange::Offers(_) => {}
+        }
+    }
+
+    /// Tells each server its share, if that has changed. One that does not answer or drains gets none.
+    pub(super) fn tick(&mut self, servers: &ServerTable, config: &SessionConfig) {
+        if self.shared.elapsed() < INTERVAL {
+            return;
+        }
+        self.shared = Instant::now();
+        self.asked.retain(|server, _| servers.records.contains_key(server));
+        let slots = |server: &PublicAddress| match &servers.records.get(server)?.state {
+            ServerState::Answering { answer, .. } if !answer.report.draining => answer.report.instances,
+            _ => None,
+        };
+        let may_keep = servers.addresses().iter().filter(|server| {
+            self.asked.contains_key(server) && !servers.records.get(server).is_some_and(|record| record.drained)
+        });
+        let rooms: Vec<(PublicAddress, u32)> = may_keep
+            .filter_map(|server| Some((server.clone(), slots(server)?.slots)))
+            .collect();
+        let lists = shares(&self.wanted(config), &rooms, accepts(&servers.records));
+        let mut lists: HashMap<PublicAddress, Vec<ReadyCount>> =
+            rooms.into_iter().map(|(server, _)| server).zip(lists).collect();
+        for (server, asked) in &mut self.asked {
+            let list = lists.remove(server).unwrap_or_default();
+            if asked.as_ref() != Some(&list) {
+                servers.keep_ready(
+                    server,
+                    KeepReady {
+                        keep_ready: list.clone(),
+                    },
+                );
+                *asked = Some(list);
+            }
+        }
+    }
+}
+
+/// Writes a file, whole or not at all.
+fn keep(path: &Path, entries: &[ReadyEntry]) -> std::io::Result<()> {
+    let folder = path.parent().unwrap_or(Path::new("."));
+    std::fs::create_dir_all(folder)?;
+    let mut file = tempfile::NamedTempFile::new_in(folder)?;
+    file.write_all(&serde_json::to_vec(entries)?)?;
+    file.persist(path)?;
+    Ok(())
+}

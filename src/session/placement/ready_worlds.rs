@@ -1,0 +1,182 @@
+//! What simulation servers keep ready: how much is left of it, and which server has to keep how much of a list.
+
+use std::collections::HashMap;
+use std::hash::Hash;
+use std::time::{Duration, Instant};
+
+use crate::shared::domain::{ProjectUrl, ReadyCount, ServerReport, View};
+
+/// The simulations that servers keep ready, as they report, less the clients that were sent there since.
+#[derive(Debug)]
+pub struct ReadyWorlds<Id>(HashMap<ProjectUrl, HashMap<Id, Left>>);
+
+#[derive(Debug, Default)]
+struct Left {
+    reported: u32,
+    /// When clients were sent that the report may not show.
+    sent: Vec<Instant>,
+}
+
+/// Time after which a report shows a client that was sent to its server.
+const UNSEEN: Duration = Duration::from_millis(500);
+
+impl<Id> Default for ReadyWorlds<Id> {
+    fn default() -> Self {
+        Self(HashMap::new())
+    }
+}
+
+impl<Id: Clone + Eq + Hash> ReadyWorlds<Id> {
+    /// Records what a server has reported.
+    pub fn report(&mut self, id: &Id, now: Instant, report: &ServerReport) {
+        for (world, servers) in &mut self.0 {
+            if let Some(left) = servers.get_mut(id) {
+                left.reported = report.ready(world, View::default());
+                left.sent.retain(|at| now.saturating_duration_since(*at) < UNSEEN);
+            }
+        }
+        for one in report
+            .ready
+            .iter()
+            .filter(|one| one.ready > 0 && one.mode == View::default())
+        {
+            let servers = self.0.entry(one.world.clone()).or_default();
+            servers.entry(id.clone()).or_default().reported = report.ready(&one.world, View::default());
+        }
+        self.0.retain(|_, servers| {
+            servers.retain(|_, left| left.reported > 0);
+            !servers.is_empty()
+        });
+    }
+
+    /// Forgets a server.
+    pub fn lose(&mut self, id: &Id) {
+        for servers in self.0.values_mut() {
+            servers.remove(id);
+        }
+    }
+
+    /// A client was sent to a server.
+    pub fn place(&mut self, id: &Id, world: &ProjectUrl, now: Instant) {
+        if let Some(left) = self.0.get_mut(world).and_then(|servers| servers.get_mut(id)) {
+            left.sent.push(now);
+        }
+    }
+
+    /// Whether some server has one of a world.
+    pub fn has(&self, world: &ProjectUrl) -> bool {
+        self.0.contains_key(world)
+    }
+
+    /// How many of a world a server has left.
+    pub fn left(&self, id: &Id, world: &ProjectUrl) -> usize {
+        let left = self.0.get(world).and_then(|servers| servers.get(id));
+        left.map_or(0, |left| (left.reported as usize).saturating_sub(left.sent.len()))
+    }
+}
+
+/// Shares out what is to be kept ready over servers, each with its number of slots: evenly, in proportion to the slots,
+/// and the same again for the same servers. Returns the list of each server.
+pub fn shares<Id>(
+    wanted: &[ReadyCount],
+    servers: &[(Id, u32)],
+    accepts: impl Fn(&Id, &ProjectUrl) -> bool,
+) -> Vec<Vec<ReadyCount>> {
+    let mut taken = vec![0_u32; servers.len()];
+    let mut lists: Vec<Vec<ReadyCount>> = servers.iter().map(|_| Vec::new()).collect();
+    for one in wanted {
+        let mut counts: Vec<Option<u32>> = servers
+            .iter()
+            .map(|(id, _)| accepts(id, &one.world).then_some(0))
+            .collect();
+        for _ in 0..one.count {
+            let candidates = servers.iter().zip(&taken).zip(&counts).enumerate();
+            let with_room = candidates.filter_map(|(index, (((_, slots), taken), count))| {
+                (count.is_some() && taken < slots).then_some((index, *taken, *slots))
+            });
+            // The server with the smallest part in use, compared as fractions.
+            let least = with_room.min_by(|(_, taken, slots), (_, other, others)| {
+                (u64::from(*taken) * u64::from(*others)).cmp(&(u64::from(*other) * u64::from(*slots)))
+            });
+            let Some((index, ..)) = least else { break };
+            if let (Some(taken), Some(Some(count))) = (taken.get_mut(index), counts.get_mut(index)) {
+                *taken += 1;
+                *count += 1;
+            }
+        }
+        for (list, count) in lists.iter_mut().zip(counts) {
+            list.extend(count.map(|count| ReadyCount { count, ..one.clone() }));
+        }
+    }
+    lists
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::shared::domain::{Load, ReadyStatus};
+
+    fn world(name: &str) -> ProjectUrl {
+        ProjectUrl::parse(&format!("https://github.com/lab/arm/blob/main/worlds/{name}.wbt")).unwrap()
+    }
+
+    fn count(name: &str, count: u32) -> ReadyCount {
+        ReadyCount {
+            world: world(name),
+            mode: View::default(),
+            count,
+        }
+    }
+
+    #[test]
+    fn a_list_is_shared_by_slots_among_servers_that_accept_it() {
+        let share = |wanted: &[ReadyCount], servers: &[(u32, u32)]| {
+            let lists = shares(wanted, servers, |id, world| *id != 9 || world.world() != "b.wbt");
+            let numbers = |list: Vec<ReadyCount>| list.into_iter().map(|one| one.count).collect::<Vec<_>>();
+            lists.into_iter().map(numbers).collect::<Vec<_>>()
+        };
+        assert_eq!(share(&[count("a", 30)], &[(0, 20), (1, 20)]), [[15], [15]]);
+        assert_eq!(share(&[count("a", 30)], &[(0, 40), (1, 20)]), [[20], [10]]);
+        assert_eq!(
+            share(&[count("a", 30)], &[(0, 5), (1, 5)]),
+            [[5], [5]],
+            "no more than slots"
+        );
+        assert_eq!(share(&[count("a", 0)], &[(0, 5)]), [[0]], "listed for another time");
+        assert_eq!(
+            share(&[count("a", 2), count("b", 3)], &[(0, 10), (9, 10)]),
+            [vec![1, 3], vec![1]]
+        );
+        assert_eq!(share(&[count("a", 3)], &[]), Vec::<Vec<u32>>::new());
+    }
+
+    #[test]
+    fn who_was_sent_there_counts_until_a_report_shows_it() {
+        let report = |ready| ServerReport {
+            ready: vec![ReadyStatus {
+                world: world("a"),
+                mode: View::default(),
+                wanted: 2,
+                ready,
+                starting: 0,
+                problem: None,
+            }],
+            ..ServerReport::load_only(Load::ZERO)
+        };
+        let now = Instant::now();
+        let mut worlds = ReadyWorlds::default();
+        assert!(!worlds.has(&world("a")));
+        worlds.report(&1, now, &report(2));
+        worlds.report(&2, now, &report(1));
+        assert_eq!((worlds.left(&1, &world("a")), worlds.left(&1, &world("b"))), (2, 0));
+        worlds.place(&1, &world("a"), now);
+        assert_eq!(worlds.left(&1, &world("a")), 1);
+        worlds.report(&1, now + UNSEEN / 2, &report(2));
+        assert_eq!(worlds.left(&1, &world("a")), 1, "it is on its way");
+        worlds.report(&1, now + UNSEEN, &report(1));
+        assert_eq!(worlds.left(&1, &world("a")), 1);
+        worlds.report(&1, now + UNSEEN, &report(0));
+        worlds.lose(&2);
+        assert_eq!((worlds.left(&1, &world("a")), worlds.left(&2, &world("a"))), (0, 0));
+    }
+}

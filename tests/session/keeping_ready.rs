@@ -1,0 +1,261 @@
+//! A fleet that keeps simulations ready: who keeps how many, and that clients are sent where one is.
+
+use serde_json::{Value, json};
+
+use crate::support::client::Client;
+use crate::support::git::{Forge, arm};
+use crate::support::http::{self, PASSWORD, post};
+use crate::support::program::{Builder, Server, session_server, simulation_server};
+use crate::support::until;
+use crate::support::webots::Webots;
+
+const SECRET: &str = "a secret of this test";
+
+/// Simulation servers with these numbers of slots, which keep simulations ready however busy the machine is.
+struct Site {
+    servers: Vec<Server>,
+    _parts: (Forge, Webots),
+}
+
+impl Site {
+    async fn new(slots: &[u16]) -> Self {
+        let forge = Forge::with_arm();
+        let webots = Webots::launcher();
+        let mut servers = Vec::new();
+        for slots in slots {
+            let server = simulation_server(&webots.path(), forge.path(), *slots)
+                .set("fleetKey", SECRET)
+                .set("readyLoad", 1000)
+                .set("timing.branches", 0.5);
+            servers.push(server.start().await);
+        }
+        Self {
+            servers,
+            _parts: (forge, webots),
+        }
+    }
+
+    fn session(&self) -> Builder {
+        let addresses: Vec<String> = self.servers.iter().map(Server::address).collect();
+        session_server(&addresses)
+            .set("fleetKey", SECRET)
+            .set("loadThreshold", 1000)
+            .set("adminPassword", PASSWORD)
+    }
+
+    /// The number that each server has ready.
+    async fn ready(&self) -> Vec<u64> {
+        let mut ready = Vec::new();
+        for server in &self.servers {
+            ready.push(server.status().await["ready"][0]["ready"].as_u64().unwrap_or_default());
+        }
+        ready
+    }
+
+    async fn until_ready(&self, expected: &[u64]) {
+        until(&format!("{expected:?} are ready"), async || {
+            self.ready().await == expected
+        })
+        .await;
+    }
+}
+
+/// Waits until the session server knows of this many.
+async fn until_known(session: &Server, count: u64) {
+    let knows = async || session.status().await["ready"][0]["ready"] == count;
+    until(&format!("{count} are known"), knows).await;
+}
+
+fn list(count: u32) -> Value {
+    json!([{"world": arm(), "count": count}])
+}
+
+/// A client's simulation of the world of [`arm`] on this server: whether it was there already.
+async fn is_there(url: &str, pass: &str) -> (bool, Client) {
+    let mut client = Client::connect(&format!("{url}/client")).await;
+    let mut start = json!({"url": arm()});
+    if !pass.is_empty() {
+        start["pass"] = pass.into();
+    }
+    client.send(&json!({ "start": start }).to_string()).await;
+    client.until("webots:").await;
+    let has_started = client
+        .heard
+        .iter()
+        .any(|text| text.starts_with("loading: webots is starting"));
+    (!has_started, client)
+}
+
+#[actix_rt::test]
+async fn each_server_keeps_its_share_and_clients_are_sent_where_one_is() {
+    let site = Site::new(&[4, 2]).await;
+    let session = site.session().set("ready", list(3)).start().await;
+    site.until_ready(&[2, 1]).await;
+    until_known(&session, 3).await;
+    let status = session.status().await;
+    assert_eq!(
+        status["ready"],
+        json!([{"world": arm(), "mode": "x3d", "wanted": 3, "ready": 3}])
+    );
+    assert_eq!(status["servers"][0]["ready"][0]["ready"], 2);
+    assert!(session.monitor().await.contains("kept ready"));
+    // Two come in the line, and one without: none waits for a start.
+    let mut clients = Vec::new();
+    for number in 0..3 {
+        let (url, pass) = if number < 2 {
+            let mut line = Client::connect(&session.websocket("/session")).await;
+            line.send(&json!({"url": arm(), "wait": true}).to_string()).await;
+            let pass = line.until("pass: ").await;
+            (line.until("ws://").await, pass["pass: ".len()..].to_owned())
+        } else {
+            (
+                http::get(&session.url(&format!("/session?url={}", arm()))).await.text(),
+                String::new(),
+            )
+        };
+        let (is_there, client) = is_there(&url, &pass).await;
+        assert!(is_there, "client {number}: {:?}", client.heard);
+        clients.push(client);
+    }
+    // The list is read again.
+    session.reload(json!({"ready": []}));
+    site.until_ready(&[0, 0]).await;
+}
+
+#[actix_rt::test]
+async fn a_lesson_is_requested_until_its_end_and_outlives_a_restart() {
+    let site = Site::new(&[4]).await;
+    let folder = tempfile::tempdir().unwrap();
+    let mut session = site.session().folder(folder.path()).start().await;
+    let ready = async |session: &Server, password: Option<&str>, body: Value| {
+        post(&session.url("/ready"), password, &body.to_string()).await
+    };
+    let lesson = |count: u32| json!({"world": arm(), "count": count, "until": "2999-01-01T09:30", "timeZone": "UTC"});
+    assert_eq!(ready(&session, None, lesson(2)).await, 401);
+    assert_eq!(
+        ready(&session, Some(PASSWORD), json!({"world": arm(), "count": 2})).await,
+        400
+    );
+    assert_eq!(
+        ready(
+            &session,
+            Some(PASSWORD),
+            json!({"world": "x", "count": 2, "until": "2999-01-01"})
+        )
+        .await,
+        400
+    );
+    assert_eq!(ready(&session, Some(PASSWORD), lesson(2)).await, 200);
+    site.until_ready(&[2]).await;
+    session.stops().await;
+    let session = site.session().folder(folder.path()).start().await;
+    until_known(&session, 2).await;
+    assert_eq!(session.status().await["requested"][0]["count"], 2);
+    // The same world again replaces the entry, and 0 ends it.
+    assert_eq!(ready(&session, Some(PASSWORD), lesson(1)).await, 200);
+    site.until_ready(&[1]).await;
+    assert_eq!(ready(&session, Some(PASSWORD), lesson(0)).await, 200);
+    until("none is kept", async || {
+        site.servers[0].status().await["instances"]["spare"] == 0
+    })
+    .await;
+    // One in the past is over.
+    let past = json!({"world": arm(), "count": 2, "until": "2020-01-01"});
+    assert_eq!(ready(&session, Some(PASSWORD), past).await, 200);
+    assert_eq!(session.status().await["ready"], json!([]));
+}
+
+#[actix_rt::test]
+async fn a_server_that_is_full_of_them_takes_clients_of_other_worlds() {
+    let site = Site::new(&[2]).await;
+    let session = site.session().set("ready", list(2)).start().await;
+    site.until_ready(&[2]).await;
+    until_known(&session, 2).await;
+    let mut states = Client::connect(&session.websocket("/session")).await;
+    assert_eq!(states.until("").await, "1", "its slots are as good as free");
+    site._parts
+        .0
+        .commit("lab/other", "main", &[("worlds/o.wbt", crate::support::WORLD)]);
+    let other = crate::support::world("lab/other", "main", "worlds/o.wbt");
+    let mut clients = Vec::new();
+    for _ in 0..2 {
+        let mut line = Client::connect(&session.websocket("/session")).await;
+        line.send(&json!({"url": other, "wait": true}).to_string()).await;
+        let pass = line.until("pass: ").await["pass: ".len()..].to_owned();
+        let url = line.until("ws://").await;
+        let mut client = Client::connect(&format!("{url}/client")).await;
+        client
+            .send(&json!({"start": {"url": other, "pass": pass}}).to_string())
+            .await;
+        client.until("webots:").await;
+        clients.push(client);
+    }
+    assert_eq!(states.until("0").await, "0");
+    assert_eq!(site.servers[0].status().await["instances"]["spare"], 0);
+}
+
+/// Plays a class of 30 within 10 s. Returns the seconds until simulated time passed, sorted.
+async fn class(session: &Server, folder: &std::path::Path) -> Vec<f64> {
+    let json = folder.join("visits.json");
+    let mut rehearse = tokio::process::Command::new(env!("CARGO_BIN_EXE_rehearse"));
+    rehearse
+        .arg(session.url(""))
+        .args([
+            "--world",
+            &arm(),
+            "--clients",
+            "30",
+            "--over",
+            "10s",
+            "--stay",
+            "2s",
+            "--real-time",
+            "0",
+            "--json",
+        ])
+        .arg(&json)
+        .kill_on_drop(true);
+    let played = actix_rt::time::timeout(std::time::Duration::from_mins(4), rehearse.output()).await;
+    let played = played.expect("it ends").unwrap();
+    assert!(played.status.success(), "{played:?}");
+    let report: Value = serde_json::from_str(&std::fs::read_to_string(&json).unwrap()).unwrap();
+    let visits = report["visits"].as_array().unwrap().iter();
+    let mut times: Vec<f64> = visits
+        .filter_map(|visit| visit["steps"]["untilRunning"].as_f64())
+        .collect();
+    times.sort_by(f64::total_cmp);
+    assert_eq!(times.len(), 30, "{report:#}");
+    times
+}
+
+/// The figures of docs/ready.md: `cargo test on_a_quiet_machine_a_class_finds -- --nocapture` prints them.
+#[actix_rt::test]
+async fn on_a_quiet_machine_a_class_finds_its_world_ready() {
+    const SLOW: &str = "#VRML_SIM R2025a utf8\n#demo-simulator: load=8\nWorldInfo { }\n";
+    let folder = tempfile::tempdir().unwrap();
+    let mut medians = Vec::new();
+    for count in [30, 0] {
+        let site = Site::new(&[20, 20]).await;
+        site._parts.0.commit("lab/arm", "main", &[("worlds/a.wbt", SLOW)]);
+        let session = site.session().set("ready", list(count)).start().await;
+        let begin = std::time::Instant::now();
+        while session.status().await["ready"][0]["ready"] != count {
+            assert!(
+                begin.elapsed() < std::time::Duration::from_mins(5),
+                "{:#}",
+                session.status().await["ready"]
+            );
+            actix_rt::time::sleep(std::time::Duration::from_millis(200)).await;
+        }
+        let times = class(&session, folder.path()).await;
+        let logs: String = site.servers.iter().map(Server::log).collect();
+        let taken = logs.matches(": takes it").count();
+        println!(
+            "{count} ready: median {:.2} s, p99 {:.2} s, {taken} taken",
+            times[15], times[29]
+        );
+        assert_eq!(taken, if count == 30 { 30 } else { 0 });
+        medians.push(times[15]);
+    }
+    assert!(medians[0] < 1.0 && medians[1] > 8.0, "{medians:?}");
+}
