@@ -203,7 +203,7 @@ impl LineKeeper {
         let entry = |one: WaitingClient| ClassEntry {
             id: format!("waiting-{:x}", one.place.number),
             server: None,
-            world: one.world.to_owned(),
+            world: one.world.to_string(),
             user: one.user.map(str::to_owned),
             label: one.label.map(str::to_owned),
             state: ClassState::Waiting,

@@ -38,8 +38,8 @@ pub struct Entry<Client> {
 pub struct WaitingClient<'line> {
     /// Its place.
     pub place: Place,
-    /// The URL of its world.
-    pub world: &'line str,
+    /// Its world.
+    pub world: &'line ProjectUrl,
     /// Its user.
     pub user: Option<&'line str>,
     /// The name that it has chosen.
@@ -66,8 +66,6 @@ pub(super) struct Group {
 /// A client in the line.
 #[derive(Debug)]
 pub(super) struct Waiting<Client> {
-    /// The URL of its world.
-    world: Box<str>,
     label: Option<Box<str>>,
     pub(super) group: Arc<Group>,
     pub(super) world: ProjectUrl,
@@ -120,14 +118,12 @@ impl<Client: Clone> WaitingLine<Client> {
             displaced = self.remove(before).map(|waiting| waiting.client).or(displaced);
         }
         let repository = entry.world.repository().to_lowercase();
-        let world = entry.world.to_string().into_boxed_str();
         let (group, count) = self.groups.entry(repository.clone()).or_insert_with(|| {
             let world = entry.world.clone();
             (Arc::new(Group { world, repository }), 0)
         });
         *count += 1;
         let waiting = Waiting {
-            world,
             label: entry.label.map(String::into_boxed_str),
             group: Arc::clone(group),
             world: entry.world,
