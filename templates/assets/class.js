@@ -71,7 +71,7 @@ function cell(label, value, ...children) {
 
 const none = () => make('span', { className: 'none' }, '–');
 
-/** Who it is. Those with one name are told apart by the number of their simulation. @param {Entry} entry */
+/** Who it is. Those with one name are told apart by the number of their simulation at its server. @param {Entry} entry */
 function who(entry) {
   const head = make('th', {});
   head.setAttribute('role', 'rowheader');
@@ -86,7 +86,8 @@ function who(entry) {
   if (!nameOf(entry)) {
     head.append(none());
   } else if ((names.get(nameOf(entry)) ?? 0) > 1) {
-    head.append(make('small', { className: 'twin' }, `no. ${numberOf(entry)}`));
+    const where = entry.server ? ` at ${entry.server}` : '';
+    head.append(make('small', { className: 'twin' }, `no. ${numberOf(entry)}${where}`));
   }
   return head;
 }

@@ -7,11 +7,10 @@ from case import BrowserTest
 from fleet import WORLD
 from playwright.sync_api import expect
 from roster import RosterServer
-from students import start_all
+from students import START, start_all
 
 PASSWORD = "open sesame"
 KEY = "a key of a whole fleet"
-NAMES = ["Nora 14", "Nora 1", "Ben <b>", "Chloe", "Chloe"]
 
 
 class OneClass(BrowserTest):
@@ -21,7 +20,6 @@ class OneClass(BrowserTest):
     def start(self, names, world="carousel"):
         """A page whose students have simulations."""
         page = self.open(self.fleet.session.url("viewer"))
-        page.tab.evaluate("""() => { window.label = (name) => name; }""")
         start_all(page, names, lambda name: None, WORLD.format(world))
         return page
 
@@ -87,6 +85,29 @@ class OneClass(BrowserTest):
         page.tab.get_by_role("button", name="Sign out").click()
         page.tab.goto(self.fleet.session.url("class"))
         expect(page.tab.get_by_label("Password")).to_be_visible()
+
+    def test_names_are_text_and_two_with_one_name_are_told_apart(self):
+        students = self.open(self.fleet.session.url("viewer"))
+        evil = "<img src=x onerror=\"document.title='evil'\">"
+        for name in ["Nora 14", "Nora 1", "Chloe", "Chloe", evil]:
+            students.tab.evaluate(START, [WORLD.format("carousel"), name])
+        students.tab.evaluate("Promise.all(simulations)")
+        page = self.teacher(width=390, height=844)
+        expect(page.tab.locator("#class tr")).to_have_count(5)
+        self.assertEqual(page.tab.locator("#class img").count(), 0)
+        self.assertNotEqual(page.tab.title(), "evil")
+        expect(page.tab.locator("#class")).to_contain_text(evil)
+        self.assertEqual((page.faults(), page.overflow()), ([], 0))
+        field = page.tab.get_by_label("Name, world or server")
+        field.fill("Nora 14")
+        expect(page.tab.locator("#filtered")).to_have_text("1 of 5")
+        field.fill("chloe")
+        twins = page.tab.locator("#class tr:visible .twin")
+        expect(twins).to_have_count(2)
+        self.assertEqual(len(set(twins.all_inner_texts())), 2)
+        students.close()
+        field.fill("")
+        expect(page.tab.locator("#class tr")).to_have_count(0)
 
     def test_two_hundred_on_four_servers_are_in_hand(self):
         worlds = [WORLD.format(name) for name in ("arm", "maze")]
