@@ -235,6 +235,7 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
         config.waiting_line,
         config.max_places_per_address,
         config.max_places_per_user,
+        config.timing.yield_after,
         config.timing.pass,
         ends.clone(),
     );

@@ -35,6 +35,8 @@ pub struct NewClient {
     pub view: View,
     /// Whether it may come back.
     pub resumable: bool,
+    /// Whether it may also come back before the simulation is ready.
+    pub early: bool,
 }
 
 /// Messages from a session to its client.

@@ -2,7 +2,7 @@
 //!
 //! | from the client (JSON) | |
 //! |---|---|
-//! | `{"start": {"url": WORLD, "mode": "x3d" \| "w3d" \| "mjpeg", "resumable": true, "name": NAME, "pass": PASS}}` | start a simulation; `resumable`: its client may resume it; `name`: what the client calls itself; `pass`: for a slot that is reserved for it |
+//! | `{"start": {"url": WORLD, "mode": "x3d" \| "w3d" \| "mjpeg", "resumable": true, "early": true, "name": NAME, "pass": PASS}}` | start a simulation; `resumable`: its client may resume it, with `early` from the first moment; `name`: what the client calls itself; `pass`: for a slot that is reserved for it |
 //! | `{"resume": TOKEN}` | resume a simulation |
 //! | `{"keep": true}` | keep a paused simulation: its idle timeout begins again |
 //! | `{"reset controller": "NAME/FILE"}` | restore a file below `controllers/` |
@@ -66,6 +66,8 @@ pub struct Start {
     pub mode: Option<Mode>,
     /// Whether its client may resume it after its connection has broken.
     pub resumable: Option<bool>,
+    /// Whether its client may also resume it while it waits or starts.
+    pub early: Option<bool>,
     /// What its client calls itself.
     pub name: Option<String>,
     /// Its pass to a reserved slot, from the line of a session server.
@@ -305,6 +307,7 @@ mod tests {
                 url: "https://x".to_owned(),
                 mode,
                 resumable,
+                early: None,
                 name: name.map(str::to_owned),
                 pass: None,
             };

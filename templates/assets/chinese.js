@@ -124,7 +124,7 @@ export const words = {
   },
   lost: {
     since: (seconds) => `连接已中断 ${duration(seconds)}。`,
-    waits: (seconds) => (seconds > 0 ? `您的仿真还会等待 ${duration(seconds)}。` : '您的仿真可能已经结束。'),
+    waits: (seconds) => (seconds > 0 ? `您的仿真最多还会等待 ${duration(seconds)}。` : '您的仿真可能已经结束。'),
     said: (seconds) => `没有连接。${words.lost.waits(seconds)}`,
     found: '连接已恢复。',
   },
@@ -136,12 +136,15 @@ export const words = {
     'session-silent': '会话服务器没有响应。',
     'server-unreachable': '无法连接仿真服务器，或它关闭了连接。',
     'broken-before': '仿真运行之前，与仿真服务器的连接中断了。',
+    'server-lost': '服务器已失联。您的仿真已结束，请重新启动。',
+    'origin-refused': '仿真服务器不为本网站的页面启动仿真。',
     broken: '与仿真服务器的连接中断：仿真已结束。',
     absent: ({ since }) => `连接中断了 ${duration(since)}：仿真已结束。`,
     'simulator-unreachable': ({ address }) => `无法在 ${address} 连接仿真器。`,
     'no-scene': ({ why }) => words.scene[why],
   },
   scene: {
+    'no-frame': '无法显示 Webots 视图：其服务器不允许本网站的页面嵌入它（配置项 frameAncestors）。',
     'no-webgl': '无法显示场景：此浏览器没有 WebGL，不能绘图。',
     unreadable: '无法显示场景：仿真器发送的场景无法读取。',
   },
@@ -216,6 +219,7 @@ export const words = {
     project: '问题来自世界或它的项目。请修改它，或重新连接。',
     takenOver: '另一个标签页或窗口正在显示它。在这里连接可以得到此标签页自己的仿真。',
     teacher: '重新连接之前，请先询问管理员。',
+    origin: '其管理员可以允许本网站（配置项 allowedOrigins）。',
     firewall: '可能被防火墙阻挡：仿真服务器端口之后的端口必须开放或转发。',
   },
   viewer: {

@@ -179,8 +179,11 @@ export class WebotsSimulation extends HTMLElement {
   /** Goes on with what this tab has kept, or starts by itself. */
   #begin() {
     const calls = this.#calls.splice(0);
-    const isRestored = calls.length === 0 && this.#runner?.restore();
-    if (!isRestored && calls.length === 0 && this.hasAttribute('autostart')) {
+    const wish = calls.length === 0 ? this.#runner?.restore() : undefined;
+    if (wish) {
+      // Nobody has seen it run yet.
+      this.#plays = this.hasAttribute('autoplay') && !wish.simulation?.hasRun;
+    } else if (calls.length === 0 && this.hasAttribute('autostart')) {
       this.start();
     }
     for (const call of calls) {
@@ -271,7 +274,12 @@ export class WebotsSimulation extends HTMLElement {
     const words = this.#panel?.words;
     const reason = reasonOf(problem);
     const code = 'code' in problem ? problem.code : (reason?.code ?? 'unknown');
-    this.#dispatch('ended', { ...reason, code, message: words && problemText(problem, words) });
+    const message = words ? problemText(problem, words) : code;
+    if (code === 'origin-refused' || ('why' in problem && problem.why === 'no-frame')) {
+      // biome-ignore lint/suspicious/noConsole: who writes the page looks there first.
+      console.error(`${NAME}: ${message} (${location.origin})`);
+    }
+    this.#dispatch('ended', { ...reason, code, message });
   }
 }
 

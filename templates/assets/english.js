@@ -141,7 +141,7 @@ export const words = {
     since: (seconds) => `No connection for ${duration(seconds)}.`,
     /** @param {number} seconds */
     waits: (seconds) =>
-      seconds > 0 ? `Your simulation waits another ${duration(seconds)}.` : 'Your simulation may have ended.',
+      seconds > 0 ? `Your simulation waits up to another ${duration(seconds)}.` : 'Your simulation may have ended.',
     /** @param {number} seconds */
     said: (seconds) => `No connection. ${words.lost.waits(seconds)}`,
     found: 'The connection is there again.',
@@ -159,6 +159,8 @@ export const words = {
     'session-silent': 'The session server does not answer.',
     'server-unreachable': 'The simulation server could not be reached, or has closed the connection.',
     'broken-before': 'The connection to the simulation server broke before the simulation ran.',
+    'server-lost': 'The server was lost. Your simulation is over; start it again.',
+    'origin-refused': 'The simulation server starts nothing for pages of this site.',
     broken: 'The connection to the simulation server broke: the simulation has ended.',
     /** @param {Extract<OwnProblem, { code: 'absent' }>} problem */
     absent: ({ since }) => `There was no connection for ${duration(since)}: the simulation has ended.`,
@@ -169,6 +171,7 @@ export const words = {
   },
   /** Why a scene can't be shown. */
   scene: {
+    'no-frame': 'Webots’ viewer can’t be shown: its server lets no pages of this site frame it (key frameAncestors).',
     'no-webgl': 'The scene can’t be shown: this browser offers no WebGL, so that nothing can be drawn.',
     unreadable: 'The scene can’t be shown: the simulator has sent a scene that can’t be read.',
   },
@@ -194,6 +197,7 @@ export const words = {
     project: 'It comes from the world or its project. Change that, or connect again.',
     takenOver: 'Another tab, or another window, shows it now. Connect here for a simulation of this tab’s own.',
     teacher: 'Ask the administrator before you connect again.',
+    origin: 'Its administrator can allow the site (key allowedOrigins).',
     firewall:
       'A firewall may be in the way: the ports above the simulation server’s own have to be open, or forwarded.',
   },

@@ -130,7 +130,9 @@ export const words = {
   lost: {
     since: (seconds) => `Pas de connexion depuis ${duration(seconds)}.`,
     waits: (seconds) =>
-      seconds > 0 ? `Votre simulation attend encore ${duration(seconds)}.` : 'Votre simulation est peut-être terminée.',
+      seconds > 0
+        ? `Votre simulation attend encore au plus ${duration(seconds)}.`
+        : 'Votre simulation est peut-être terminée.',
     said: (seconds) => `Pas de connexion. ${words.lost.waits(seconds)}`,
     found: 'La connexion est rétablie.',
   },
@@ -142,12 +144,16 @@ export const words = {
     'session-silent': 'Le serveur de sessions ne répond pas.',
     'server-unreachable': 'Le serveur de simulation est injoignable ou a fermé la connexion.',
     'broken-before': 'La connexion au serveur de simulation a été coupée avant que la simulation ne tourne.',
+    'server-lost': 'Le serveur a été perdu. Votre simulation est terminée ; démarrez-la de nouveau.',
+    'origin-refused': 'Le serveur de simulation ne démarre rien pour les pages de ce site.',
     broken: 'La connexion au serveur de simulation a été coupée : la simulation est terminée.',
     absent: ({ since }) => `La connexion a été coupée pendant ${duration(since)} : la simulation est terminée.`,
     'simulator-unreachable': ({ address }) => `Le simulateur est injoignable à l’adresse ${address}.`,
     'no-scene': ({ why }) => words.scene[why],
   },
   scene: {
+    'no-frame':
+      'La vue de Webots ne peut pas être affichée : son serveur n’accepte pas de cadre dans les pages de ce site (clé frameAncestors).',
     'no-webgl': 'La scène ne peut pas être affichée : ce navigateur n’a pas WebGL et ne peut rien dessiner.',
     unreadable: 'La scène ne peut pas être affichée : le simulateur a envoyé une scène illisible.',
   },
@@ -227,6 +233,7 @@ export const words = {
     takenOver:
       'Un autre onglet ou une autre fenêtre l’affiche maintenant. Connectez-vous ici pour une simulation propre à cet onglet.',
     teacher: 'Demandez à l’administrateur avant de vous reconnecter.',
+    origin: 'Son administrateur peut autoriser le site (clé allowedOrigins).',
     firewall:
       'Un pare-feu fait peut-être obstacle : les ports au-dessus de celui du serveur de simulation doivent être ouverts ou redirigés.',
   },

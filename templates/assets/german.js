@@ -131,7 +131,9 @@ export const words = {
   lost: {
     since: (seconds) => `Keine Verbindung seit ${duration(seconds)}.`,
     waits: (seconds) =>
-      seconds > 0 ? `Deine Simulation wartet noch ${duration(seconds)}.` : 'Deine Simulation ist vielleicht beendet.',
+      seconds > 0
+        ? `Deine Simulation wartet höchstens noch ${duration(seconds)}.`
+        : 'Deine Simulation ist vielleicht beendet.',
     said: (seconds) => `Keine Verbindung. ${words.lost.waits(seconds)}`,
     found: 'Die Verbindung ist wieder da.',
   },
@@ -143,12 +145,16 @@ export const words = {
     'session-silent': 'Der Sitzungsserver antwortet nicht.',
     'server-unreachable': 'Der Simulationsserver ist nicht erreichbar oder hat die Verbindung geschlossen.',
     'broken-before': 'Die Verbindung zum Simulationsserver brach ab, bevor die Simulation lief.',
+    'server-lost': 'Der Server ist ausgefallen. Deine Simulation ist beendet; starte sie neu.',
+    'origin-refused': 'Der Simulationsserver startet nichts für Seiten dieser Website.',
     broken: 'Die Verbindung zum Simulationsserver brach ab: Die Simulation ist beendet.',
     absent: ({ since }) => `Die Verbindung war ${duration(since)} lang unterbrochen: Die Simulation ist beendet.`,
     'simulator-unreachable': ({ address }) => `Der Simulator ist unter ${address} nicht erreichbar.`,
     'no-scene': ({ why }) => words.scene[why],
   },
   scene: {
+    'no-frame':
+      'Die Ansicht von Webots kann nicht gezeigt werden: Ihr Server erlaubt keine Rahmen auf Seiten dieser Website (Schlüssel frameAncestors).',
     'no-webgl': 'Die Szene lässt sich nicht zeigen: Dieser Browser hat kein WebGL und kann nichts zeichnen.',
     unreadable: 'Die Szene lässt sich nicht zeigen: Der Simulator hat eine unlesbare Szene gesendet.',
   },
@@ -226,6 +232,7 @@ export const words = {
     takenOver:
       'Ein anderer Tab oder ein anderes Fenster zeigt sie jetzt. Verbinde dich hier, um eine eigene Simulation zu starten.',
     teacher: 'Frage die Administration, bevor du dich neu verbindest.',
+    origin: 'Wer ihn verwaltet, kann die Website erlauben (Schlüssel allowedOrigins).',
     firewall:
       'Vielleicht ist eine Firewall im Weg: Die Ports oberhalb des Ports des Simulationsservers müssen offen oder weitergeleitet sein.',
   },

@@ -127,7 +127,7 @@ export const words = {
     since: (seconds) => `接続が切れてから ${duration(seconds)}たちました。`,
     waits: (seconds) =>
       seconds > 0
-        ? `シミュレーションはあと ${duration(seconds)}待ちます。`
+        ? `シミュレーションはあと最大 ${duration(seconds)}待ちます。`
         : 'シミュレーションは終了した可能性があります。',
     said: (seconds) => `接続がありません。${words.lost.waits(seconds)}`,
     found: '接続が回復しました。',
@@ -140,12 +140,16 @@ export const words = {
     'session-silent': 'セッションサーバーが応答しません。',
     'server-unreachable': 'シミュレーションサーバーに接続できないか、接続が閉じられました。',
     'broken-before': 'シミュレーションが動く前に、サーバーとの接続が切れました。',
+    'server-lost': 'サーバーが失われました。シミュレーションは終了しました。もう一度開始してください。',
+    'origin-refused': 'シミュレーションサーバーは、このサイトのページからは開始しません。',
     broken: 'サーバーとの接続が切れました。シミュレーションは終了しました。',
     absent: ({ since }) => `${duration(since)}のあいだ接続がありませんでした。シミュレーションは終了しました。`,
     'simulator-unreachable': ({ address }) => `${address} のシミュレーターに接続できません。`,
     'no-scene': ({ why }) => words.scene[why],
   },
   scene: {
+    'no-frame':
+      'Webots のビューアーを表示できません。サーバーがこのサイトのページへの埋め込みを許可していません（キー frameAncestors）。',
     'no-webgl': 'シーンを表示できません。このブラウザーには WebGL がなく、描画できません。',
     unreadable: 'シーンを表示できません。シミュレーターが送ったシーンを読み取れません。',
   },
@@ -224,6 +228,7 @@ export const words = {
     project: 'ワールドまたはそのプロジェクトに原因があります。修正するか、もう一度接続してください。',
     takenOver: '別のタブまたはウィンドウで表示されています。ここで接続すると、このタブのシミュレーションが始まります。',
     teacher: '接続し直す前に、管理者に聞いてください。',
+    origin: '管理者がこのサイトを許可できます（キー allowedOrigins）。',
     firewall:
       'ファイアウォールが妨げている可能性があります。シミュレーションサーバーのポートより上のポートを開くか、転送する必要があります。',
   },

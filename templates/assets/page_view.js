@@ -143,7 +143,14 @@ function problemAdvice(problem, words) {
   if ('sentence' in problem) {
     return words.advice[adviceFor(problem.reason?.code)];
   }
-  return words.advice[problem.code === 'simulator-unreachable' ? 'firewall' : 'general'];
+  /** @type {Partial<Record<import('./visit.js').OwnProblem['code'], import('./reasons.js').AdviceName>>} */
+  const own = {
+    'simulator-unreachable': 'firewall',
+    'server-lost': 'again',
+    absent: 'again',
+    'origin-refused': 'origin',
+  };
+  return words.advice[own[problem.code] ?? 'general'];
 }
 
 /**
@@ -232,6 +239,9 @@ function connectedProgress(state, words) {
       return { at: 'simulation', is, notes: { ...ready, simulation: note } };
     }
     case 'lost':
+      if (!state.hasRun) {
+        return { at: 'server', is: 'doing', notes: { session, server: words.steps.returning } };
+      }
       return {
         at: 'simulation',
         is: state.wasShown ? 'done' : 'doing',

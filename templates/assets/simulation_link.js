@@ -8,12 +8,19 @@ import { SimulationReader } from './messages.js';
 /** Time to wait for the close code after a sentence without a reason, in milliseconds. */
 const CLOSING = 1000;
 
+/** Timeout of the question why a connection could not be opened, in milliseconds. */
+const WHY = 3000;
+
+/** The failure, if the server has sent one, and the close code, if it is known. `isForbidden`: the server accepts no
+ * connections of pages of this site.
+ * @typedef {{ code?: number | undefined, failure?: Failure | undefined, isForbidden?: boolean }} Closed
+ */
+
 /**
- * What happens on the connection. `closed` is the last event: with the failure, if the server has sent one, and the
- * close code, if it is known.
+ * What happens on the connection. `closed` is the last event.
  * @typedef {{ type: 'opened' }
  *   | { type: 'message', message: Message }
- *   | { type: 'closed', code?: number | undefined, failure?: Failure | undefined }} LinkEvent
+ *   | ({ type: 'closed' } & Closed)} LinkEvent
  */
 
 export class SimulationLink {
@@ -21,6 +28,7 @@ export class SimulationLink {
   #reader = new SimulationReader();
   #tell;
   #isOver = false;
+  #isOpen = false;
   /** @type {Failure | undefined} */
   #failure;
 
@@ -37,11 +45,17 @@ export class SimulationLink {
       if (this.#isOver) {
         return;
       }
+      this.#isOpen = true;
       this.send(request);
       tell({ type: 'opened' });
     });
     this.#socket.addEventListener('message', ({ data }) => this.#read(String(data)));
-    this.#socket.addEventListener('close', ({ code }) => this.#end(code));
+    const url = `${server}/client`.replace(/^ws/, 'http');
+    this.#socket.addEventListener('close', async ({ code }) => {
+      // A browser does not tell why a connection could not be opened.
+      const isForbidden = !this.#isOpen && 'start' in request && (await forbids(url));
+      this.#end(code, isForbidden);
+    });
   }
 
   /** @param {string} text */
@@ -63,13 +77,16 @@ export class SimulationLink {
     }
   }
 
-  /** @param {number} [code] */
-  #end(code) {
+  /**
+   * @param {number} [code]
+   * @param {boolean} [isForbidden]
+   */
+  #end(code, isForbidden) {
     if (this.#isOver) {
       return;
     }
     this.#isOver = true;
-    this.#tell({ type: 'closed', code, failure: this.#failure });
+    this.#tell({ type: 'closed', code, failure: this.#failure, ...(isForbidden && { isForbidden }) });
   }
 
   /** @param {object} message */
@@ -90,4 +107,13 @@ export class SimulationLink {
     this.#isOver = true;
     this.#socket.close(1000);
   }
+}
+
+/**
+ * Whether the server refuses pages of this site.
+ * @param {string} url
+ */
+async function forbids(url) {
+  const answer = await fetch(url, { signal: AbortSignal.timeout(WHY) }).catch(() => undefined);
+  return answer?.status === 403;
 }

@@ -6,6 +6,9 @@ import { Drawing } from './draw.js';
 import { Scene, SceneError } from './scene.js';
 import { Stream } from './stream.js';
 
+export { SceneError } from './scene.js';
+export { isDemonstration } from './stream.js';
+
 /** @typedef {import('./stream.js').Mode} Mode */
 
 /** Number of lines of the simulation's console that are kept. */

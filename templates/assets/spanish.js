@@ -130,7 +130,9 @@ export const words = {
   lost: {
     since: (seconds) => `Sin conexión desde hace ${duration(seconds)}.`,
     waits: (seconds) =>
-      seconds > 0 ? `Tu simulación espera todavía ${duration(seconds)}.` : 'Puede que tu simulación haya terminado.',
+      seconds > 0
+        ? `Tu simulación espera todavía como mucho ${duration(seconds)}.`
+        : 'Puede que tu simulación haya terminado.',
     said: (seconds) => `Sin conexión. ${words.lost.waits(seconds)}`,
     found: 'La conexión ha vuelto.',
   },
@@ -142,12 +144,16 @@ export const words = {
     'session-silent': 'El servidor de sesiones no responde.',
     'server-unreachable': 'No se pudo alcanzar el servidor de simulación, o ha cerrado la conexión.',
     'broken-before': 'La conexión con el servidor de simulación se cortó antes de que funcionara la simulación.',
+    'server-lost': 'Se perdió el servidor. Tu simulación ha terminado; iníciala de nuevo.',
+    'origin-refused': 'El servidor de simulación no inicia nada para páginas de este sitio.',
     broken: 'La conexión con el servidor de simulación se cortó: la simulación ha terminado.',
     absent: ({ since }) => `No hubo conexión durante ${duration(since)}: la simulación ha terminado.`,
     'simulator-unreachable': ({ address }) => `No se pudo alcanzar el simulador en ${address}.`,
     'no-scene': ({ why }) => words.scene[why],
   },
   scene: {
+    'no-frame':
+      'No se puede mostrar la vista de Webots: su servidor no admite marcos en páginas de este sitio (clave frameAncestors).',
     'no-webgl': 'No se puede mostrar la escena: este navegador no tiene WebGL y no puede dibujar nada.',
     unreadable: 'No se puede mostrar la escena: el simulador ha enviado una escena ilegible.',
   },
@@ -227,6 +233,7 @@ export const words = {
     takenOver:
       'Otra pestaña u otra ventana la muestra ahora. Conéctate aquí para tener una simulación propia de esta pestaña.',
     teacher: 'Pregunta al administrador antes de conectarte de nuevo.',
+    origin: 'Su administrador puede permitir el sitio (clave allowedOrigins).',
     firewall:
       'Puede que un cortafuegos lo impida: los puertos por encima del puerto del servidor de simulación tienen que estar abiertos o redirigidos.',
   },

@@ -1,9 +1,12 @@
 // The place of the scene: chooses between Webots' own viewer and the small one, and shows it.
 
-import { SceneError } from './scene.js';
-import { SmallViewer } from './small_viewer.js';
-import { isDemonstration } from './stream.js';
+/** The small viewer is loaded once there is something to show: the first picture of the page comes sooner. */
+const small = () => import('./small_viewer.js');
 
+/** Time in which the page of Webots' own viewer reports after its frame has loaded, in milliseconds. */
+const REPORT = 2000;
+/** What that page reports. */
+const HERE = 'webots-viewer';
 /** Least time between two signs of life that are passed on, in milliseconds. */
 const HEARD = 500;
 
@@ -53,14 +56,15 @@ export class Stage {
     this.#shows += 1;
     const show = this.#shows;
     const webots = viewer === 'small' ? undefined : ((await ownViewer(server)) ?? script);
-    const isSmall = !webots || (viewer === 'automatic' && (await isDemonstration(address, kind)));
+    const isSmall = !webots || (viewer === 'automatic' && (await (await small()).isDemonstration(address, kind)));
+    const viewers = isSmall ? await small() : undefined;
     if (show !== this.#shows) {
       return;
     }
     this.#viewer?.close();
-    if (isSmall) {
-      this.#showSmall(address, kind, isBack);
-    } else {
+    if (viewers) {
+      this.#showSmall(viewers, address, kind, isBack);
+    } else if (webots) {
       this.#showWebots(address, webots);
     }
     if (isSmall && viewer === 'webots') {
@@ -69,11 +73,12 @@ export class Stage {
   }
 
   /**
+   * @param {typeof import('./small_viewer.js')} viewers
    * @param {string} address
    * @param {string | undefined} kind
    * @param {boolean} isBack
    */
-  #showSmall(address, kind, isBack) {
+  #showSmall({ SmallViewer, SceneError }, address, kind, isBack) {
     const show = this.#shows;
     /** @param {VisitEvent} event */
     const tell = (event) => {
@@ -131,6 +136,20 @@ export class Stage {
     frame.allow = 'fullscreen';
     const wanted = new URLSearchParams({ script, stream: address, lang: this.#words.language });
     frame.src = new URL(`webots-viewer#${wanted}`, this.#base).href;
+    const listening = new AbortController();
+    let isHere = false;
+    const hear = (/** @type {MessageEvent} */ { source, data }) => {
+      isHere ||= source === frame.contentWindow && data === HERE;
+    };
+    addEventListener('message', hear, { signal: listening.signal });
+    const show = this.#shows;
+    // A page that may not be framed here loads as well, but is not that page.
+    const check = () => {
+      if (!isHere && show === this.#shows) {
+        this.#tell({ type: 'sceneFailed', why: 'no-frame' });
+      }
+    };
+    frame.addEventListener('load', () => setTimeout(check, REPORT), { once: true });
     this.#element.replaceChildren(frame);
     /** The frame has no origin. @type {(text: string) => void} */
     const send = (text) => frame.contentWindow?.postMessage(text, '*');
@@ -138,7 +157,10 @@ export class Stage {
       play: () => send('real-time:-1'),
       pause: () => send('pause'),
       reset: () => send('reset'),
-      close: () => frame.remove(),
+      close: () => {
+        listening.abort();
+        frame.remove();
+      },
     };
     this.#tell({ type: 'scene', scene: { is: 'framed' } });
   }

@@ -15,7 +15,7 @@ import { helpsToWait } from './reasons.js';
 /** @typedef {import('./messages.js').Resumption} Resumption */
 
 /** What a problem that the page itself has found consists of. Times in seconds.
- * @typedef {{ code: 'session-unreachable' | 'session-silent' | 'server-unreachable' | 'broken-before' | 'broken' }
+ * @typedef {{ code: 'session-unreachable' | 'session-silent' | 'server-unreachable' | 'server-lost' | 'broken-before' | 'broken' | 'origin-refused' }
  *   | { code: 'absent', since: number }
  *   | { code: 'simulator-unreachable', address: string }
  *   | { code: 'no-scene', why: import('./scene.js').SceneProblem }} OwnProblem
@@ -57,15 +57,17 @@ import { helpsToWait } from './reasons.js';
  *   | { is: 'redirected', goal: Goal, why: Problem, until: number }} Unconnected
  */
 
-/** @typedef {Target & { is: 'connecting', place: { is: 'opening' } | { is: 'asked' } | { is: 'queued', ahead: number } }} Connecting */
-/** @typedef {Target & { is: 'starting', phase: 'checkout' | 'launch', progress?: Extract<Message, { is: 'progress' }> | undefined, facts: Facts }} Starting */
+/** The states on the way to a simulation; one that was accepted may have a token to return with. */
+/** @typedef {Target & { is: 'connecting', resumption?: Resumption | undefined, place: { is: 'opening' } | { is: 'asked' } | { is: 'queued', ahead: number } }} Connecting */
+/** @typedef {Target & { is: 'starting', resumption?: Resumption | undefined, phase: 'checkout' | 'launch', progress?: Extract<Message, { is: 'progress' }> | undefined, facts: Facts }} Starting */
 /** `heardAt`: the last sign of life of the server or the simulator; `tickedAt`: the last tick.
  * @typedef {Target & { is: 'running', address: string, scene: Scene, facts: Facts, heardAt: number, tickedAt: number,
  *   resumption?: Resumption | undefined }} Running
  */
-/** The simulation waits for this page, which tries to return. `wasShown`: the page still shows its scene;
+/** The simulation waits for this page, which tries to return. `hasRun`: its simulator was ready, as far as the page knows;
+ * `wasShown`: the page still shows its scene;
  * `refusedSince`: since when its server refuses all attempts although the session server answers.
- * @typedef {Target & { is: 'lost', facts: Facts, heardAt: number, resumption: Resumption, wasShown: boolean, isTold: boolean,
+ * @typedef {Target & { is: 'lost', facts: Facts, heardAt: number, resumption: Resumption, hasRun: boolean, wasShown: boolean, isTold: boolean,
  *   tries: number, nextTry: number, refusedSince?: number | undefined }} Lost
  */
 /** @typedef {Connecting | Starting | Running | Lost} Connected */
@@ -83,7 +85,9 @@ import { helpsToWait } from './reasons.js';
  * @typedef {{ fleet: Fleet, state: State, asked: number, wakeAt: number | undefined }} Visit
  */
 
-/** @typedef {{ server: string, world: string } & Resumption} Kept a simulation that this tab can resume */
+/** A simulation that this tab can resume.
+ * @typedef {{ server: string, world: string, hasRun: boolean } & Resumption} Kept
+ */
 
 /**
  * @typedef {{ type: 'submitted', world: string }
@@ -211,7 +215,7 @@ export function isConnected(state) {
  * @param {State} state
  */
 export function resumptionOf(state) {
-  return state.is === 'running' || state.is === 'lost' ? state.resumption : undefined;
+  return isConnected(state) ? state.resumption : undefined;
 }
 
 /**
@@ -271,7 +275,10 @@ function ask(goal, { fleet, asked, now }, waitsFor, before = []) {
   const id = asked + 1;
   /** @type {State} */
   const asking = { is: 'asking', goal, id, until: now + ANSWER, waitsFor };
-  if (fleet === 'connecting' || fleet === 'unreachable') {
+  if (fleet === 'connecting') {
+    return { to: { ...asking, id: NOT_ASKED }, effects: before };
+  }
+  if (fleet === 'unreachable') {
     return { to: end({ code: 'session-unreachable' }, asking), effects: before };
   }
   return { to: asking, effects: [...before, { do: 'ask', id, world: goal.world }] };
@@ -287,9 +294,11 @@ function whileAsking(state, event, around) {
   if (event.type === 'disconnected') {
     return { to: state.line ? inLine(state.goal, state.line) : end({ code: 'session-unreachable' }, state) };
   }
-  if (event.type === 'available' && state.line && state.id === NOT_ASKED) {
+  if (event.type === 'available' && state.id === NOT_ASKED) {
     const { to, effects } = ask(state.goal, around);
-    return to.is === 'asking' ? { to: { ...to, line: state.line }, ...(effects && { effects }) } : undefined;
+    return to.is === 'asking'
+      ? { to: { ...to, ...(state.line && { line: state.line }) }, ...(effects && { effects }) }
+      : undefined;
   }
   if (event.type === 'tick' && state.until !== undefined && around.now >= state.until) {
     return { to: end({ code: 'session-silent' }, state) };
@@ -402,34 +411,77 @@ function whileStarting(state, event, around) {
     return undefined;
   }
   const { message } = event;
-  const { goal, server, isRestored } = state;
-  const target = { goal, server, isRestored };
-  const facts = factsAfter(state.is === 'starting' ? state.facts : { isWatched: false }, message, around.now);
+  if (message.is === 'ready') {
+    const facts = factsAfter(state.is === 'starting' ? state.facts : { isWatched: false }, message, around.now);
+    return run(state, message, facts, false, around.now, state.resumption);
+  }
+  if (message.is === 'resumable') {
+    return keep(state, message.resumption, false);
+  }
+  const to = startGoesOn(state, message, around.now);
+  return to && { to };
+}
+
+/**
+ * The state after a message about a start. `undefined`: it says nothing about it.
+ * @param {Connecting | Starting | Lost} state
+ * @param {Message} message
+ * @param {number} now
+ * @returns {Connecting | Starting | undefined}
+ */
+function startGoesOn(state, message, now) {
+  const { goal, server, isRestored, resumption } = state;
+  const target = { goal, server, isRestored, resumption };
+  const facts = factsAfter('facts' in state ? state.facts : { isWatched: false }, message, now);
   const phase = state.is === 'starting' ? state.phase : 'checkout';
   switch (message.is) {
     case 'queued':
-      return { to: { ...target, is: 'connecting', place: { is: 'queued', ahead: message.ahead } } };
+      return { ...target, is: 'connecting', place: { is: 'queued', ahead: message.ahead } };
     case 'progress':
-      return { to: { ...target, is: 'starting', phase, progress: message, facts } };
+      return {
+        ...target,
+        is: 'starting',
+        phase: message.step === 'launch' ? 'launch' : phase,
+        progress: message,
+        facts,
+      };
     case 'launched':
-      return { to: { ...target, is: 'starting', phase: 'launch', facts } };
-    case 'ready':
-      return run(target, message, facts, false, around.now);
+      return { ...target, is: 'starting', phase: 'launch', facts };
     default:
-      return state.is === 'starting' ? { to: { ...state, facts } } : undefined;
+      return state.is === 'starting' ? { ...state, facts } : undefined;
   }
 }
 
 /**
- * A start has failed: perhaps another server can do it, or this one later.
- * @param {Connecting | Starting} state
- * @param {{ code?: number | undefined, failure?: Failure | undefined }} closed
+ * The page has got a token to return with, which replaces the one before.
+ * @template {Connecting | Starting | Running | Lost} T
+ * @param {T} state
+ * @param {Resumption} resumption
+ * @param {boolean} hasRun
+ * @returns {{ to: T, effects: Effect[] }}
+ */
+function keep(state, resumption, hasRun) {
+  const { server, goal } = state;
+  const kept = { ...resumption, server, world: goal.world, hasRun };
+  return { to: { ...state, resumption }, effects: [{ do: 'store', kept }] };
+}
+
+/**
+ * A start has failed: perhaps another server can do it, or this one later; or the page finds it again.
+ * @param {Connecting | Starting | Lost} state
+ * @param {import('./simulation_link.js').Closed} closed
  * @param {Surroundings} around
  * @returns {Transition}
  */
-function startFailed(state, { code, failure }, around) {
+function startFailed(state, { code, failure, isForbidden }, around) {
   const { goal } = state;
-  const isGranted = state.is === 'starting';
+  const isGranted = state.is !== 'connecting';
+  if (isForbidden) {
+    return { to: end({ code: 'origin-refused' }, state) };
+  }
+  if (!failure && state.resumption && state.is !== 'lost') {
+    return lose({ ...state, heardAt: around.now }, state.resumption, around.now);
+  }
   if (!failure) {
     return isGranted
       ? { to: end({ code: 'broken-before' }, state) }
@@ -566,23 +618,22 @@ function hear(state, message, now) {
   if (message.is !== 'resumable') {
     return { to };
   }
-  const { resumption } = message;
-  const { server, goal } = state;
-  return { to: { ...to, resumption }, effects: [{ do: 'store', kept: { ...resumption, server, world: goal.world } }] };
+  return keep(to, message.resumption, true);
 }
 
 /* coming back */
 
 /**
  * The connection is lost: the page tries at once to return.
- * @param {Running} state
+ * @param {Running | ((Connecting | Starting) & { heardAt: number })} state
  * @param {Resumption} resumption
  * @param {number} now
  * @returns {Transition}
  */
-function lose({ goal, server, isRestored, facts, heardAt, scene }, resumption, now) {
-  const wasShown = ['shown', 'closed', 'framed'].includes(scene.is);
-  const { closesAt } = facts;
+function lose(state, resumption, now) {
+  const { goal, server, isRestored, heardAt } = state;
+  const wasShown = state.is === 'running' && ['shown', 'closed', 'framed'].includes(state.scene.is);
+  const closesAt = 'facts' in state ? state.facts.closesAt : undefined;
   return tryAgain(
     {
       is: 'lost',
@@ -591,6 +642,7 @@ function lose({ goal, server, isRestored, facts, heardAt, scene }, resumption, n
       isRestored,
       resumption,
       heardAt,
+      hasRun: state.is === 'running',
       wasShown,
       isTold: false,
       tries: 0,
@@ -609,7 +661,7 @@ function lose({ goal, server, isRestored, facts, heardAt, scene }, resumption, n
  * @param {Surroundings} around
  * @returns {Transition}
  */
-function restore({ server, world, token, absence }, { now }) {
+function restore({ server, world, token, absence, hasRun }, { now }) {
   return tryAgain(
     {
       is: 'lost',
@@ -618,6 +670,7 @@ function restore({ server, world, token, absence }, { now }) {
       isRestored: true,
       resumption: { token, absence },
       heardAt: now,
+      hasRun,
       wasShown: false,
       isTold: false,
       tries: 0,
@@ -647,18 +700,16 @@ function tryAgain(state, now, before = []) {
  * @param {Surroundings} around
  * @returns {Transition | undefined}
  */
-function whileLost(state, event, { now, random }) {
+function whileLost(state, event, around) {
+  const { now, random } = around;
   const away = now - state.heardAt;
   switch (event.type) {
-    case 'message': {
-      const facts = factsAfter(state.facts, event.message, now);
-      if (event.message.is !== 'ready') {
-        return { to: { ...state, facts, heardAt: now, tries: 1, refusedSince: undefined } };
-      }
-      const { to, effects } = run(state, event.message, facts, true, now, state.resumption);
-      return { to, effects: state.isTold ? [...effects, { do: 'sayFound' }] : effects };
-    }
+    case 'message':
+      return found(state, event.message, now);
     case 'closed': {
+      if (event.failure && !state.hasRun && event.failure.reason?.code !== 'ended') {
+        return startFailed(state, event, around);
+      }
       if (event.failure) {
         return {
           to: end(
@@ -673,12 +724,12 @@ function whileLost(state, event, { now, random }) {
     }
     case 'probed': {
       const refusedSince = state.refusedSince ?? now;
-      return {
-        to:
-          now - refusedSince >= GONE
-            ? end({ code: 'absent', since: away / SECOND }, state)
-            : { ...state, refusedSince },
-      };
+      if (now - refusedSince < GONE) {
+        return { to: { ...state, refusedSince } };
+      }
+      return state.hasRun
+        ? { to: end({ code: 'server-lost' }, state) }
+        : redirect({ code: 'server-unreachable' }, state.goal, state, around);
     }
     case 'online':
       return { to: { ...state, nextTry: now } };
@@ -686,6 +737,30 @@ function whileLost(state, event, { now, random }) {
       return waitOn(state, away, now);
   }
   return undefined;
+}
+
+/**
+ * The server answers again.
+ * @param {Lost} state
+ * @param {Message} message
+ * @param {number} now
+ * @returns {Transition}
+ */
+function found(state, message, now) {
+  const facts = factsAfter(state.facts, message, now);
+  /** @type {Effect[]} */
+  const said = state.isTold ? [{ do: 'sayFound' }] : [];
+  if (message.is === 'ready') {
+    const { to, effects } = run(state, message, facts, state.hasRun, now, state.resumption);
+    return { to, effects: [...effects, ...said] };
+  }
+  // It still waits for a slot, or starts.
+  const start = state.hasRun ? undefined : startGoesOn(state, message, now);
+  if (start) {
+    return { to: start, effects: said };
+  }
+  const to = { ...state, facts, heardAt: now, tries: 1, refusedSince: undefined };
+  return message.is === 'resumable' ? keep(to, message.resumption, state.hasRun) : { to };
 }
 
 /**

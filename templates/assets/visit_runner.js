@@ -82,17 +82,21 @@ export class VisitRunner {
     }
   }
 
-  /** Goes on with what this tab has kept, if it has something. Returns whether it has. */
+  /** Goes on with what this tab has kept, if it has something. Returns that. */
   restore() {
     const { wish } = this.#store;
     const { named } = this.#choices();
     if (!wish || (named !== '' && named !== wish.named)) {
       this.#store.forget();
-      return false;
+      return undefined;
     }
     const { world, simulation } = wish;
-    this.take(simulation ? { type: 'restored', kept: simulation } : { type: 'awaited', world });
-    return true;
+    if (simulation) {
+      this.take({ type: 'restored', kept: simulation });
+    } else {
+      this.take({ type: this.#store.ticketFor(world) ? 'awaited' : 'submitted', world });
+    }
+    return wish;
   }
 
   /** Ends the simulation, and the connections. */
@@ -149,7 +153,9 @@ export class VisitRunner {
     this.#link?.detach();
     const { name } = this.#choices();
     const start =
-      'resume' in request ? request : { start: { url: request.world, pass: request.pass, resumable: true, name } };
+      'resume' in request
+        ? request
+        : { start: { url: request.world, pass: request.pass, resumable: true, early: true, name } };
     this.#link = new SimulationLink(server, start, (event) => this.take(event));
   }
 

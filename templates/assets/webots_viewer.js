@@ -7,6 +7,9 @@
 import { find } from './dom.js';
 import { wordsOfPage } from './language.js';
 
+// The page around this one learns that it may be framed there.
+parent.postMessage('webots-viewer', '*');
+
 const HOME = /^https:\/\/cyberbotics\.com\/wwi\/[^/]+\//;
 const wanted = new URLSearchParams(location.hash.slice(1));
 const script = wanted.get('script') ?? '';

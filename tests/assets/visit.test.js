@@ -10,7 +10,7 @@ import { Visit } from './visitor.js';
 const WORLD = 'https://github.com/demo/worlds/blob/main/worlds/playground.wbt';
 const SERVER = 'ws://one:2000';
 const TOKEN = 'f00d';
-const KEPT = { server: SERVER, world: WORLD, token: TOKEN, absence: 60 };
+const KEPT = { server: SERVER, world: WORLD, token: TOKEN, absence: 60, hasRun: true };
 const SHOWN = /** @type {const} */ ({ type: 'scene', scene: { is: 'shown', title: 'Playground', runs: false } });
 
 /** @type {(code: string, blame: string, retry: string, output?: string) => Reason} */
@@ -291,8 +291,11 @@ test('a session server that is silent, away, or back', () => {
   const other = asking().answer('Error: the session server does not answer').take({ type: 'available', now: true });
   assert.equal(problem(other), 'The session server does not answer', 'a sentence decides nothing');
   const early = new Visit().take({ type: 'submitted', world: WORLD });
-  assert.equal(problem(early), 'The session server could not be reached.');
+  assert.equal(problem(early), undefined, 'it is asked for when the session server is there');
   assert.deepEqual(early.did(), ['clear']);
+  assert.deepEqual(early.take({ type: 'connected' }, { type: 'available', now: false }).did(), ['ask']);
+  const never = new Visit().take({ type: 'submitted', world: WORLD }, { type: 'disconnected' });
+  assert.equal(problem(never), 'The session server could not be reached.');
 });
 
 test('a lost connection is shown after two seconds, and found again', () => {
@@ -305,7 +308,7 @@ test('a lost connection is shown after two seconds, and found again', () => {
   assert.equal(notice(visit), undefined);
   visit.take({ type: 'closed', code: 1006 }).pass(3);
   assert.match(notice(visit)?.text ?? '', /^No connection for [34] seconds\.$/);
-  assert.equal(notice(visit)?.advice, 'Your simulation waits another 57 seconds.');
+  assert.equal(notice(visit)?.advice, 'Your simulation waits up to another 57 seconds.');
   assert.equal(visit.view.progress?.is, 'done', 'its scene is still shown');
   assert.ok(visit.did().includes('sayLost'));
   visit.receive('session: 1');
@@ -321,6 +324,60 @@ test('a lost connection is shown after two seconds, and found again', () => {
   assert.deepEqual(visit.effects.at(-1), { do: 'sayFound' });
   visit.receive('absence: 60', 'resume: other');
   assert.deepEqual(visit.effects.at(-1), { do: 'store', kept: { ...KEPT, token: 'other' } });
+});
+
+/** The texts with which a server lets a client come back from the first moment. */
+const EARLY = ['session: 1', 'absence: 300', `resume: ${TOKEN}`];
+const EARLY_KEPT = { server: SERVER, world: WORLD, token: TOKEN, absence: 300, hasRun: false };
+
+test('a page that is loaded again while it waits or starts goes on', () => {
+  const texts = { queued: ['queue: 2'], starting: ['loading: Step 2/9 : 10 %'], launching: ['shutdownTimeout: 60'] };
+  for (const [name, now] of Object.entries(texts)) {
+    const before = connecting().receive(...EARLY);
+    assert.deepEqual(before.effects.at(-1), { do: 'store', kept: EARLY_KEPT }, name);
+    before.receive(...now).did();
+    assert.deepEqual(before.take({ type: 'hidden' }).did(), ['detach'], name);
+
+    const after = new Visit().take({ type: 'restored', kept: EARLY_KEPT });
+    assert.deepEqual(after.effects, [{ do: 'connect', server: SERVER, request: { resume: TOKEN } }]);
+    assert.equal(after.view.progress?.at, 'server');
+    after.receive('session: 1', 'absence: 300', 'resume: next', ...now);
+    assert.deepEqual(after.effects.at(-1), { do: 'store', kept: { ...EARLY_KEPT, token: 'next' } }, name);
+    assert.equal(after.state.is, name === 'queued' ? 'connecting' : 'starting');
+    after.receive('webots:ws://one:2001', 'absence: 300', 'resume: next').take(SHOWN);
+    assert.equal(after.state.is, 'running');
+    assert.ok('isBack' in (after.effects.find((effect) => effect.do === 'show') ?? {}));
+    assert.deepEqual(after.effects.at(-1), { do: 'store', kept: { ...EARLY_KEPT, token: 'next', hasRun: true } });
+    assert.equal(after.effects.find((effect) => effect.do === 'show')?.isBack, false, 'nobody has seen it before');
+  }
+});
+
+test('a start whose connection breaks is found again, and one that has failed goes elsewhere', () => {
+  const broken = connecting().receive(...EARLY, 'loading: Step 2/9 : 10 %');
+  broken.did();
+  assert.deepEqual(broken.take({ type: 'closed', code: 1006 }).did(), ['freeze', 'connect']);
+  assert.equal(broken.state.is, 'lost');
+  broken.receive('session: 1', 'absence: 300', 'resume: next', 'loading: Step 3/9 : 5 %');
+  assert.equal(broken.state.is, 'starting');
+  const failed = new Visit().take({ type: 'restored', kept: EARLY_KEPT });
+  failed.take({ type: 'available', now: true }).receive(...error('this simulation has ended: no disk', DRAINING));
+  assert.equal(failed.state.is, 'redirected');
+  const gone = connecting()
+    .receive(...EARLY)
+    .take({ type: 'closed', code: 1006 });
+  for (let attempt = 0; attempt < 4; ++attempt) {
+    gone.take({ type: 'closed', code: 1006 }, { type: 'probed' }).pass(1);
+  }
+  assert.ok(['redirected', 'asking'].includes(gone.state.is), gone.state.is);
+  const none = connecting().take({ type: 'closed', code: 1006 });
+  assert.equal(none.state.is, 'redirected', 'a server without such tokens');
+});
+
+test('a server that refuses the site is not asked again, nor is another', () => {
+  const visit = asking().answer(SERVER).take({ type: 'closed', code: 1006, isForbidden: true });
+  assert.equal(visit.state.is, 'ended');
+  assert.match(visit.view.problem?.text ?? '', /starts nothing for pages of this site/);
+  assert.match(visit.view.problem?.advice ?? '', /allowedOrigins/);
 });
 
 test('a server that hangs is noticed by its silence, and one attempt is under way at a time', () => {
@@ -397,10 +454,7 @@ test('a server that refuses all attempts while the session server answers is gon
     assert.deepEqual(visit.did().slice(-1), ['probe']);
     visit.take({ type: 'probed' }).pass(1);
   }
-  assert.match(
-    visit.view.problem?.text ?? '',
-    /^There was no connection for [34] seconds: the simulation has ended\.$/,
-  );
+  assert.equal(visit.view.problem?.text, 'The server was lost. Your simulation is over; start it again.');
   const offline = running().take({ type: 'closed', code: 1006 });
   for (let attempt = 0; attempt < 4; ++attempt) {
     offline.take({ type: 'closed', code: 1006 }).pass(1);

@@ -1,11 +1,14 @@
 """The viewer resumes after a reload, Back or a lost connection, and shows the correct state in between."""
 
 import json
+import pathlib
 import re
+import shutil
+import tempfile
 import unittest
 
 from case import KEPT, Running, kept, seconds
-from fleet import ROOT, WORLD, free_ports, until
+from fleet import BIN, ROOT, WORLD, Fleet, free_ports, until
 from playwright.sync_api import expect
 
 
@@ -76,7 +79,7 @@ class ComingBack(Running):
         expect(page.tab.locator("#mode")).to_have_text("paused")
         with server.hanging():
             expect(page.tab.locator("#notice-text")).to_contain_text("No connection for", timeout=30_000)
-            expect(page.tab.locator("#notice-advice")).to_contain_text("Your simulation waits another")
+            expect(page.tab.locator("#notice-advice")).to_contain_text("Your simulation waits up to another")
             expect(page.tab.locator("#availability")).to_contain_text("No connection")
             expect(page.tab.locator("#mode")).to_have_text("no connection")
             self.assertEqual(page.faults(), [])
@@ -93,7 +96,7 @@ class ComingBack(Running):
         pid, before = self.pid(server), seconds(page)
         page.context.set_offline(True)
         expect(page.tab.locator("#notice-text")).to_contain_text("No connection for 20 seconds", timeout=40_000)
-        expect(page.tab.locator("#notice-advice")).to_have_text("Your simulation waits another 40 seconds.")
+        expect(page.tab.locator("#notice-advice")).to_contain_text(re.compile("another 4 minutes, (39|40|41) seconds"))
         page.context.set_offline(False)
         self.goes_on(page, server, pid, before + 10)
         self.leaves_nothing(page, server)
@@ -133,6 +136,50 @@ class ComingBack(Running):
             "it is refused",
             lambda: tab.evaluate("window.heard.some(([kind, more]) => kind === 'error' && /accepts/.test(more))"),
         )
+
+
+class Starting(Running):
+    """Webots does not start before there is a gate."""
+
+    @classmethod
+    def make_fleet(cls):
+        folder = pathlib.Path(tempfile.mkdtemp(prefix="fleet-webots-"))
+        cls.addClassCleanup(shutil.rmtree, folder)
+        cls.gate = folder / "gate"
+        webots = folder / "webots"
+        webots.write_text(f'#!/bin/sh\nuntil [ -e {cls.gate} ]; do sleep 0.1; done\nexec {BIN}/demo-simulator "$@"\n')
+        webots.chmod(0o755)
+        return Fleet(simulation={"webots": str(webots), "isolation": "none"})
+
+    def test_a_link_starts_it_and_a_reload_at_any_time_goes_on(self):
+        page = self.open(self.fleet.session.url(f"viewer?url={WORLD.format('playground')}&start=1&play=1"))
+        servers = (self.fleet.simulation, self.fleet.other)
+        ids = lambda: [one["id"] for server in servers for one in server.status()["simulations"]]
+        before = None
+        for _ in range(3):
+            expect(page.tab.locator("#step-launch.doing")).to_be_visible()
+            # A screen reader hears each step.
+            expect(page.tab.locator("#spoken")).to_contain_text("Launch: ")
+            self.assertEqual(page.faults(), [])
+            before = before or ids()
+            self.assertEqual(ids(), before)
+            page.tab.reload()
+        self.gate.touch()
+        expect(page.tab.locator("[data-step=simulation].done")).to_be_visible()
+        expect(page.tab.locator("#spoken")).to_have_text("The simulation is ready.")
+        expect(page.tab.locator("#mode")).to_have_text("real time")
+        expect(page.tab.locator("#view")).to_be_in_viewport()
+        self.assertEqual(ids(), before)
+        page.tab.get_by_role("button", name="Full screen").click()
+        expect(page.tab.get_by_role("button", name="Leave full screen")).to_be_visible()
+        self.assertEqual(page.faults(), [])
+        page.tab.get_by_role("button", name="Leave full screen").click()
+        page.tab.get_by_role("button", name="Disconnect").click()
+        until("the simulation is gone", lambda: not ids())
+        # Who has left is not led back, but a link starts a new one.
+        page.tab.goto(self.fleet.session.url("viewer"))
+        expect(page.tab.locator("#availability.on")).to_be_visible()
+        self.assertEqual(ids(), [])
 
 
 class Busy(Running):

@@ -56,7 +56,7 @@ class Killed(LeavingServers):
         expect(page.tab.locator("[data-step=simulation].done")).to_be_visible()
         self.fleet.simulation.kill()
         expect(page.tab.locator("#notice-text")).to_contain_text("No connection for")
-        expect(page.tab.locator("#problem-text")).to_contain_text("the simulation has ended")
+        expect(page.tab.locator("#problem-text")).to_contain_text("The server was lost. Your simulation is over")
         self.connect(page)
         self.is_led_to_the_other(page)
 

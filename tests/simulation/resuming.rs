@@ -10,7 +10,9 @@ use serde_json::json;
 use super::life::quick;
 use super::scene::nothing_left;
 use crate::support::relay::{Mood, Relay};
-use crate::support::{Builder, Client, Server, arm, demo_server, http, instances_below, until};
+use crate::support::{
+    Builder, Client, DEMO, Server, Webots, arm, demo_server, http, instances_below, server_of, until,
+};
 
 const ENDED: &str = "loading: Error: this simulation has ended";
 const TAKEN_OVER: &str = "loading: Error: this simulation was taken over elsewhere";
@@ -53,7 +55,7 @@ async fn who_comes_back_finds_the_simulation_as_it_runs_at_each_level() {
             format!("session: {}", server.simulations().await[0]["id"].as_str().unwrap())
         );
         let url = format!("webots:ws://localhost:{}", server.port + 1);
-        assert_eq!(heard[2..5], ["kind: w3d", &url, "absence: 60"]);
+        assert_eq!(heard[2..5], ["kind: w3d", &url, "absence: 300"]);
         let rest: u64 = heard[1]["shutdownTimeout: ".len()..].parse().unwrap();
         assert!((7000..=7200).contains(&rest) && heard.len() == 6, "{heard:?}");
         assert_ne!(first, second);
@@ -75,6 +77,122 @@ async fn who_comes_back_finds_the_simulation_as_it_runs_at_each_level() {
         client.close_with(1000).await;
         nothing_left(&server, 2).await;
     }
+}
+
+/// A client that may come back from the first moment, and its token, which comes before anything else.
+async fn early(server: &Server) -> (Client, String) {
+    let mut client = Client::connect(&server.websocket("/client")).await;
+    let start = json!({"start": {"url": arm(), "resumable": true, "early": true}});
+    client.send(&start.to_string()).await;
+    let token = client.token().await;
+    let kinds: Vec<_> = client.heard.iter().filter_map(|text| text.split(':').next()).collect();
+    assert_eq!(kinds, ["session", "absence", "resume"]);
+    (client, token)
+}
+
+#[actix_rt::test]
+async fn who_has_asked_for_it_comes_back_while_it_waits_and_while_it_starts() {
+    let folder = tempfile::tempdir().unwrap();
+    let gate = folder.path().join("gate");
+    let script = format!(
+        "until [ -e {} ]; do sleep 0.1; done\nexec {DEMO} \"$@\"",
+        gate.display()
+    );
+    let builder = quick(server_of(Webots::script(&script), 1));
+    // A sandbox has no gate.
+    let server = builder.set("isolation", "none").start().await;
+    let stage = async || server.simulations().await[0]["stage"].clone();
+    let (first, _) = early(&server).await;
+    let (mut client, token) = early(&server).await;
+    client.until("queue: 0").await;
+    let id = client.heard[0].clone();
+    drop(client);
+    server.until_away(1).await;
+    // It keeps its position.
+    let mut client = Client::resuming(&server, &token).await;
+    let token = client.token().await;
+    client.until("queue: 0").await;
+    drop(client);
+    server.until_away(1).await;
+    // It is its turn while nobody is there.
+    first.close_with(1000).await;
+    until("it is launched", async || stage().await == "launching").await;
+    let mut client = Client::resuming(&server, &token).await;
+    let token = client.token().await;
+    client.until("loading: webots is starting").await;
+    drop(client);
+    server.until_away(1).await;
+    // It becomes ready while nobody is there.
+    std::fs::write(&gate, "").unwrap();
+    until("it is ready", async || stage().await == "idle").await;
+    let mut client = Client::resuming(&server, &token).await;
+    client.until("webots:").await;
+    assert_eq!(client.heard[0], id);
+    let last = client.token().await;
+    assert_eq!(server.status().await["instances"]["arrivals"], 2);
+    client.close_with(1000).await;
+    nothing_left(&server, 1).await;
+    assert_eq!(refused(&server, &last).await, ENDED);
+}
+
+#[actix_rt::test]
+async fn who_comes_back_to_a_start_that_has_failed_hears_why() {
+    let folder = tempfile::tempdir().unwrap();
+    let gate = folder.path().join("gate");
+    let script = format!("until [ -e {} ]; do sleep 0.1; done; exit 3", gate.display());
+    let builder = quick(server_of(Webots::script(&script), 1));
+    // A sandbox has no gate.
+    let server = builder.set("isolation", "none").start().await;
+    let (client, token) = early(&server).await;
+    until("it is launched", async || {
+        server.simulations().await[0]["stage"] == "launching"
+    })
+    .await;
+    drop(client);
+    server.until_away(1).await;
+    std::fs::write(&gate, "").unwrap();
+    until("it has failed", async || server.simulations().await.is_empty()).await;
+    let mut client = Client::resuming(&server, &token).await;
+    let told = client.until("loading: Error:").await;
+    assert!(
+        told.starts_with(&format!("{ENDED}: ")) && told.contains("code 3"),
+        "{told}"
+    );
+    assert!(
+        client.heard[0].contains(r#""code":"launch-failed""#),
+        "{:?}",
+        client.heard
+    );
+}
+
+#[actix_rt::test]
+async fn a_client_that_waits_gets_the_slot_of_one_that_is_away_for_long() {
+    let server = quick(demo_server(2)).set("timing.yieldAfter", 2.0).start().await;
+    let (away, token) = Client::resumable(&server).await;
+    drop(away);
+    server.until_away(1).await;
+    let since = Instant::now();
+    // Another slot is free: nobody has to leave.
+    let second = Client::ready(&server).await;
+    while since.elapsed() < Duration::from_secs(4) {
+        actix_rt::time::sleep(Duration::from_millis(100)).await;
+        assert_eq!(server.simulations().await.len(), 2);
+    }
+    let third = Client::ready(&server).await;
+    let mut late = Client::resuming(&server, &token).await;
+    let told = late.until("loading: Error:").await;
+    assert!(told.contains("Others wait for a place"), "{told}");
+    // Who is away for a shorter time stays.
+    third.close_with(1000).await;
+    let (away, token) = Client::resumable(&server).await;
+    drop(away);
+    server.until_away(1).await;
+    let mut waits = Client::start(&server, &arm()).await;
+    waits.until("queue: 0").await;
+    assert_eq!(server.simulations().await.len(), 3);
+    Client::resuming(&server, &token).await.until("webots:").await;
+    second.close_with(1000).await;
+    waits.until("webots:").await;
 }
 
 #[actix_rt::test]

@@ -151,6 +151,7 @@ pub async fn a_session_leaves_nothing_in_any_state() {
             url: arm(),
             mode: None,
             resumable: Some(true),
+            early: None,
             name: None,
             pass: None,
         };

@@ -17,7 +17,7 @@ use crate::shared::config::{
     one_or_many, optional_whole, percent, require, seconds, whole,
 };
 use crate::shared::domain::{PublicAddress, PublicUrl, ReadyEntry, complete_host};
-use crate::shared::http::TrustedProxies;
+use crate::shared::http::{Origin, TrustedProxies};
 
 keys! {
 /// Every key of the session server. The original's keys keep their meaning.
@@ -110,6 +110,9 @@ pub struct SessionConfig {
     pub ready: Vec<ReadyEntry> = Vec::new(),
     /// URL of Webots' own viewer (`WebotsView.js`), for simulation servers that don't have it. Default: none.
     pub viewer_script: Option<url::Url> = None,
+    /// Origins of web pages, such as `https://lab.org`, that may show `/viewer?embed=1` in a frame. Default: none.
+    #[serde(deserialize_with = "one_or_many")]
+    pub frame_ancestors: Vec<Origin> = Vec::new(),
     /// All other durations.
     pub timing: Timing = Timing::default(),
 }

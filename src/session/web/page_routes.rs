@@ -6,14 +6,14 @@ use actix_web::error::ErrorInternalServerError;
 use actix_web::{HttpRequest, HttpResponse, Result, web};
 use askama::Template;
 
-use super::pages::{self, Monitor, Viewer, WebotsViewer};
+use super::pages::{self, Embedded, Monitor, Viewer, WebotsViewer};
 use crate::asset;
 use crate::session::config::AskName;
 use crate::session::fleet::FleetStatus;
 use crate::session::state::AppState;
 use crate::shared::http::assets::{self, Asset};
 use crate::shared::http::routing::{GET, READ, path};
-use crate::shared::http::{ConnectionKind, FOREIGN_SCRIPTS, OWN_FILES, PageView, VIEWER, html};
+use crate::shared::http::{ConnectionKind, FOREIGN_SCRIPTS, OWN_FILES, PageView, VIEWER, framed_by, html};
 use crate::shared::run::timestamp;
 
 /// Assets of this server's pages, besides those that both servers share.
@@ -43,6 +43,8 @@ pub fn configure(app: &mut web::ServiceConfig) {
         .service(path("/events", GET, events))
         .service(path("/viewer", READ, viewer))
         .service(path("/webots-viewer", READ, webots_viewer))
+        .service(path("/embed.js", READ, embed_script))
+        .service(path("/embed.d.ts", READ, embed_types))
         .service(path("/assets/{name}", READ, asset));
 }
 
@@ -91,6 +93,10 @@ async fn viewer(request: HttpRequest, server: web::Data<AppState>) -> HttpRespon
         .as_ref()
         .and_then(|header| config.trusted_proxies.trusted_header(&request, header));
     let script = server.config.viewer_script.as_ref().map(url::Url::as_str);
+    if request.query_string().split('&').any(|one| one == "embed=1") {
+        let policy = framed_by(VIEWER, &server.config.frame_ancestors);
+        return html(Embedded { script }.render(), &policy);
+    }
     html(
         Viewer {
             examples: &server.config.examples,
@@ -104,8 +110,23 @@ async fn viewer(request: HttpRequest, server: web::Data<AppState>) -> HttpRespon
 }
 
 /// Webots' own viewer is third-party code: it runs in an embedded page with an origin of its own.
-async fn webots_viewer() -> HttpResponse {
-    html(WebotsViewer.render(), FOREIGN_SCRIPTS)
+async fn webots_viewer(server: web::Data<AppState>) -> HttpResponse {
+    let policy = framed_by(FOREIGN_SCRIPTS, &server.config.frame_ancestors);
+    html(WebotsViewer.render(), &policy)
+}
+
+/// The element `<webots-simulation>`, for pages of other sites.
+async fn embed_script() -> HttpResponse {
+    HttpResponse::Ok()
+        .content_type("text/javascript; charset=utf-8")
+        .body(include_str!("../../../templates/embed.js"))
+}
+
+/// Its types.
+async fn embed_types() -> HttpResponse {
+    HttpResponse::Ok()
+        .content_type("text/plain; charset=utf-8")
+        .body(include_str!("../../../templates/embed.d.ts"))
 }
 
 async fn asset(request: HttpRequest) -> HttpResponse {

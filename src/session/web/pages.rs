@@ -74,6 +74,14 @@ pub struct Viewer<'config> {
     pub script: Option<&'config str>,
 }
 
+/// The page `/viewer?embed=1`, for frames of other sites.
+#[derive(Template)]
+#[template(path = "session/embedded.html")]
+pub struct Embedded<'config> {
+    /// URL of Webots' own viewer, if `viewerScript` is set.
+    pub script: Option<&'config str>,
+}
+
 /// The page that holds Webots' own viewer.
 #[derive(Template)]
 #[template(path = "session/webots_viewer.html")]

@@ -28,5 +28,5 @@ pub use limits::{
 pub use live_updates::{LiveUpdates, PageView, TableRow};
 pub use metrics::{CONTENT_TYPE, Gauge, Metrics};
 pub use origin::Origin;
-pub use page::{FOREIGN_SCRIPTS, OWN_FILES, SharedPage, VIEWER, heat, html, width};
+pub use page::{FOREIGN_SCRIPTS, OWN_FILES, SharedPage, VIEWER, framed_by, heat, html, width};
 pub use peer::{Peer, TrustedProxies};

@@ -10,6 +10,8 @@ use actix_web::{HttpMessage, HttpRequest, HttpResponse, HttpResponseBuilder};
 use tokio::sync::Mutex;
 use tokio::time::sleep_until;
 
+use super::origin::Origin;
+
 /// The policy (`Content-Security-Policy`) of a page that loads only files of its own server, and no inline script or
 /// style.
 pub const OWN_FILES: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; \
@@ -27,6 +29,17 @@ pub const FOREIGN_SCRIPTS: &str = "default-src 'none'; script-src 'self' http: h
     style-src 'self' http: https:; font-src 'self' data: http: https:; img-src 'self' data: blob: http: https:; \
     connect-src 'self' data: blob: http: https: ws: wss:; frame-ancestors 'self'; base-uri 'none'; form-action 'self'; \
     sandbox allow-scripts allow-modals allow-pointer-lock";
+
+/// A policy by which pages of these origins may also embed the page.
+pub fn framed_by(policy: &str, origins: &[Origin]) -> String {
+    let Some((before, after)) = policy.split_once("frame-ancestors ") else {
+        return policy.to_owned();
+    };
+    let (own, rest) = after.split_once(';').unwrap_or((after, ""));
+    let allowed = [own].into_iter().filter(|own| *own != "'none'" || origins.is_empty());
+    let all: Vec<&str> = allowed.chain(origins.iter().map(|one| one.0.as_str())).collect();
+    format!("{before}frame-ancestors {};{rest}", all.join(" "))
+}
 
 /// The CSS class of the color of a bar, for a value in percent.
 pub fn heat(percent: &f64) -> &'static str {
@@ -130,5 +143,36 @@ impl Rendered {
             tag: EntityTag::new_strong(format!("{:016x}", hasher.finish())),
             html: html.into(),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_the_named_origins_may_embed_a_page() {
+        let lab = [
+            Origin("https://lab.org".to_owned()),
+            Origin("https://school.org".to_owned()),
+        ];
+        let ancestors = |policy: &str, origins: &[Origin]| {
+            let policy = framed_by(policy, origins);
+            let directives: Vec<_> = policy
+                .split("; ")
+                .filter(|one| one.starts_with("frame-ancestors"))
+                .collect();
+            directives.join("|")
+        };
+        assert_eq!(framed_by(VIEWER, &[]), VIEWER);
+        assert_eq!(framed_by(FOREIGN_SCRIPTS, &[]), FOREIGN_SCRIPTS);
+        assert_eq!(
+            ancestors(VIEWER, &lab),
+            "frame-ancestors https://lab.org https://school.org"
+        );
+        assert_eq!(
+            ancestors(FOREIGN_SCRIPTS, &lab),
+            "frame-ancestors 'self' https://lab.org https://school.org"
+        );
     }
 }

@@ -3,7 +3,7 @@
 use actix::prelude::*;
 use futures_util::stream::{self, StreamExt};
 
-use super::session::{Attachment, Client, Ready, Session, State, seconds_until};
+use super::session::{Attachment, Client, Comeback, Launched, Ready, Session, State, seconds_until};
 use crate::shared::domain::Failure;
 use crate::shared::run::seconds_since_1970;
 use crate::simulation::attachment::{ClientAction, Connection, Resume, ToClient, Token};
@@ -13,14 +13,14 @@ use crate::simulation::protocol;
 impl Session {
     /// Waits for a client that may return; ends the session if it can't be resumed.
     pub(super) fn await_client(&mut self, ctx: &mut Context<Self>) {
-        if self.state.token().is_none() {
+        let Comeback::With(_) = self.comeback else {
             return self.leave(StopReason::Left, ctx);
-        }
+        };
         if let Client::Away(_) = self.client {
             return;
         }
         let absence = self.server.config.timing.absence;
-        if let State::Ready(_) = self.state {
+        if !matches!(self.state, State::Over(_)) {
             log::info!("{}: away; it may come back within {} s", self.name(), absence.as_secs());
             self.show_away(Some(seconds_since_1970() + absence.as_secs()));
         }
@@ -28,9 +28,7 @@ impl Session {
     }
 
     fn show_away(&self, until: Option<u64>) {
-        self.server
-            .slots
-            .update(self.id, |simulation| simulation.away_until = until);
+        self.server.slots.mark_away(self.id, until);
     }
 
     /// Attaches a connection to a session.
@@ -47,19 +45,21 @@ impl Session {
         }
     }
 
-    /// Sends the client the kind of the scene, the URL of Webots and, if the session is resumable, a token to return with.
+    /// Sends the client the kind of the scene, the URL of Webots and, if the client may come back, the token for that.
     pub(super) fn offer(&self) {
-        let State::Ready(Ready {
-            launched, url, token, ..
-        }) = &self.state
-        else {
+        let State::Ready(Ready { launched, url, .. }) = &self.state else {
             return;
         };
         if let Some(scene) = launched.scene {
             self.text(protocol::kind(scene));
         }
         self.text(protocol::webots(url));
-        if let Some(token) = token {
+        self.offer_comeback();
+    }
+
+    /// Sends the client the token with which it may come back, if it has one.
+    pub(super) fn offer_comeback(&self) {
+        if let Comeback::With(token) = &self.comeback {
             self.text(protocol::absence(self.server.config.timing.absence.as_secs()));
             self.text(protocol::resume(token));
         }
@@ -67,31 +67,51 @@ impl Session {
 
     /// Why a client with this token may not return; `None` if it may.
     fn refusal(&self, token: Token) -> Option<Failure> {
-        match &self.state {
-            state if state.token() != Some(token) => Some(protocol::taken_over()),
-            State::Over { failure, .. } => Some(protocol::ended(Some(failure))),
-            _ => None,
+        match (self.comeback, &self.state) {
+            (Comeback::With(last), State::Over(failure)) if last == token => Some(protocol::ended(Some(failure))),
+            (Comeback::With(last), _) if last == token => None,
+            _ => Some(protocol::taken_over()),
         }
     }
 
     /// Tells a client that has come back what it has missed.
     pub(super) fn tell_again(&self) {
-        let State::Ready(ready) = &self.state else { return };
         self.text(protocol::simulation_id(self.id));
-        let rest = self
-            .server
-            .config
-            .timeout
-            .saturating_sub(ready.started.elapsed().as_secs());
-        self.text(protocol::shutdown_timeout(rest));
-        self.texts(ready.launched.texts.iter().cloned());
-        self.offer();
-        if let Some(end) = ready.idle_end {
-            self.text(protocol::idle(Some(seconds_until(end))));
+        match &self.state {
+            State::Waiting { ahead, .. } => {
+                self.offer_comeback();
+                self.texts(ahead.iter().copied().flat_map(protocol::queue));
+            }
+            State::CheckingOut(_) => {
+                self.offer_comeback();
+                self.texts(self.progress.clone());
+            }
+            State::Launching(launched) => {
+                self.offer_comeback();
+                self.tell_launched(launched);
+                self.texts(self.progress.clone());
+            }
+            State::Ready(ready) => {
+                self.tell_launched(&ready.launched);
+                self.offer();
+                if let Some(end) = ready.idle_end {
+                    self.text(protocol::idle(Some(seconds_until(end))));
+                }
+                if ready.is_watched {
+                    self.text(protocol::watched(true));
+                }
+            }
+            State::Over(_) => {}
         }
-        if ready.is_watched {
-            self.text(protocol::watched(true));
+    }
+
+    /// Sends the rest of the time limit, and what the project requests.
+    fn tell_launched(&self, launched: &Launched) {
+        if let Some(started) = launched.started {
+            let rest = self.server.config.timeout.saturating_sub(started.elapsed().as_secs());
+            self.text(protocol::shutdown_timeout(rest));
         }
+        self.texts(launched.texts.iter().cloned());
     }
 }
 
@@ -115,9 +135,7 @@ impl Handler<Resume> for Session {
             // It has no token before it has a client.
             Client::Expected(_) => {}
         }
-        if let State::Ready(Ready { token, .. }) = &mut self.state {
-            *token = token.map(Token::next);
-        }
+        self.comeback = Comeback::With(token.next());
         self.show_away(None);
         self.await_viewer_again(ctx);
         self.tell_again();

@@ -37,8 +37,9 @@ pub struct Session {
     pub(super) state: State,
     /// How its client wants to see it.
     pub(super) view: View,
-    /// Whether its client may resume it.
-    pub(super) resumable: bool,
+    pub(super) comeback: Comeback,
+    /// The last progress of the start, as it was sent, for a client that comes back.
+    pub(super) progress: Option<String>,
     /// Whether a controller is being reset.
     pub(super) is_resetting: bool,
 }
@@ -70,6 +71,24 @@ pub enum SpareEvent {
     Failed(SpareKind, Failure),
 }
 
+/// Whether the client of a session may come back once its connection has broken.
+#[derive(Clone, Copy)]
+pub(super) enum Comeback {
+    /// It may not.
+    Never,
+    /// Once Webots is ready, when it gets a token.
+    OnceReady,
+    /// With this token, the last that it got.
+    With(Token),
+}
+
+impl Comeback {
+    /// For a client that has asked for it or not.
+    pub(super) fn asked(resumable: bool) -> Self {
+        if resumable { Self::OnceReady } else { Self::Never }
+    }
+}
+
 /// A connection that is attached to a session. Dropping it detaches the connection at once.
 pub(super) struct Attachment {
     /// Receives what is for the client.
@@ -92,6 +111,8 @@ pub(super) enum State {
         world: ProjectUrl,
         tip: Option<Tip>,
         lease: SlotLease,
+        /// The number of clients ahead, once it is known.
+        ahead: Option<usize>,
     },
     /// The project is being checked out for this slot; the job ends with the actor.
     CheckingOut(Slot),
@@ -99,8 +120,8 @@ pub(super) enum State {
     Launching(Launched),
     /// Webots is ready.
     Ready(Ready),
-    /// The simulation has ended, or was not admitted. A client that has this token may come back to hear why.
-    Over { failure: Failure, token: Option<Token> },
+    /// The simulation has ended, or was not admitted. A client that may come back hears why.
+    Over(Failure),
 }
 
 /// A simulation whose Webots was requested.
@@ -112,19 +133,17 @@ pub(super) struct Launched {
     pub(super) scene: Option<SceneKind>,
     /// The texts that its project requests, kept for a client that returns.
     pub(super) texts: Vec<String>,
+    /// When its time limit has begun: with the start of Webots, or with its client.
+    pub(super) started: Option<Instant>,
 }
 
 /// A simulation whose Webots is ready.
 pub(super) struct Ready {
     pub(super) launched: Launched,
-    /// When Webots was started: the time limit counts from then.
-    pub(super) started: Instant,
     /// The port on which Webots listens.
     pub(super) port: u16,
     /// The URL of Webots.
     pub(super) url: String,
-    /// The last token that the client got; `None` if it can't return.
-    pub(super) token: Option<Token>,
     /// When the simulation ends because it is paused; `None` if it does not.
     pub(super) idle_end: Option<Instant>,
     /// Whether an administrator watches it.
@@ -161,24 +180,13 @@ pub(super) fn seconds_until(then: Instant) -> u64 {
 impl State {
     /// The end of a session that has panicked; also what is left of a state while the next one is made of it.
     pub(super) fn lost() -> Self {
-        Self::Over {
-            failure: lost(),
-            token: None,
-        }
+        Self::Over(lost())
     }
 
     pub(super) fn launched(&self) -> Option<&Launched> {
         match self {
             Self::Launching(launched) | Self::Ready(Ready { launched, .. }) => Some(launched),
-            Self::Waiting { .. } | Self::CheckingOut(_) | Self::Over { .. } => None,
-        }
-    }
-
-    /// The last token that the client got, if it got one.
-    pub(super) fn token(&self) -> Option<Token> {
-        match self {
-            Self::Ready(Ready { token, .. }) | Self::Over { token, .. } => *token,
-            Self::Waiting { .. } | Self::CheckingOut(_) | Self::Launching(_) => None,
+            Self::Waiting { .. } | Self::CheckingOut(_) | Self::Over(_) => None,
         }
     }
 }
@@ -205,6 +213,7 @@ impl Session {
             world,
             view: request.mode.unwrap_or_default().into(),
             resumable: request.resumable.unwrap_or_default() && !server.config.timing.absence.is_zero(),
+            early: request.early.unwrap_or_default(),
         };
         let taker = Taker {
             kind: SpareKind {
@@ -236,6 +245,7 @@ impl Session {
             world,
             view,
             resumable,
+            early,
         } = client;
         let id = SimulationId::next();
         let peer = connection.peer;
@@ -247,11 +257,13 @@ impl Session {
                     world,
                     tip: None,
                     lease,
+                    ahead: None,
                 },
-                Err(failure) => State::Over { failure, token: None },
+                Err(failure) => State::Over(failure),
             };
-            let session = Self {
-                resumable,
+            let mut session = Self {
+                comeback: Comeback::asked(resumable),
+                progress: None,
                 server,
                 id,
                 peer: Some(peer),
@@ -261,10 +273,13 @@ impl Session {
                 is_resetting: false,
             };
             session.text(protocol::simulation_id(id));
-            if let State::Over { failure, .. } = &session.state {
+            if let State::Over(failure) = &session.state {
                 session.count(failure.reason.code());
                 session.tell(failure);
                 ctx.stop();
+            } else if early {
+                session.issue_token(ctx);
+                session.offer_comeback();
             }
             session
         })
@@ -310,15 +325,14 @@ impl Session {
 
     /// Releases everything, and sends the client the reason. A client that missed it receives it when it returns.
     pub(super) fn finish(&mut self, failure: Failure, ctx: &mut Context<Self>) {
-        if let State::Over { .. } = self.state {
+        if let State::Over(_) = self.state {
             return;
         }
         if let Client::Expected(_) = self.client {
             return self.finish_spare(failure, ctx);
         }
         self.tell(&failure);
-        let token = self.state.token();
-        self.state = State::Over { failure, token };
+        self.state = State::Over(failure);
         self.await_client(ctx);
     }
 
@@ -333,7 +347,7 @@ impl Session {
             }) => {
                 webots.0.do_send(Stop(reason));
             }
-            State::Over { .. } => {}
+            State::Over(_) => {}
         }
     }
 
@@ -364,7 +378,7 @@ impl Session {
         restored.spawn(ctx);
     }
 
-    fn become_ready(&mut self, started: Instant, port: u16, url: String, ctx: &mut Context<Self>) {
+    fn become_ready(&mut self, port: u16, url: String, ctx: &mut Context<Self>) {
         let launched = match std::mem::replace(&mut self.state, State::lost()) {
             State::Launching(launched) => launched,
             // It has ended meanwhile.
@@ -372,10 +386,8 @@ impl Session {
         };
         self.state = State::Ready(Ready {
             launched,
-            started,
             port,
             url,
-            token: None,
             idle_end: None,
             is_watched: false,
             arrival: Arrival::Settled,
@@ -395,15 +407,26 @@ impl Session {
         let arrival = self.await_viewer(ctx);
         if let State::Ready(ready) = &mut self.state {
             ready.arrival = arrival;
-            let register = || self.server.sessions.register(ctx.address().recipient());
-            ready.token = self.resumable.then(register);
         }
+        self.issue_token(ctx);
         self.offer();
-        if self.resumable {
+    }
+
+    /// Lets the client come back from now on, if it may and has no token yet.
+    pub(super) fn issue_token(&mut self, ctx: &mut Context<Self>) {
+        if let Comeback::OnceReady = self.comeback {
+            self.comeback = Comeback::With(self.server.sessions.register(ctx.address().recipient()));
             let absence = self.server.config.timing.absence.as_secs();
             // While Webots is busy it sends nothing, and its client would assume a lost connection.
             ctx.run_interval(SIGN_OF_LIFE, move |this, _| this.hint(protocol::absence(absence)));
         }
+    }
+
+    /// Sends the client a step of its start.
+    pub(super) fn show_progress(&mut self, text: &str) {
+        let text = protocol::loading(text);
+        self.hint(text.clone());
+        self.progress = Some(text);
     }
 
     fn exited(&mut self, failure: Failure, ctx: &mut Context<Self>) {
@@ -411,7 +434,7 @@ impl Session {
             State::Ready(_) => self.finish(failure, ctx),
             State::Launching(_) => self.fail(failure, ctx),
             // The session has ended it; the client knows why.
-            State::Over { .. } | State::Waiting { .. } | State::CheckingOut(_) => {}
+            State::Over(_) | State::Waiting { .. } | State::CheckingOut(_) => {}
         }
     }
 }
@@ -454,11 +477,16 @@ impl Handler<SlotEvent> for Session {
     fn handle(&mut self, event: SlotEvent, ctx: &mut Self::Context) {
         match event {
             SlotEvent::Granted(port) => match std::mem::replace(&mut self.state, State::lost()) {
-                State::Waiting { world, tip, lease } => self.check_out(world, tip, Slot { lease, port }, ctx),
+                State::Waiting { world, tip, lease, .. } => self.check_out(world, tip, Slot { lease, port }, ctx),
                 // It has ended while it waited.
                 other => self.state = other,
             },
-            SlotEvent::Queued(ahead) => self.texts(protocol::queue(ahead)),
+            SlotEvent::Queued(position) => {
+                if let State::Waiting { ahead, .. } = &mut self.state {
+                    *ahead = Some(position);
+                }
+                self.texts(protocol::queue(position));
+            }
             SlotEvent::Watched(is_watched) => {
                 if let State::Ready(ready) = &mut self.state {
                     ready.is_watched = is_watched;
@@ -490,7 +518,7 @@ impl Handler<WebotsEvent> for Session {
 
     fn handle(&mut self, event: WebotsEvent, ctx: &mut Self::Context) {
         match event {
-            WebotsEvent::Progress(text) => self.hint(protocol::loading(&text)),
+            WebotsEvent::Progress(text) => self.show_progress(&text),
             WebotsEvent::Text(text) => {
                 let text = protocol::of_project(&text);
                 if let State::Launching(launched) = &mut self.state {
@@ -498,10 +526,15 @@ impl Handler<WebotsEvent> for Session {
                 }
                 self.text(text);
             }
-            WebotsEvent::Started => self.text(protocol::shutdown_timeout(self.server.config.timeout)),
-            WebotsEvent::Ready { started, port, stream } => {
+            WebotsEvent::Started(at) => {
+                if let State::Launching(launched) = &mut self.state {
+                    launched.started = Some(at);
+                }
+                self.text(protocol::shutdown_timeout(self.server.config.timeout));
+            }
+            WebotsEvent::Ready { port, stream } => {
                 let url = self.server.config.stream_url(port, &stream.reveal());
-                self.become_ready(started, port, url, ctx);
+                self.become_ready(port, url, ctx);
             }
             WebotsEvent::Heartbeat => self.hint(protocol::HEARTBEAT.to_owned()),
             WebotsEvent::Hanging(seconds) => self.hint(protocol::hanging(seconds)),

@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use actix::prelude::*;
 
-use super::session::{Client, Expected, Ready, Session, SpareEvent, State};
+use super::session::{Client, Comeback, Expected, Ready, Session, SpareEvent, State};
 use crate::shared::domain::{Failure, Reason};
 use crate::simulation::attachment::NewClient;
 use crate::simulation::checkout::Tip;
@@ -33,6 +33,7 @@ impl Session {
                     world: kind.world.clone(),
                     tip,
                     lease,
+                    ahead: None,
                 }
             } else {
                 ctx.stop();
@@ -45,7 +46,8 @@ impl Session {
                 view: kind.view,
                 client: Client::Expected(Expected { kind, keeper }),
                 state,
-                resumable: false,
+                comeback: Comeback::Never,
+                progress: None,
                 is_resetting: false,
             }
         })
@@ -61,7 +63,7 @@ impl Session {
             keeper.do_send(SpareEvent::Failed(kind.clone(), failure.clone()));
         }
         let has_no_client = self.server.slots.give_up_spare(self.id);
-        self.state = State::Over { failure, token: None };
+        self.state = State::Over(failure);
         // Otherwise that client is on its way.
         if has_no_client {
             ctx.stop();
@@ -70,7 +72,7 @@ impl Session {
 
     /// A client takes the simulation.
     pub(super) fn taken_by(&mut self, client: NewClient, ctx: &mut Context<Self>) {
-        if let State::Over { .. } = self.state {
+        if let State::Over(_) = self.state {
             Self::start_for(Arc::clone(&self.server), client, None);
             return ctx.stop();
         }
@@ -78,21 +80,28 @@ impl Session {
             connection,
             identity,
             resumable,
+            early,
             ..
         } = client;
         let peer = connection.peer;
         log::info!("{}: client {peer}: takes it{identity}", self.id);
         self.peer = Some(peer);
-        self.resumable = resumable;
+        self.comeback = Comeback::asked(resumable);
         self.client = Client::Connected(Self::attached(connection, ctx));
         self.text(protocol::simulation_id(self.id));
+        if early {
+            self.issue_token(ctx);
+            self.offer_comeback();
+        }
+        if let State::Launching(launched) | State::Ready(Ready { launched, .. }) = &mut self.state {
+            launched.started = Some(Instant::now());
+        }
         if let Some(launched) = self.state.launched() {
             launched.webots.0.do_send(Taken);
             self.text(protocol::shutdown_timeout(self.server.config.timeout));
             self.texts(launched.texts.iter().cloned());
         }
-        if let State::Ready(Ready { started, .. }) = &mut self.state {
-            *started = Instant::now();
+        if let State::Ready(_) = self.state {
             self.hand_over(ctx);
         }
     }

@@ -111,7 +111,9 @@ impl Session {
             simulation.version = Some(version);
             simulation.scene = scene;
         });
-        self.text(protocol::loading("webots is starting"));
+        let text = protocol::loading("webots is starting");
+        self.text(text.clone());
+        self.progress = Some(text);
         let gpu = self.take_gpu(&slot.lease);
         let project = Arc::new(project);
         let project_of_webots = Arc::downgrade(&project);
@@ -138,6 +140,7 @@ impl Session {
             project: project_of_webots,
             scene,
             texts: Vec::new(),
+            started: None,
         });
     }
 

@@ -33,9 +33,12 @@ pub struct Timing {
     /// A client that answers no ping for this long is disconnected. Must exceed `ping`. Default: 60.
     #[serde(with = "seconds")]
     pub silence: Duration = Duration::from_mins(1),
-    /// Time for which a simulation waits for a disconnected client; 0: not at all. Default: 60.
+    /// Time for which a simulation waits for a disconnected client; 0: not at all. Default: 300.
     #[serde(with = "seconds_or_zero")]
-    pub absence: Duration = Duration::from_mins(1),
+    pub absence: Duration = Duration::from_mins(5),
+    /// A simulation that has waited this long for its client gives its slot to another client that waits. Default: 60.
+    #[serde(with = "seconds")]
+    pub yield_after: Duration = Duration::from_mins(1),
     /// Time in which a viewer must open the stream of a simulation that is ready, else it ends; 0: it may take any time.
     /// Default: 60.
     #[serde(with = "seconds_or_zero")]

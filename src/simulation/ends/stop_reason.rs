@@ -9,7 +9,7 @@ pub enum StopReason {
     Left,
     /// Its client was disconnected, and has not come back in time.
     Away,
-    /// Its client is away, as are others of its address, and others wait for a slot.
+    /// Its client is away for too long while others wait for a slot.
     MakesRoom,
     /// Nobody has opened its stream in time.
     NoViewer,
@@ -31,7 +31,7 @@ impl From<StopReason> for Failure {
             StopReason::Away => Self::new(Reason::Away, "Its client has not come back"),
             StopReason::MakesRoom => Self::new(
                 Reason::Away,
-                "Others wait for a place, and your address has left several simulations behind",
+                "Others wait for a place, and its client has not come back",
             ),
             StopReason::NoViewer => Self::new(Reason::NoViewer, "Nobody has opened its 3D view"),
             StopReason::Unneeded => Self::new(Reason::Left, "It was kept ready, and no client has taken it"),

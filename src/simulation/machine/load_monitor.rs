@@ -221,7 +221,7 @@ mod tests {
 
     fn monitor(spread: Spread) -> (LoadMonitor, watch::Receiver<Arc<Readings>>) {
         let ends = Ends::start(PathBuf::from("/nonexistent"), String::new(), 12, &Metrics::default()).unwrap();
-        let slots = SlotPool::new(2001..=2001, 1, None, None, Duration::from_secs(10), ends);
+        let slots = SlotPool::new(2001..=2001, 1, None, None, Duration::MAX, Duration::from_secs(10), ends);
         LoadMonitor::new(slots, Path::new("/"), None, Arc::new(spread)).unwrap()
     }
 

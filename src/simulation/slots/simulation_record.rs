@@ -37,6 +37,8 @@ pub(super) struct SimulationRecord {
     pub accesses: Vec<Access>,
     /// Why the server ends it, once it does, as text for those at its streams.
     pub ending: Arc<OnceLock<String>>,
+    /// Since when its client is away, which may come back.
+    pub away_since: Option<Instant>,
     /// Whether it was told to make room for a client that waits, or was kept ready and ends.
     pub makes_room: bool,
     /// Its end, once that is reported. Only the first report counts.
@@ -75,7 +77,7 @@ pub enum SlotEvent {
     Viewed,
     /// The administrator stops the simulation; the text is for its client.
     Stopped(String),
-    /// Another client waits for a slot, and too many simulations of the address wait for clients that are away; or the
+    /// Another client waits for a slot, and the client of this one has been away for too long; or the
     /// simulation was kept ready, and is not needed.
     MakeRoom,
     /// A client takes the simulation, which was kept ready.
@@ -177,6 +179,7 @@ impl SimulationRecord {
             answers_controllers: false,
             accesses: Vec::new(),
             ending: Arc::default(),
+            away_since: None,
             makes_room: false,
             end: None,
             events: Vec::new(),
@@ -187,7 +190,7 @@ impl SimulationRecord {
 
     /// Whether it has a slot and waits for its client, which has lost its connection.
     pub(super) fn is_away(&self) -> bool {
-        self.simulation.port.is_some() && self.simulation.away_until.is_some()
+        self.simulation.port.is_some() && self.away_since.is_some()
     }
 
     /// Grants it a port.

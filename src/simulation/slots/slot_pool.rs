@@ -30,6 +30,8 @@ pub(super) struct Slots {
     queue_capacity: usize,
     pub(super) per_address: Option<usize>,
     pub(super) per_user: Option<usize>,
+    /// How long a client may be away before its simulation gives its slot to one that waits.
+    yield_after: Duration,
     /// Number of leases that were requested, including those of clients that were refused.
     pub(super) arrivals: u64,
     /// Number of simulations that have given their slots back.
@@ -48,12 +50,14 @@ const RECHECK: Duration = Duration::from_secs(1);
 
 impl SlotPool {
     /// Leases these ports; `queue_capacity` clients may wait. `per_address` and `per_user` limit the slots of one
-    /// address and one user, and likewise their waiting clients. A reservation holds for the time `pass`. Each end is recorded with `ends`.
+    /// address and one user, and likewise their waiting clients. A simulation whose client is away for `yield_after` gives
+    /// its slot to a client that waits. A reservation holds for the time `pass`. Each end is recorded with `ends`.
     pub fn new(
         ports: RangeInclusive<u16>,
         queue_capacity: usize,
         per_address: Option<usize>,
         per_user: Option<usize>,
+        yield_after: Duration,
         pass: Duration,
         ends: Ends,
     ) -> Arc<Self> {
@@ -62,6 +66,7 @@ impl SlotPool {
             queue_capacity,
             per_address,
             per_user,
+            yield_after,
             arrivals: 0,
             freed: 0,
             reservations: Reservations::new(pass),
@@ -180,6 +185,14 @@ impl SlotPool {
     /// Changes what pages show of a simulation, if it has not ended.
     pub fn update(&self, id: SimulationId, change: impl FnOnce(&mut Simulation)) {
         self.change(id, |record| change(&mut record.simulation));
+    }
+
+    /// Records until when the client of a simulation, which has gone, may come back; `None`: it is there.
+    pub fn mark_away(&self, id: SimulationId, until: Option<u64>) {
+        self.change(id, |record| {
+            record.simulation.away_until = until;
+            record.away_since = until.map(|_| Instant::now());
+        });
     }
 
     /// Stops the simulations with these ids; `why` is the text for their clients. Returns the ids of those that are there.
@@ -352,8 +365,9 @@ impl Slots {
     }
 
     /// While clients wait because all slots are taken, ends others: one for each, first those that are kept ready without
-    /// a client, then simulations that wait for their own clients: the longest absent first, of addresses for which more than a quarter of the slots waits. So somebody who leaves one
-    /// simulation after the other can't keep all slots.
+    /// a client, then simulations that wait for their own clients: the longest
+    /// absent first, of those absent for `yield_after`, and of addresses for which more than a quarter of the slots waits. So
+    /// somebody who leaves one simulation after the other can't keep all slots.
     fn make_room(&mut self) {
         let waiting = self.waiting();
         if waiting == 0 || self.free_port().is_some() {
@@ -376,7 +390,8 @@ impl Slots {
         }
     }
 
-    /// The simulation that waits for its client the longest, of addresses for which more than their share waits.
+    /// The simulation that waits for its client the longest, if that is too long, or more than the share of its address
+    /// waits.
     fn longest_away(&mut self) -> Option<&mut SimulationRecord> {
         let share = (self.ports.len() / 4).max(1);
         let mut away: HashMap<IpAddr, usize> = HashMap::new();
@@ -389,12 +404,16 @@ impl Slots {
         for address in self.records.values().filter_map(address) {
             *away.entry(address).or_default() += 1;
         }
-        let has_too_many =
-            |record: &&mut SimulationRecord| address(record).is_some_and(|address| away.get(&address) > Some(&share));
+        let yield_after = self.yield_after;
+        let has_to_go = |record: &&mut SimulationRecord| {
+            let is_long = record.away_since.is_some_and(|since| since.elapsed() >= yield_after);
+            let is_one_of_many = address(record).is_some_and(|address| away.get(&address) > Some(&share));
+            record.is_away() && !record.makes_room && (is_long || is_one_of_many)
+        };
         self.records
             .values_mut()
-            .filter(has_too_many)
-            .min_by_key(|record| record.simulation.away_until)
+            .filter(has_to_go)
+            .min_by_key(|record| record.away_since)
     }
 
     /// The ports that are leased or reserved.

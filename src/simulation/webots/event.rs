@@ -15,12 +15,10 @@ pub enum WebotsEvent {
     Progress(String),
     /// A text of the protocol that its project requests, unchanged.
     Text(String),
-    /// Its process was started.
-    Started,
+    /// Its process was started at this time: the time limit counts from then.
+    Started(Instant),
     /// It is ready.
     Ready {
-        /// When its process was started: the time limit counts from then.
-        started: Instant,
         /// The port on which it listens.
         port: u16,
         /// The token for its stream.

@@ -91,8 +91,6 @@ pub(super) struct Stopping {
 pub(super) struct Process {
     group: ProcessGroup,
     tail: Tail,
-    /// When its time limit has begun: with the start of the process, or with its client.
-    started: Instant,
     /// Restarts the controller of a competition's participant.
     restart: Option<Arc<Notify>>,
     /// Whether the simulation is not paused, as its output shows.
@@ -168,7 +166,7 @@ impl Webots {
             startup: None,
             has_listened: false,
         }));
-        self.send(WebotsEvent::Started);
+        self.send(WebotsEvent::Started(Instant::now()));
         // In containers, the wait begins when the container reports that it runs.
         if self.spec.containers.is_none() {
             self.follow_startup(ctx);
@@ -216,7 +214,6 @@ impl Webots {
         Ok(Process {
             group,
             tail,
-            started: Instant::now(),
             restart,
             is_running: false,
         })
@@ -247,7 +244,6 @@ impl Webots {
             other => return self.state = other,
         };
         self.log(Level::Info, "ready");
-        let started = process.started;
         self.enter(State::Ready(Ready {
             process,
             last_heartbeat: Instant::now(),
@@ -255,7 +251,6 @@ impl Webots {
             idle_end: None,
         }));
         self.send(WebotsEvent::Ready {
-            started,
             port: self.spec.slot.port,
             stream: self.spec.slot.lease.open_stream(!self.spec.is_ready_by_heartbeat()),
         });
@@ -473,8 +468,7 @@ impl Handler<Taken> for Webots {
 
     fn handle(&mut self, _: Taken, ctx: &mut Self::Context) {
         self.spec.is_spare = false;
-        if let Some(process) = self.state.process() {
-            process.started = Instant::now();
+        if self.state.process().is_some() {
             self.limit_time(ctx);
         }
         self.used(ctx);

@@ -1,0 +1,275 @@
+"""The pages that docs/embedding.md prints, served from another site."""
+
+import gzip
+import itertools
+import os
+import re
+import sys
+import unittest
+import urllib.request
+
+from case import BrowserTest
+from fleet import SOON, WORLD, Fleet, free_ports, until
+from playwright.sync_api import expect
+from site_of_others import Site, printed
+
+SHOWN = "[data-step=simulation].done"
+
+
+class Embedding(BrowserTest):
+    """The base: a site of others, beside the fleet."""
+
+    @classmethod
+    def setUpClass(cls):
+        super().setUpClass()
+        cls.site = cls.enterClassContext(Site(cls.fleet))
+
+    def keeps_to_the_rules(self, page):
+        if not self.may_complain:
+            self.assertEqual(page.complaints, [], "the console")
+        self.assertLessEqual(page.hosts(), {"localhost", self.host}, "who was asked")
+
+    def visit(self, name, text, **options):
+        return self.open(self.site.put(name, text), **options)
+
+    def simulations(self):
+        """The simulations of all servers."""
+        servers = (self.fleet.simulation, self.fleet.other)
+        return [one for server in servers for one in server.status()["simulations"]]
+
+
+class PrintedPages(Embedding):
+    def test_a_page_starts_reloads_goes_on_and_ends(self):
+        page = self.visit("page", printed("A page"))
+        tab = page.tab
+        expect(tab.locator("#availability.on")).to_be_visible()
+        self.assertEqual(page.faults(), [])
+        tab.get_by_role("button", name="Connect").click()
+        expect(tab.locator(SHOWN)).to_be_visible()
+        expect(tab.locator("#spoken")).to_have_text("The simulation is ready.")
+        tab.get_by_role("button", name="Play").click()
+        expect(tab.locator("#told")).to_have_text(re.compile(r"^[1-9]\d*\.\d seconds$"))
+        self.assertEqual(page.faults(), [])
+        (before,) = self.simulations()
+        tab.reload()
+        expect(tab.locator(SHOWN)).to_be_visible()
+        expect(tab.locator("#mode")).to_have_text("real time")
+        (after,) = self.simulations()
+        self.assertEqual((before["id"], before["pid"]), (after["id"], after["pid"]))
+        # As a script of the page steers it.
+        tab.evaluate("document.getElementById('robot').pause()")
+        expect(tab.locator("#mode")).to_have_text("paused")
+        self.assertEqual(tab.evaluate("document.getElementById('robot').state"), "running")
+        tab.evaluate("document.getElementById('robot').reset()")
+        expect(tab.locator("#clock")).to_have_text("0:00.000")
+        tab.get_by_role("button", name="Disconnect").click()
+        expect(tab.locator("#told")).to_have_text("Goodbye.")
+        until("it is gone", lambda: not self.simulations())
+        # Nothing is left of it after a reload.
+        tab.reload()
+        expect(tab.get_by_role("button", name="Connect")).to_be_visible()
+        self.assertEqual(self.simulations(), [])
+
+    def test_a_failure_has_a_code_for_the_page_and_words_for_its_visitor(self):
+        text = printed("A page").replace("playground.wbt", "missing.wbt")
+        page = self.visit("missing", text)
+        tab = page.tab
+        tab.evaluate("document.getElementById('robot').addEventListener('ended', (e) => { window.end = e.detail; })")
+        expect(tab.locator("#availability.on")).to_be_visible()
+        tab.evaluate(f"document.getElementById('robot').start('{WORLD.format('missing')}')")
+        expect(tab.locator("#problem-advice")).to_contain_text("Look whether")
+        end = tab.evaluate("window.end")
+        self.assertEqual((end["code"], end["blame"], end["retry"]), ("world-not-found", "user", "no"))
+        expect(tab.locator("#told")).to_contain_text("missing.wbt")
+
+    def test_two_elements_are_two_simulations_and_the_removal_of_one_ends_it(self):
+        page = self.visit("race", printed("Two simulations"))
+        tab = page.tab
+        expect(tab.locator(f"#left {SHOWN}")).to_be_visible()
+        expect(tab.locator(f"#right {SHOWN}")).to_be_visible()
+        for side in ("left", "right"):
+            expect(tab.locator(f"#{side} #mode")).to_have_text("real time")
+        self.assertEqual(page.faults(), [])
+        before = {one["id"] for one in self.simulations()}
+        self.assertEqual(len(before), 2)
+        tab.reload()
+        for side in ("left", "right"):
+            expect(tab.locator(f"#{side} #mode")).to_have_text("real time")
+        self.assertEqual({one["id"] for one in self.simulations()}, before)
+        # Who moves an element in its page keeps its simulation.
+        tab.evaluate("document.querySelector('main').prepend(document.getElementById('left'))")
+        tab.get_by_role("button", name="Give up").click()
+        until("one has ended", lambda: len(self.simulations()) == 1)
+        expect(tab.locator("#left #mode")).to_have_text("real time")
+        tab.evaluate("document.getElementById('left').stop()")
+        until("the other has ended", lambda: not self.simulations())
+
+    def test_the_element_is_in_order_in_all_languages_and_both_schemes_narrow_and_enlarged(self):
+        languages = ["en", "de", "fr", "es", "zh", "ja"]
+        for number, (language, scheme) in enumerate(itertools.product(languages, ["light", "dark"])):
+            with self.subTest(language, scheme=scheme):
+                text = printed("A page").replace('id="robot"', f'id="robot" lang="{language}"')
+                # Every second one as a phone, the others at 200 %.
+                options = (
+                    {"width": 390, "height": 800}
+                    if number % 2
+                    else {"width": 640, "height": 450, "device_scale_factor": 2}
+                )
+                page = self.visit("page", text, scheme=scheme, **options)
+                expect(page.tab.locator("#availability.on")).to_be_visible()
+                self.in_order(page)
+                page.tab.locator("[part=start]").click()
+                expect(page.tab.locator(SHOWN)).to_be_visible()
+                self.in_order(page)
+                page.tab.locator("[part=leave]").click()
+                expect(page.tab.locator("[part=start]")).to_be_focused()
+                page.tab.evaluate(f"document.getElementById('robot').start('{WORLD.format('missing')}')")
+                expect(page.tab.locator("#problem")).to_be_visible()
+                self.in_order(page)
+
+    def in_order(self, page):
+        self.assertEqual(page.faults(), [])
+        self.assertLessEqual(page.overflow(), 0, "pixels too wide")
+
+    def test_all_that_a_page_loads_has_40_kib_compressed(self):
+        text = printed("A page").replace('id="robot"', 'id="robot" lang="ja"')
+        page = self.visit("page", text)
+        page.tab.locator("[part=start]").click()
+        expect(page.tab.locator(SHOWN)).to_be_visible()
+        parts = [url for url in page.asked if url.startswith("http://127.0.0.1")]
+        parts = [url for url in parts if re.search(r"/embed\.js$|/assets/\w+\.(js|css)$", url)]
+        self.assertGreater(len(parts), 20)
+        sizes = {}
+        for url in parts:
+            with urllib.request.urlopen(url, timeout=SOON) as answer:
+                sizes[url] = len(gzip.compress(answer.read()))
+        page.tab.locator("[part=leave]").click()
+        until("it is gone", lambda: not self.simulations())
+        print(f"{sum(sizes.values())} bytes in {len(sizes)} files, compressed", file=sys.stderr)
+        self.assertLessEqual(sum(sizes.values()), 40 * 1024, sizes)
+
+    @unittest.skipUnless("QUIET_MACHINE" in os.environ, "it depends on the speed of the machine")
+    def test_on_a_quiet_machine_it_is_drawn_within_100_ms(self):
+        text = printed("A page").replace(
+            "<script type=\"module\" src",
+            """<script>
+              const look = () => {
+                const shown = document.querySelector("webots-simulation")?.shadowRoot?.querySelector("#availability");
+                if (shown?.offsetHeight) window.drawn = performance.now();
+                else requestAnimationFrame(look);
+              };
+              look();
+            </script>
+            <script type="module" src""",
+        )
+        took = []
+        for _ in range(5):
+            page = self.visit("page", text)
+            until("it is drawn", lambda page=page: page.tab.evaluate("window.drawn"))
+            begin = """performance.getEntriesByType('resource')
+                .find((one) => one.name.endsWith('/embed.js')).startTime"""
+            took.append(page.tab.evaluate(f"window.drawn - {begin}"))
+        print(f"drawn after {[round(one) for one in took]} ms", file=sys.stderr)
+        self.assertLess(min(took), 100)
+
+    def test_text_inside_is_for_where_the_element_does_not_run(self):
+        text = printed("A page").replace("></webots-simulation>", ">Please enable JavaScript.</webots-simulation>")
+        page = self.visit("text", text)
+        expect(page.tab.locator("#availability.on")).to_be_visible()
+        drawn = """() => {
+            const text = document.createRange();
+            text.selectNodeContents(document.querySelector('webots-simulation'));
+            return text.getClientRects().length;
+        }"""
+        self.assertEqual(page.tab.evaluate(drawn), 0)
+        without = self.visit("text", text, javascript=False)
+        expect(without.tab.get_by_text("Please enable")).to_be_visible()
+        without.complaints.clear()
+
+
+class InLine(Embedding):
+    key = "a secret of these tests"
+    session = {"fleetKey": key, "loadThreshold": 1000, "port": free_ports(64) + 63}
+    simulation = {"maxConnections": 1, "fleetKey": key}
+
+    def test_a_page_waits_in_line_also_over_a_reload(self):
+        text = printed("Two simulations")
+        first = self.visit("race", text)
+        for side in ("left", "right"):
+            expect(first.tab.locator(f"#{side} {SHOWN}")).to_be_visible()
+        page = self.visit("page", printed("A page"))
+        tab = page.tab
+        expect(tab.locator("#availability")).not_to_contain_text("Connecting")
+        tab.get_by_role("button", name="Connect").click()
+        expect(tab.locator("#notice-text")).to_have_text("All servers are busy.")
+        expect(tab.locator("#step-session small")).to_contain_text("you are next")
+        self.assertEqual(page.faults(), [])
+        self.assertEqual(tab.evaluate("document.getElementById('robot').state"), "waiting")
+        tab.reload()
+        expect(tab.locator("#step-session small")).to_contain_text("you are next")
+        first.tab.get_by_role("button", name="Give up").click()
+        expect(tab.locator(SHOWN)).to_be_visible()
+        # Its page is left, and it waits; the element on the other page is closed with it.
+        tab.evaluate("document.getElementById('robot').remove()")
+        first.tab.evaluate("document.getElementById('left').remove()")
+        until("all is over", lambda: not self.simulations())
+
+
+class Refused(Embedding):
+    may_complain = True
+    simulation = {"allowedOrigins": ["https://other.example.org"]}
+
+    def test_a_site_that_is_not_listed_is_told_once_on_the_page_and_in_the_console(self):
+        page = self.visit("page", printed("A page"))
+        tab = page.tab
+        expect(tab.locator("#availability.on")).to_be_visible()
+        tab.get_by_role("button", name="Connect").click()
+        expect(tab.locator("#problem-text")).to_have_text(
+            "The simulation server starts nothing for pages of this site."
+        )
+        expect(tab.locator("#problem-advice")).to_contain_text("allowedOrigins")
+        own = [one for one in page.complaints if "webots-simulation" in one]
+        self.assertEqual(len(own), 1, page.complaints)
+        self.assertIn(self.site.origin, own[0])
+        expect(tab.locator("#told")).to_contain_text("It has ended: The simulation server starts nothing")
+
+
+class InAFrame(Embedding):
+    @classmethod
+    def make_fleet(cls):
+        # The port of the site is known only later.
+        return Fleet()
+
+    def test_only_a_site_that_is_listed_may_frame_the_viewer(self):
+        page = printed("A frame")
+        text = f"<!DOCTYPE html><html lang='en'><title>Course</title><main><h1>Course</h1>{page}</main>"
+        self.may_complain = True
+        refused = self.visit("course", text)
+        until("the browser says why", lambda: any("frame-ancestors" in one for one in refused.complaints))
+        allowed = self.fleet.start(
+            "session-server",
+            "framed",
+            {
+                "port": free_ports(1),
+                "simulationServers": [self.fleet.simulation.address],
+                "loadRefresh": 0.2,
+                "loadThreshold": 1000,
+                "frameAncestors": [self.site.origin],
+            },
+        )
+        text = text.replace("https://simulations.example.org", allowed.url("").rstrip("/"))
+        page = self.visit("course", text)
+        frame = page.tab.frame_locator("iframe")
+        expect(frame.locator("#availability.on")).to_be_visible()
+        self.assertEqual(page.faults(), [])
+        frame.get_by_role("button", name="Connect").click()
+        expect(frame.locator(SHOWN)).to_be_visible()
+        frame.get_by_role("button", name="Play", exact=True).click()
+        expect(frame.locator("#mode")).to_have_text("real time")
+        frame.get_by_role("button", name="Disconnect").click()
+        until("it is gone", lambda: not self.simulations())
+        self.assertEqual(page.complaints, [])
+
+
+if __name__ == "__main__":
+    unittest.main()
