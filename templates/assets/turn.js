@@ -6,6 +6,10 @@ const LENGTH = 0.18;
 
 /** A browser that has no sound, or allows none without a click, stays silent. */
 export function ring() {
+  // It would write a warning to the console.
+  if (navigator.userActivation?.hasBeenActive === false) {
+    return;
+  }
   try {
     const audio = new AudioContext();
     TONES.forEach((frequency, index) => {

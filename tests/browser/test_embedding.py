@@ -151,7 +151,7 @@ class PrintedPages(Embedding):
     @unittest.skipUnless("QUIET_MACHINE" in os.environ, "it depends on the speed of the machine")
     def test_on_a_quiet_machine_it_is_drawn_within_100_ms(self):
         text = printed("A page").replace(
-            "<script type=\"module\" src",
+            '<script type="module" src',
             """<script>
               const look = () => {
                 const shown = document.querySelector("webots-simulation")?.shadowRoot?.querySelector("#availability");
