@@ -75,7 +75,7 @@ async fn a_client_takes_one_that_is_ready_and_starts_nothing() {
         let heard: Vec<_> = client.heard.iter().map(String::as_str).collect();
         assert_eq!(heard[1..3], ["shutdownTimeout: 7200", "kind: w3d"], "{heard:?}");
         assert!(
-            heard[3].starts_with("webots:ws://localhost:") && heard[4] == "absence: 60",
+            heard[3].starts_with("webots:ws://localhost:") && heard[4] == "absence: 300",
             "{heard:?}"
         );
         let one = server.simulations().await.remove(0);
