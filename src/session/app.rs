@@ -74,13 +74,16 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     };
     let http = server::serve(socket, server.connections.clone(), options, app)?;
     let handle = http.handle();
-    let serving = actix_rt::spawn(http);
+    let mut serving = actix_rt::spawn(http);
     start::announce("session server", &http_url, &websocket_url, port);
     let registry = server.registry.clone();
     actix_rt::spawn(service_manager::feed_watchdog(async move || {
         registry.send(GetStatus).await.is_ok()
     }));
-    until_stopped(&mut signals, &file, &server).await?;
+    tokio::select! {
+        stopped = until_stopped(&mut signals, &file, &server) => stopped?,
+        ended = &mut serving => return Err(server::fault(ended).into()),
+    }
     log::info!("stopping");
     service_manager::stopping("stopping");
     phase_sender.send_replace(Phase::Closing);
@@ -155,7 +158,7 @@ fn assemble(
         &WAITED,
     )?;
     let roster = Arc::new(Roster::default());
-    let registry = Registry::start(Arc::clone(&config), available_sender, waited, Arc::clone(&roster));
+    let registry = Registry::start(Arc::clone(&config), available_sender, waited, Arc::clone(&roster))?;
     let key = config.fleet_key.as_ref().map(|key| FleetKey::new(key.reveal()));
     let key = key.unwrap_or_else(FleetKey::random);
     let admin_auth = AdminAuth::new(AuthSettings {

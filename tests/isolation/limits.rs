@@ -14,7 +14,8 @@ use super::lives::{long, named};
 use crate::simulation::ends::line;
 use crate::simulation::scene::{instance_folders, nothing_left};
 use crate::support::{
-    Builder, Client, DEMO, SOON, Server, Webots, arm, demo_server, holds_soon, http, server_of, skip, until,
+    Builder, Client, DEMO, SOON, Server, Webots, arm, demo_server, holds_soon, http, server_of, session_server, skip,
+    until,
 };
 
 const LEVELS: [&str; 2] = ["none", "sandbox"];
@@ -200,11 +201,11 @@ async fn a_simulation_has_its_own_control_group() {
 }
 
 /// The start of a server that may have this many processes and threads, as a user of its own with this folder.
-fn with_processes(folder: &Path, processes: u32) -> Builder {
+fn with_processes(server: Builder, folder: &Path, processes: u32) -> Builder {
     let user = folder.metadata().unwrap().uid();
     let command =
         format!("exec setpriv --reuid={user} --regid={user} --clear-groups prlimit --nproc={processes} \"$0\" \"$@\"");
-    demo_server(1).set("isolation", "none").folder(folder).before(&command)
+    server.folder(folder).before(&command)
 }
 
 /// A folder of a user that has no process.
@@ -219,13 +220,19 @@ fn folder_of_a_user() -> Option<TempDir> {
 
 #[actix_rt::test]
 async fn a_server_that_may_start_too_few_threads_serves_or_ends() {
+    serves_or_ends(|| demo_server(1).set("isolation", "none"), 6).await;
+    serves_or_ends(|| session_server(&[]), 2).await;
+}
+
+/// Lets a server start this number of processes and threads, and more.
+async fn serves_or_ends(server: impl Fn() -> Builder, least: u32) {
     let cores = u32::try_from(std::thread::available_parallelism().unwrap().get()).unwrap();
     let mut served = false;
     let mut log = String::new();
-    for processes in 6..=cores + 16 {
+    for processes in least..=cores + 16 {
         // The guardian of the one before may still be there.
         let Some(folder) = folder_of_a_user() else { return };
-        let mut server = with_processes(folder.path(), processes).spawn();
+        let mut server = with_processes(server(), folder.path(), processes).spawn();
         let mut code = None;
         let decided = holds_soon(async || {
             code = server.exit_code();
@@ -247,7 +254,8 @@ async fn a_server_that_may_start_too_few_threads_serves_or_ends() {
 #[actix_rt::test]
 async fn a_server_that_can_start_no_more_threads_is_not_ready() {
     let Some(folder) = folder_of_a_user() else { return };
-    let server = with_processes(folder.path(), 200).start().await;
+    let demo = demo_server(1).set("isolation", "none");
+    let server = with_processes(demo, folder.path(), 200).start().await;
     assert_eq!(server.health().await, (200, "ok".to_owned()));
     let limit = |processes: u32| {
         // As the server's user, and only the soft limit: who is root in a container may not change others' limits.

@@ -83,19 +83,23 @@ const TICK: Duration = Duration::from_millis(250);
 impl Registry {
     /// Starts the registry and its monitors. It publishes in `available` whether a server can take a client, and observes
     /// in `waited` how long clients have waited in the line. Simulation servers tell `roster` which simulations they have.
+    ///
+    /// # Errors
+    /// When the system starts no thread for the monitors.
     pub fn start(
         config: Arc<SessionConfig>,
         available: watch::Sender<bool>,
         waited: Histogram,
         roster: Arc<Roster>,
-    ) -> Addr<Self> {
-        Self::create(|ctx| {
+    ) -> std::io::Result<Addr<Self>> {
+        let thread = Arbiter::try_new()?.handle();
+        Ok(Self::create(|ctx| {
             let parent = Parent {
                 probes: ctx.address().recipient(),
                 links: ctx.address().recipient(),
                 roster,
             };
-            let servers = ServerTable::new(&config, parent);
+            let servers = ServerTable::new(&config, thread, parent);
             Self {
                 // A large class behind one address may reserve room at once.
                 quota: AddressQuota::new(200, 12),
@@ -106,7 +110,7 @@ impl Registry {
                 servers,
                 available,
             }
-        })
+        }))
     }
 
     /// Publishes a change of availability, to those who are not in the line.

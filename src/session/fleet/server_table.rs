@@ -5,6 +5,7 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use actix::prelude::*;
+use actix_rt::ArbiterHandle;
 use rustls::ClientConfig;
 
 use super::name_table::NameTable;
@@ -38,13 +39,13 @@ pub struct ServerTable {
     listed: Vec<PublicAddress>,
     tls: Option<Arc<ClientConfig>>,
     /// The thread of the monitors, so that requests of clients do not wait for them.
-    thread: Arbiter,
+    thread: ArbiterHandle,
     parent: Parent,
 }
 
 impl ServerTable {
-    /// No servers yet; `parent` receives what their monitors find.
-    pub fn new(config: &Arc<SessionConfig>, parent: Parent) -> Self {
+    /// No servers yet; their monitors will run on this thread, and `parent` receives what they find.
+    pub fn new(config: &Arc<SessionConfig>, thread: ArbiterHandle, parent: Parent) -> Self {
         Self {
             names: NameTable::default(),
             fleet: LoadBalancer::new(config.policy()),
@@ -54,7 +55,7 @@ impl ServerTable {
             records: HashMap::new(),
             listed: Vec::new(),
             tls: None,
-            thread: Arbiter::new(),
+            thread,
             parent,
         }
     }
@@ -104,9 +105,8 @@ impl ServerTable {
             server: server.clone(),
             change: LinkChange::Down,
         });
-        let monitor = ServerMonitor::start_in_arbiter(&self.thread.handle(), move |_| {
-            ServerMonitor::new(server, &config, tls, parent)
-        });
+        let monitor =
+            ServerMonitor::start_in_arbiter(&self.thread, move |_| ServerMonitor::new(server, &config, tls, parent));
         if let Some(before) = self.monitors.insert(key, monitor) {
             before.do_send(Stop);
         }
@@ -237,7 +237,7 @@ mod tests {
             links: found.recipient(),
             roster: Arc::default(),
         };
-        let mut table = ServerTable::new(&config, parent);
+        let mut table = ServerTable::new(&config, Arbiter::current(), parent);
         table.apply(&config);
         let first: PublicAddress = "127.0.0.1:1".parse().unwrap();
         let second: PublicAddress = "127.0.0.1:2".parse().unwrap();
