@@ -38,6 +38,7 @@ class RosterServer:
         asyncio.run_coroutine_threadsafe(stop(), self.loop).result()
         self.loop.call_soon_threadsafe(self.loop.stop)
         self.thread.join()
+        self.loop.close()
 
     async def start(self):
         return await serve(self.link, "127.0.0.1", 0, process_request=self.request)

@@ -193,7 +193,7 @@ class Monitors(BrowserTest):
         config = self.fleet.session.config
         self.fleet.session.stop()
         expect(live).to_contain_text("No connection since")
-        type(self).fleet.session = Server("session-server", self.fleet.session.folder, config)
+        type(self).fleet.session = Server("session-server", self.fleet.session.folder, config, {})
         self.fleet.servers.append(self.fleet.session)
         expect(live).to_have_text("Live")
         expect(page.tab.locator("#servers .state.up")).to_have_count(2)
