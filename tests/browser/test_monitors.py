@@ -52,7 +52,7 @@ class Monitors(BrowserTest):
         expect(page.tab.locator("#glance")).to_contain_text("1 down")
         expect(page.tab.locator("#changes li").first).to_contain_text(self.fleet.other.address)
         self.fleet.servers.remove(self.fleet.other)
-        type(self).fleet.other = Server("simulation-server", self.fleet.other.folder, config)
+        type(self).fleet.other = Server("simulation-server", self.fleet.other.folder, config, self.fleet.environment)
         self.fleet.servers.append(self.fleet.other)
         expect(row.locator(".state")).to_have_text("up")
         self.assertTrue(page.tab.evaluate("window.same"), "the page was loaded again")
@@ -193,7 +193,7 @@ class Monitors(BrowserTest):
         config = self.fleet.session.config
         self.fleet.session.stop()
         expect(live).to_contain_text("No connection since")
-        type(self).fleet.session = Server("session-server", self.fleet.session.folder, config, {})
+        type(self).fleet.session = Server("session-server", self.fleet.session.folder, config, self.fleet.environment)
         self.fleet.servers.append(self.fleet.session)
         expect(live).to_have_text("Live")
         expect(page.tab.locator("#servers .state.up")).to_have_count(2)
