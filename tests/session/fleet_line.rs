@@ -9,10 +9,11 @@ use base64::engine::general_purpose::URL_SAFE_NO_PAD;
 use nix::sys::signal::Signal;
 use serde_json::json;
 
+use super::stand_in::{Manner, StandIn};
 use super::until_states;
 use crate::support::client::{Client, Heard};
-use crate::support::git::{Forge, WORLD, world};
-use crate::support::program::{Builder, Server, session_server, simulation_server};
+use crate::support::git::{Forge, WORLD, arm, world};
+use crate::support::program::{Builder, Server, demo_server, session_server, simulation_server};
 use crate::support::webots::Webots;
 use crate::support::{SOON, until};
 
@@ -153,8 +154,8 @@ impl Visitor<'_> {
 
 impl Class {
     /// The pairs of clients of which the second had its turn before the first, although both waited, the first had come
-    /// earlier, and the server could take both.
-    fn overtakings(&self, takes: &BTreeMap<String, &[&str]>) -> Vec<(Wait, Wait)> {
+    /// earlier, and the server could take both, by more than this time.
+    fn overtakings(&self, takes: &BTreeMap<String, &[&str]>, tolerance: Duration) -> Vec<(Wait, Wait)> {
         let waits = self.waits.borrow();
         let mut found = Vec::new();
         for turn in waits.iter().filter(|wait| wait.server.is_some()) {
@@ -162,8 +163,8 @@ impl Class {
             let was_passed_over = |other: &&Wait| {
                 other.place < turn.place
                     && takes.contains(&other.owner)
-                    && other.from + SEEN < turn.until
-                    && other.until > turn.until + SEEN
+                    && other.from + tolerance < turn.until
+                    && other.until > turn.until + tolerance
             };
             found.extend(
                 waits
@@ -211,11 +212,143 @@ fn server(forge: &Forge, webots: &Webots, owners: &[&str]) -> Builder {
         .set("fleetKey", SECRET)
 }
 
-fn fleet(servers: &[&Server]) -> Builder {
-    let addresses: Vec<String> = servers.iter().map(|server| server.address()).collect();
-    session_server(&addresses)
+fn fleet(addresses: &[String]) -> Builder {
+    session_server(addresses)
         .set("fleetKey", SECRET)
         .set("loadThreshold", 1000)
+}
+
+/// A client of an address in the line for the world of `arm`.
+async fn enter_from(session: &Server, address: &str) -> Client {
+    let url = session.websocket("/session");
+    let mut client = Client::with_headers(&url, &[("x-forwarded-for", address)])
+        .await
+        .unwrap();
+    client.send(&json!({"url": arm(), "wait": true}).to_string()).await;
+    client.until("ticket: ").await;
+    client
+}
+
+/// The next pass of a client whose turn comes.
+async fn pass(client: &mut Client) -> String {
+    client.until("pass: ").await.replace("pass: ", "")
+}
+
+#[actix_rt::test]
+async fn a_flood_of_tickets_of_one_address_takes_no_turn_of_others() {
+    let server = demo_server(2)
+        .set("fleetKey", SECRET)
+        .set("maxPlacesPerAddress", 1)
+        .start()
+        .await;
+    let session = fleet(&[server.address()]).start().await;
+    until_states(&session, &["up"]).await;
+    let (flooding, other) = ("203.0.113.9", "203.0.113.10");
+    let mut flood = Vec::new();
+    for _ in 0..40 {
+        flood.push(enter_from(&session, flooding).await);
+    }
+    let start = async |address: &str, pass: &str| {
+        let mut client = Client::from_address(&server, address).await.unwrap();
+        let request = json!({"start": {"url": arm(), "pass": pass}});
+        client.send(&request.to_string()).await;
+        client.until("webots:").await;
+        client
+    };
+    let first = start(flooding, &pass(&mut flood[0]).await).await;
+    // The second slot stays free for others, although forty came before.
+    let mut client = enter_from(&session, other).await;
+    let given = pass(&mut client).await;
+    let second = start(other, &given).await;
+    // Those of the flood have kept their order, and get what their address may have.
+    first.leave().await;
+    start(flooding, &pass(&mut flood[1]).await).await.leave().await;
+    pass(&mut flood[2]).await;
+    second.leave().await;
+}
+
+#[actix_rt::test]
+async fn a_python_server_among_others_takes_its_turn_by_the_load_alone() {
+    // The original's simulation server has `/load` and no `/status`, and knows neither slots nor passes.
+    let python = StandIn::start(Manner::Load("200.0".to_owned()));
+    let server = demo_server(1).set("fleetKey", SECRET).start().await;
+    let inside = Client::ready(&server).await;
+    let session = fleet(&[server.address(), python.address()])
+        // The load of this machine fills no server.
+        .set("loadThreshold", 150)
+        .start()
+        .await;
+    until_states(&session, &["full", "full"]).await;
+    let mut first = enter_from(&session, "203.0.113.9").await;
+    assert_eq!(first.until("queue: ").await, "queue: 0");
+    python.set(Manner::Load("3.0".to_owned()));
+    assert_eq!(first.until("ws://").await, python.url());
+    assert!(
+        !first.heard.iter().any(|text| text.starts_with("pass:")),
+        "{:?}",
+        first.heard
+    );
+    python.set(Manner::Load("200.0".to_owned()));
+    until_states(&session, &["full", "full"]).await;
+    let mut second = enter_from(&session, "203.0.113.9").await;
+    assert_eq!(second.until("queue: ").await, "queue: 0");
+    inside.leave().await;
+    pass(&mut second).await;
+    assert_eq!(second.until("ws://").await, format!("ws://{}", server.address()));
+}
+
+#[actix_rt::test]
+async fn on_a_quiet_machine_two_session_servers_are_as_fair_as_their_messages_are_fast() {
+    const CLIENTS: usize = 80;
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let lab: &[&str] = &["lab"];
+    let (first, second) = (
+        server(&forge, &webots, lab).start().await,
+        server(&forge, &webots, lab).start().await,
+    );
+    let both = [first.address(), second.address()];
+    let sessions = [fleet(&both).start().await, fleet(&both).start().await];
+    for session in &sessions {
+        until_states(session, &["up"; 2]).await;
+    }
+    let class = Class::default();
+    let clients = (0..CLIENTS).map(|number| {
+        // Three of four wait at the first one.
+        let session = &sessions[usize::from(number % 4 == 0)];
+        let visitor = Visitor {
+            class: &class,
+            session: session.websocket("/session"),
+            owner: "lab",
+            ticket: String::new(),
+            stay: Duration::from_millis(300 + 10 * (number as u64 * 37 % 50)),
+            reloads: false,
+        };
+        async move {
+            actix_rt::time::sleep(Duration::from_millis(10 * number as u64)).await;
+            visitor.visit().await;
+        }
+    });
+    futures_util::future::join_all(clients).await;
+    assert_eq!(class.served.get(), CLIENTS);
+    let takes: BTreeMap<String, &[&str]> = both.iter().map(|address| (format!("ws://{address}"), lab)).collect();
+    let all = class.overtakings(&takes, SEEN);
+    let mut by: BTreeMap<(u64, u64), usize> = BTreeMap::new();
+    for (overtaken, _) in &all {
+        *by.entry(overtaken.place).or_default() += 1;
+    }
+    let later = |(first, second): &(Wait, Wait)| second.place.0 - first.place.0;
+    println!(
+        "{} overtakings, at most {} of one client, by clients that came at most {} ms later",
+        all.len(),
+        by.values().max().copied().unwrap_or_default(),
+        all.iter().map(later).max().unwrap_or_default()
+    );
+    // The messages of both are on their way for some time.
+    let unfair: Vec<_> = all
+        .iter()
+        .filter(|pair| u128::from(later(pair)) > SEEN.as_millis())
+        .collect();
+    assert!(unfair.is_empty(), "{unfair:#?}");
 }
 
 #[actix_rt::test]
@@ -230,7 +363,8 @@ async fn on_a_quiet_machine_two_hundred_share_twenty_slots_in_order_whatever_hap
     let drained = server(&forge, &webots, lab).start().await;
     let third = server(&forge, &webots, both).start().await;
     let fourth = server(&forge, &webots, lab).start().await;
-    let mut session = fleet(&[&killed, &drained, &third, &fourth]).start().await;
+    let addresses = [&killed, &drained, &third, &fourth].map(Server::address);
+    let mut session = fleet(&addresses).start().await;
     until_states(&session, &["up"; 4]).await;
     let class = Class::default();
     let url = session.websocket("/session");
@@ -276,13 +410,14 @@ async fn on_a_quiet_machine_two_hundred_share_twenty_slots_in_order_whatever_hap
         served(CLIENTS * 3 / 5).await;
         session.signal(Signal::SIGKILL);
         session.ended().await;
-        let again = fleet(&[&third, &fourth, &added]).port(session.port).start().await;
+        let addresses = [&third, &fourth, &added].map(Server::address);
+        let again = fleet(&addresses).port(session.port).start().await;
         served(CLIENTS).await;
         (added, again)
     };
     let (_, (added, again)) = tokio::join!(futures_util::future::join_all(clients), events);
     assert_eq!(class.served.get(), CLIENTS);
-    let overtakings = class.overtakings(&takes);
+    let overtakings = class.overtakings(&takes, SEEN);
     let mut idle = Vec::new();
     for (server, owners) in [
         (&killed, both),

@@ -15,6 +15,7 @@ mod pushing;
 mod requests;
 mod seeing;
 mod signing_in;
+mod slots;
 mod stopping;
 mod trust;
 mod waiting;

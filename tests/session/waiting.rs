@@ -1,13 +1,15 @@
 //! The line: clients that wait for a slot, at simulation servers that only report.
 
 use serde_json::json;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
 
 use super::stand_in::{Manner, StandIn};
 use super::{addresses, until_states};
-use crate::support::client::Client;
+use crate::support::client::{Client, Heard};
 use crate::support::git::world;
 use crate::support::program::{Builder, Server, session_server};
-use crate::support::{http, until};
+use crate::support::{SOON, http, until};
 
 /// A client in the line, and its ticket.
 struct Waiting(Client, String);
@@ -141,6 +143,50 @@ async fn a_ticket_keeps_the_place_over_a_reload_and_a_restart_of_the_session_ser
     assert_eq!(forged.position().await, "queue: 3");
 }
 
+/// A WebSocket that can be cut like a cable.
+async fn bare(session: &Server) -> TcpStream {
+    let mut socket = TcpStream::connect(session.address()).await.unwrap();
+    let head = "GET /session HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
+                Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n";
+    socket.write_all(head.as_bytes()).await.unwrap();
+    let mut heard = [0; 512];
+    assert!(socket.read(&mut heard).await.unwrap() > 0);
+    socket
+}
+
+#[actix_rt::test]
+async fn clients_whose_connections_break_while_they_enter_leave_nothing_in_the_line() {
+    const CLIENTS: usize = 400;
+    let (_server, session) = one_full_server(|builder| builder).await;
+    let url = world("lab/arm", "main", "worlds/a.wbt");
+    let request = json!({"url": url, "wait": true}).to_string();
+    let length = u8::try_from(request.len()).unwrap();
+    assert!(length < 126);
+    // A text whose mask changes nothing.
+    let frame = [&[0x81, 0x80 | length, 0, 0, 0, 0], request.as_bytes()].concat();
+    let mut sockets = Vec::new();
+    for _ in 0..CLIENTS {
+        sockets.push(bare(&session).await);
+    }
+    // All ask at once, so that some break before they are answered.
+    for socket in &mut sockets {
+        socket.write_all(&frame).await.unwrap();
+    }
+    for socket in sockets {
+        socket.set_zero_linger().unwrap();
+    }
+    let mut after = Waiting::enter(&session, "lab").await;
+    until("only the client that is there waits", async || {
+        session.status().await["line"]["waiting"] == 1
+    })
+    .await;
+    until(
+        "nobody is ahead of it",
+        async || matches!(after.0.next_within(SOON).await, Some(Heard::Text(text)) if text == "queue: 0"),
+    )
+    .await;
+}
+
 #[actix_rt::test]
 async fn free_slots_belong_to_those_who_wait_for_them_and_to_nobody_else() {
     let servers = [Manner::of_owner("lab"), Manner::of_owner("school")].map(StandIn::start);
@@ -179,6 +225,43 @@ async fn free_slots_belong_to_those_who_wait_for_them_and_to_nobody_else() {
     servers[0].set(Manner::of_owner("lab"));
     until_states(&session, &["up", "up"]).await;
     assert_eq!(request("lab").await, servers[0].url());
+}
+
+#[actix_rt::test]
+async fn the_monitor_shows_who_waits_for_what_and_since_when() {
+    let (_server, session) = one_full_server(|builder| builder).await;
+    let page = async || http::get(&session.url("/monitor")).await.text();
+    let row = async |owner: &str| {
+        let page = page().await;
+        let key = format!(r#"data-key="https://github.com/{owner}/arm">"#);
+        let (_, row) = page.split_once(&key)?;
+        Some(row.split_once("</tr>").unwrap().0.to_owned())
+    };
+    assert!(row("lab").await.is_none() && page().await.contains("Nobody waits for a place."));
+    let first = Waiting::enter(&session, "lab").await;
+    let _second = Waiting::enter(&session, "lab").await;
+    let _third = Waiting::enter(&session, "school").await;
+    let lab = row("lab").await.unwrap();
+    assert!(
+        lab.contains("github.com/lab/arm</th>") && lab.contains(r#"data-value="2">2</td>"#),
+        "{lab}"
+    );
+    let since = lab
+        .split_once(r#"<time datetime=""#)
+        .unwrap()
+        .1
+        .split('"')
+        .next()
+        .unwrap();
+    let since = humantime::parse_rfc3339(since).unwrap();
+    assert!(since.elapsed().unwrap() < SOON, "{lab}");
+    assert!(row("school").await.unwrap().contains(r#"data-value="1">1</td>"#));
+    assert!(page().await.contains("3 wait in the line"));
+    first.0.leave().await;
+    until("one of lab is left", async || {
+        row("lab").await.is_some_and(|row| row.contains(">1</td>"))
+    })
+    .await;
 }
 
 #[actix_rt::test]

@@ -3,7 +3,9 @@
 use std::time::Duration;
 
 use serde_json::{Value, json};
-use webots_fleet::shared::domain::{FleetKey, Hello, Offers, Pass, ProjectUrl, ReservationId, ServerRun, Wish, Wishes};
+use webots_fleet::shared::domain::{
+    FleetKey, Hello, Offers, Pass, Passed, ProjectUrl, ReservationId, ServerRun, Wish, Wishes,
+};
 
 use crate::support::program::{Builder, Server};
 use crate::support::{Client, arm, arm_at, demo_server, until};
@@ -266,7 +268,73 @@ async fn who_has_its_share_is_passed_over_and_keeps_its_place() {
         back: Vec::new(),
     };
     link.socket.send(&serde_json::to_string(&wishes).unwrap()).await;
-    assert_eq!(link.slots().await[0].0, 2);
+    let offers = link.offers().await;
+    assert_eq!(offers.offers[0].ticket, 2);
+    // So the session server can name others instead.
+    assert_eq!(offers.passed, [Passed::Address("203.0.113.9".parse().unwrap())]);
     greedy.leave().await;
-    assert_eq!(link.slots().await[0].0, 1);
+    let offers = link.offers().await;
+    assert_eq!((offers.offers[0].ticket, offers.passed), (1, Vec::new()));
+}
+
+#[actix_rt::test]
+async fn an_address_that_lets_slots_expire_comes_after_the_others() {
+    let server = reserving()
+        .set("maxConnections", 1)
+        .set("timing.pass", 0.05)
+        .start()
+        .await;
+    let mut link = Link::open(&server).await;
+    let (wasteful, other) = ("203.0.113.9", "203.0.113.10");
+    let wish = |ticket: u64, waited: u64, address: &str| Wish {
+        ticket,
+        waited,
+        address: Some(address.parse().unwrap()),
+        user: None,
+        world: None,
+    };
+    // All its clients have waited longer, and none of them comes.
+    let mut first: Vec<Wish> = (0..30).map(|ticket| wish(ticket, 90_000 - ticket, wasteful)).collect();
+    first.push(wish(99, 1, other));
+    let wishes = Wishes {
+        number: 1,
+        all: 31,
+        first,
+        back: Vec::new(),
+    };
+    link.socket.send(&serde_json::to_string(&wishes).unwrap()).await;
+    let mut served = Vec::new();
+    while served.last() != Some(&99) {
+        served.extend(link.slots().await.into_iter().map(|(ticket, _)| ticket));
+    }
+    // Twenty expire without a consequence, and one tells that it is too many.
+    assert_eq!(served, (0..21).chain([99]).collect::<Vec<_>>());
+}
+
+#[actix_rt::test]
+async fn a_session_server_that_sends_nonsense_disturbs_no_other() {
+    let server = reserving().start().await;
+    let (mut bad, mut good) = (Link::open(&server).await, Link::open(&server).await);
+    bad.want(&[(7, 99)]).await;
+    assert_eq!(bad.slots().await[0].0, 7);
+    // It gives back what it was not given.
+    let wishes = Wishes {
+        number: 2,
+        back: (0..100).map(ReservationId).collect(),
+        ..Wishes::default()
+    };
+    bad.socket.send(&serde_json::to_string(&wishes).unwrap()).await;
+    good.want(&[(8, 1)]).await;
+    let slots = good.slots().await;
+    assert_eq!(slots[0].0, 8);
+    assert_eq!(server.status().await["instances"]["reserved"], 2);
+    bad.socket.send(&"x".repeat(9 * 1024)).await;
+    assert_eq!(bad.socket.closed().await, Some(1008));
+    for text in ["[]", r#"{"number": 1}"#, r#"{"number": -1, "first": [], "all": 0}"#] {
+        let mut bad = Link::open(&server).await;
+        bad.socket.send(text).await;
+        assert_eq!(bad.socket.closed().await, Some(1008), "{text}");
+    }
+    let mut client = start(&server, &arm(), &good.pass(slots[0].1)).await;
+    client.until("webots:").await;
 }

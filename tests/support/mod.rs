@@ -34,6 +34,7 @@ pub mod ports;
 pub mod program;
 pub mod receiver;
 pub mod relay;
+pub mod reserving;
 pub mod sentences;
 pub mod smtp;
 pub mod stand_in;

@@ -8,14 +8,14 @@ use actix::prelude::*;
 use prometheus::Histogram;
 
 use super::server_record::ServerRecord;
-use super::server_table::{ServerTable, accepts, admission};
+use super::server_table::{ServerTable, admission, terms};
 use super::slot_link::{LinkChange, LinkEvent};
 use crate::session::class::{ClassEntry, ClassState};
 use crate::session::line::{
     Dispatcher, Entered, Entry, LineStatus, Moment, Place, Progress, Served, Ticket, Turn, WaitingClient,
 };
 use crate::session::placement::ReadyWorlds;
-use crate::shared::domain::{Failure, ProjectUrl, PublicAddress, Reason};
+use crate::shared::domain::{Failure, ProjectUrl, PublicAddress, Reason, ServerReport};
 
 /// Asks for a slot, and waits for it in the line. The answer is the place, unless it is the client's turn already.
 #[derive(Message, Debug)]
@@ -37,15 +37,10 @@ pub struct Wait {
     pub label: Option<String>,
 }
 
-/// A client waits no longer.
+/// The client of this connection waits no longer, if it does. Another connection may have its place by now.
 #[derive(Message, Debug)]
 #[rtype(result = "()")]
-pub struct StopWaiting {
-    /// Its place.
-    pub place: Place,
-    /// Its connection, unless another one has that place by now.
-    pub connection: u64,
-}
+pub struct StopWaiting(pub u64);
 
 /// What happens to a client in the line.
 #[derive(Message, Debug, Clone)]
@@ -96,13 +91,12 @@ impl LineKeeper {
         self.dispatcher.claims(server, load, admission(records))
     }
 
-    /// A client asks for a slot.
-    pub(super) fn enter(&mut self, servers: &mut ServerTable, wait: Wait) -> Result<Option<Place>, Failure> {
+    /// A client asks for a slot. What follows is up to [`Self::serve`].
+    pub(super) fn enter(&mut self, servers: &ServerTable, wait: Wait) -> Result<Option<Place>, Failure> {
         let refused = servers.refusal(Some(&wait.world));
         if matches!(refused.reason, Reason::RepositoryNotAllowed | Reason::RepositoryBlocked) {
             return Err(refused);
         }
-        let now = moment();
         let client = wait.client;
         let entry = Entry {
             world: wait.world,
@@ -116,7 +110,12 @@ impl LineKeeper {
             let record = servers.records.get(server);
             record.is_some_and(|record| record.state.report().is_some())
         };
-        match self.dispatcher.enter(wait.ticket, entry, rand::random(), is_up, now) {
+        let terms = terms(&servers.records);
+        let number = rand::random();
+        match self
+            .dispatcher
+            .enter(wait.ticket, entry, number, is_up, terms, moment())
+        {
             Entered::Again(turn) => {
                 client.do_send(LineEvent::Turn(turn));
                 Ok(None)
@@ -125,24 +124,17 @@ impl LineKeeper {
                 if let Some(displaced) = displaced {
                     displaced.do_send(LineEvent::TakenOver);
                 }
-                self.serve(servers, None);
-                if let Some(ahead) =
-                    self.dispatcher
-                        .first_news(place, servers.addresses(), accepts(&servers.records), now.instant)
-                {
-                    client.do_send(LineEvent::Progress(ahead));
-                }
                 Ok(Some(place))
             }
         }
     }
 
     /// A client waits no longer.
-    pub(super) fn leave(&mut self, StopWaiting { place, connection }: StopWaiting) {
-        self.dispatcher.leave(place, connection);
+    pub(super) fn leave(&mut self, StopWaiting(connection): StopWaiting) {
+        self.dispatcher.leave(connection);
     }
 
-    /// Something has happened to the link of a server.
+    /// Something has happened to the link of a server. What follows is up to [`Self::serve`].
     pub(super) fn link(&mut self, servers: &mut ServerTable, LinkEvent { server, change }: LinkEvent) {
         if !servers.records.contains_key(&server) {
             return;
@@ -162,35 +154,39 @@ impl LineKeeper {
                 self.give(turns, &mut servers.ready);
             }
         }
-        self.serve(servers, Some(&server));
     }
 
-    /// A server has reported. What follows for those who wait is worked out once for all servers, with the next tick.
-    pub(super) fn reported(&mut self, servers: &ServerTable, server: &PublicAddress) {
+    /// A server has reported; `before` is its last report. What follows for those who wait is worked out once for all
+    /// servers, with the next tick.
+    pub(super) fn reported(&mut self, servers: &ServerTable, server: &PublicAddress, before: Option<&ServerReport>) {
         let record = servers.records.get(server);
-        let report = record.and_then(|record| record.state.report());
-        if let Some(instances) = report.and_then(|report| report.instances) {
+        let Some(report) = record.and_then(|record| record.state.report()) else {
+            return;
+        };
+        if let Some(instances) = report.instances {
             self.dispatcher.count_freed(server, instances.freed, Instant::now());
+        }
+        if !before.is_some_and(|before| before.has_rules_of(report)) {
+            self.dispatcher.rules_changed(server, terms(&servers.records));
         }
     }
 
-    /// Forgets the servers that are no longer in the fleet.
-    pub(super) fn forget_others(&mut self, servers: &ServerTable) {
-        self.dispatcher.retain(|server| servers.records.contains_key(server));
+    /// The fleet consists of these servers now.
+    pub(super) fn set_servers(&mut self, servers: &ServerTable) {
+        self.dispatcher
+            .set_servers(servers.addresses(), terms(&servers.records));
     }
 
     /// Looks after what changes with time alone.
     pub(super) fn tick(&mut self, servers: &mut ServerTable) {
-        self.serve(servers, None);
+        self.serve(servers);
         let now = Instant::now();
-        if now.duration_since(self.told) < NEWS || self.dispatcher.is_empty() {
+        if now.duration_since(self.told) < NEWS {
             return;
         }
         self.told = now;
-        for (client, progress) in self
-            .dispatcher
-            .news(servers.addresses(), accepts(&servers.records), now)
-        {
+        self.dispatcher.forget(now);
+        for (client, progress) in self.dispatcher.news(now) {
             client.do_send(LineEvent::Progress(progress));
         }
         for (client, place) in self.dispatcher.renewals(now) {
@@ -221,8 +217,8 @@ impl LineKeeper {
         self.dispatcher.status(moment().unix)
     }
 
-    /// Gives turns, and tells servers who waits: this one, or all.
-    fn serve(&mut self, servers: &mut ServerTable, only: Option<&PublicAddress>) {
+    /// Gives turns, and tells servers who waits, and clients that have just come how they stand.
+    pub(super) fn serve(&mut self, servers: &mut ServerTable) {
         let ServerTable {
             records, fleet, ready, ..
         } = servers;
@@ -231,11 +227,15 @@ impl LineKeeper {
             let report = records.get(server).and_then(|record| record.state.report());
             self.has_key && !self.refused_by.contains(server) && report.is_some_and(|report| report.reserves)
         };
+        let now = moment();
         let served = self
             .dispatcher
-            .serve(fleet, admission(records), will_reserve, ready, only, moment());
+            .serve(fleet, admission(records), will_reserve, ready, now);
         let Served { turns, wishes } = served;
         self.give(turns, ready);
+        for (client, progress) in self.dispatcher.first_news(now.instant) {
+            client.do_send(LineEvent::Progress(progress));
+        }
         for (server, wishes) in wishes {
             servers.ask(&server, wishes);
         }

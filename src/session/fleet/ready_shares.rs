@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use jiff::Timestamp;
 
 use super::server_record::ServerState;
-use super::server_table::{ServerTable, accepts};
+use super::server_table::{ServerTable, terms};
 use super::slot_link::{LinkChange, LinkEvent};
 use crate::session::config::SessionConfig;
 use crate::session::placement::shares;
@@ -125,7 +125,9 @@ impl ReadyShares {
         let rooms: Vec<(PublicAddress, u32)> = may_keep
             .filter_map(|server| Some((server.clone(), slots(server)?.slots)))
             .collect();
-        let lists = shares(&self.wanted(config), &rooms, accepts(&servers.records));
+        let terms = terms(&servers.records);
+        let accepts = |server: &PublicAddress, world: &ProjectUrl| terms(server, world).is_some();
+        let lists = shares(&self.wanted(config), &rooms, accepts);
         let mut lists: HashMap<PublicAddress, Vec<ReadyCount>> =
             rooms.into_iter().map(|(server, _)| server).zip(lists).collect();
         for (server, asked) in &mut self.asked {

@@ -73,7 +73,23 @@ pub struct Registry {
     /// Whether a simulation server can take a client; all web clients follow it.
     available: watch::Sender<bool>,
     changes: StateHistory,
+    /// What has to be looked at once the messages that have come are handled.
+    pending: Pending,
 }
+
+/// Whether messages have changed something.
+#[derive(Default)]
+struct Pending {
+    /// A [`Settle`] is on its way.
+    is_scheduled: bool,
+    /// The line has changed, or a server's answer to it.
+    line: bool,
+}
+
+/// Works out what follows from all messages that were handled before: many may come at the same moment.
+#[derive(Message)]
+#[rtype(result = "()")]
+struct Settle;
 
 /// Pause between two lookups of the names.
 const LOOKUP_INTERVAL: Duration = Duration::from_secs(1);
@@ -104,6 +120,7 @@ impl Registry {
                 // A large class behind one address may reserve room at once.
                 quota: AddressQuota::new(200, 12),
                 changes: StateHistory::new(&config),
+                pending: Pending::default(),
                 line: LineKeeper::new(waited, config.fleet_key.is_some()),
                 ready: ReadyShares::open(&config),
                 config,
@@ -111,6 +128,15 @@ impl Registry {
                 available,
             }
         }))
+    }
+
+    /// Has the consequences of a message worked out.
+    fn settle(&mut self, ctx: &mut Context<Self>) {
+        if !self.pending.is_scheduled {
+            self.pending.is_scheduled = true;
+            // actix handles it after the messages that have come.
+            ctx.notify(Settle);
+        }
     }
 
     /// Publishes a change of availability, to those who are not in the line.
@@ -130,6 +156,7 @@ impl Registry {
             records, fleet, ready, ..
         } = &mut self.servers;
         let Some(record) = records.get_mut(server) else { return };
+        let before = record.state.last_answer().map(|answer| Arc::clone(&answer.report));
         let change = match answer {
             Ok(report) => {
                 let now = Instant::now();
@@ -165,7 +192,7 @@ impl Registry {
         if let Some(change) = change {
             self.changes.add(change);
         }
-        self.line.reported(&self.servers, server);
+        self.line.reported(&self.servers, server, before.as_deref());
     }
 
     /// Chooses a server for a client of this address.
@@ -217,8 +244,8 @@ impl Registry {
             .map(|answers, registry, ctx| {
                 if registry.servers.names.record(answers) {
                     registry.servers.follow_names(&registry.config);
-                    registry.line.forget_others(&registry.servers);
-                    registry.publish();
+                    registry.line.set_servers(&registry.servers);
+                    registry.settle(ctx);
                 }
                 ctx.run_later(LOOKUP_INTERVAL, Self::look_up_names);
             })
@@ -241,6 +268,7 @@ impl Actor for Registry {
         // The requests and reports of a whole fleet may arrive at the same moment.
         ctx.set_mailbox_capacity(4096);
         self.servers.apply(&self.config);
+        self.line.set_servers(&self.servers);
         ctx.run_interval(TICK, |registry, _| {
             registry.servers.restart_monitors(&registry.config);
             registry.line.tick(&mut registry.servers);
@@ -261,19 +289,19 @@ impl Handler<ProbeResult> for Registry {
             latency,
             answer,
         }: ProbeResult,
-        _: &mut Self::Context,
+        ctx: &mut Self::Context,
     ) {
         self.record(&server, latency, answer);
-        self.publish();
+        self.settle(ctx);
     }
 }
 
 impl Handler<Pick> for Registry {
     type Result = Result<PublicAddress, Failure>;
 
-    fn handle(&mut self, Pick { world, from }: Pick, _: &mut Self::Context) -> Self::Result {
+    fn handle(&mut self, Pick { world, from }: Pick, ctx: &mut Self::Context) -> Self::Result {
         let answer = self.pick(world.as_ref(), from);
-        self.publish();
+        self.settle(ctx);
         answer
     }
 }
@@ -281,28 +309,41 @@ impl Handler<Pick> for Registry {
 impl Handler<Wait> for Registry {
     type Result = Result<Option<Place>, Failure>;
 
-    fn handle(&mut self, wait: Wait, _: &mut Self::Context) -> Self::Result {
-        let entered = self.line.enter(&mut self.servers, wait);
-        self.publish();
-        entered
+    fn handle(&mut self, wait: Wait, ctx: &mut Self::Context) -> Self::Result {
+        self.pending.line = true;
+        self.settle(ctx);
+        self.line.enter(&self.servers, wait)
     }
 }
 
 impl Handler<StopWaiting> for Registry {
     type Result = ();
 
-    fn handle(&mut self, stop: StopWaiting, _: &mut Self::Context) {
+    fn handle(&mut self, stop: StopWaiting, ctx: &mut Self::Context) {
         self.line.leave(stop);
-        self.publish();
+        self.pending.line = true;
+        self.settle(ctx);
     }
 }
 
 impl Handler<LinkEvent> for Registry {
     type Result = ();
 
-    fn handle(&mut self, event: LinkEvent, _: &mut Self::Context) {
+    fn handle(&mut self, event: LinkEvent, ctx: &mut Self::Context) {
         self.ready.link(&event);
         self.line.link(&mut self.servers, event);
+        self.pending.line = true;
+        self.settle(ctx);
+    }
+}
+
+impl Handler<Settle> for Registry {
+    type Result = ();
+
+    fn handle(&mut self, _: Settle, _: &mut Self::Context) {
+        if std::mem::take(&mut self.pending).line {
+            self.line.serve(&mut self.servers);
+        }
         self.publish();
     }
 }
@@ -356,10 +397,10 @@ impl Handler<GetWaiting> for Registry {
 impl Handler<Reconfigure> for Registry {
     type Result = ();
 
-    fn handle(&mut self, Reconfigure(config): Reconfigure, _: &mut Self::Context) {
+    fn handle(&mut self, Reconfigure(config): Reconfigure, ctx: &mut Self::Context) {
         self.servers.apply(&config);
-        self.line.forget_others(&self.servers);
+        self.line.set_servers(&self.servers);
         self.config = config;
-        self.publish();
+        self.settle(ctx);
     }
 }

@@ -173,11 +173,13 @@ pub fn admission(
     }
 }
 
-/// Whether a server accepts a world at the load of its last report.
-pub fn accepts(records: &HashMap<PublicAddress, ServerRecord>) -> impl Fn(&PublicAddress, &ProjectUrl) -> bool {
+/// On what terms a server takes a client for a world at the load of its last report.
+pub fn terms(
+    records: &HashMap<PublicAddress, ServerRecord>,
+) -> impl Fn(&PublicAddress, &ProjectUrl) -> Option<Admission> {
     |server, world| {
-        let answer = records.get(server).and_then(|record| record.state.last_answer());
-        answer.is_some_and(|answer| answer.report.check(world, answer.report.load).is_ok())
+        let answer = records.get(server)?.state.last_answer()?;
+        answer.report.check(world, answer.report.load).ok()
     }
 }
 

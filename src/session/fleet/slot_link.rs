@@ -99,6 +99,8 @@ const CONNECT: Duration = Duration::from_secs(5);
 const SILENCE: Duration = Duration::from_mins(2);
 /// Pause after a connection has broken.
 const PAUSE: Duration = Duration::from_millis(500);
+/// Pause after each message of a server, so that none can keep this one busy with them.
+const BETWEEN_MESSAGES: Duration = Duration::from_millis(1);
 /// Pause if the server has no `/slots`, or another key.
 const LONG_PAUSE: Duration = Duration::from_secs(30);
 
@@ -115,7 +117,8 @@ impl SlotLink {
                 LinkChange::Refused
             } else {
                 LinkChange::Down
-            });
+            })
+            .await;
             log::debug!("{}: no slots are reserved: {error}", self.server);
             let pause = match error {
                 LinkError::Broken(_) => PAUSE,
@@ -152,23 +155,26 @@ impl SlotLink {
         // Those for an earlier link.
         while messages.try_recv().is_ok() {}
         let mut followed = hello.roster.then(|| Followed::new(self));
-        self.tell(LinkChange::Up(hello));
-        self.tell(LinkChange::Offers(first));
+        self.tell(LinkChange::Up(hello)).await;
+        self.tell(LinkChange::Offers(first)).await;
         let mut watching = self.roster.watching();
         if followed.is_some() {
             watching.mark_changed();
         }
         loop {
             tokio::select! {
-                message = receive(&mut socket, SILENCE) => match message? {
-                    ToSessionServer::Offers(offers) => self.tell(LinkChange::Offers(offers)),
-                    ToSessionServer::Roster(update) => self.roster.update(&self.server, update),
-                    ToSessionServer::Stopped(stopped) => {
-                        if let Some(followed) = &mut followed {
-                            followed.answer(stopped);
+                message = receive(&mut socket, SILENCE) => {
+                    match message? {
+                        ToSessionServer::Offers(offers) => self.tell(LinkChange::Offers(offers)).await,
+                        ToSessionServer::Roster(update) => self.roster.update(&self.server, update),
+                        ToSessionServer::Stopped(stopped) => {
+                            if let Some(followed) = &mut followed {
+                                followed.answer(stopped);
+                            }
                         }
                     }
-                },
+                    sleep(BETWEEN_MESSAGES).await;
+                }
                 next = messages.recv() => match next {
                     Some(next) => send(&mut socket, &next).await?,
                     None => return Ok(()),
@@ -185,11 +191,13 @@ impl SlotLink {
         }
     }
 
-    fn tell(&self, change: LinkChange) {
-        self.events.do_send(LinkEvent {
+    /// Tells what has happened, once the receiver has handled what came before. A receiver that has ended needs nothing.
+    async fn tell(&self, change: LinkChange) {
+        let event = LinkEvent {
             server: self.server.clone(),
             change,
-        });
+        };
+        self.events.send(event).await.ok();
     }
 }
 

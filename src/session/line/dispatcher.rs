@@ -5,13 +5,13 @@
 
 use std::collections::{HashMap, HashSet};
 use std::hash::Hash;
-use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use super::link::{LISTED, Link};
-use super::rate::{Rate, estimate};
+use super::classes::{ClassId, Classes, Doors};
+use super::link::Link;
+use super::rate::{Basis, Rate};
 use super::ticket::Ticket;
-use super::waiting_line::{Entry, Group, Place, Progress, WaitingClient, WaitingLine};
+use super::waiting_line::{Entry, LISTED, Place, Progress, WaitingClient, WaitingLine};
 use crate::session::placement::{LoadBalancer, ReadyWorlds};
 use crate::shared::domain::{Admission, Hello, Offers, Pass, ProjectUrl, Wishes};
 
@@ -74,7 +74,9 @@ pub struct WaitingFor {
     pub repository: String,
     /// Number of clients.
     pub waiting: u32,
-    /// How long the first of them has waited.
+    /// When the first of them has come, in milliseconds since 1970.
+    pub since: u64,
+    /// How long it has waited.
     pub longest: Duration,
 }
 
@@ -97,19 +99,19 @@ impl LineStatus {
 /// The line, and the servers whose slots it gets.
 #[derive(Debug)]
 pub struct Dispatcher<Server, Client> {
-    line: WaitingLine<Client>,
+    line: WaitingLine<Server, Client>,
     links: HashMap<Server, Link>,
     /// The rates at which slots of servers become free, each with the number of slots that it has counted.
     rates: HashMap<Server, (u64, Rate)>,
     turns: HashMap<u64, PastTurn<Server>>,
+    /// Those who have come since it was last told how clients stand.
+    newcomers: Vec<Place>,
 }
 
 /// How long a turn without a reservation can be resumed.
 const TURN: Duration = Duration::from_secs(10);
 /// How long a used ticket is known: longer than any ticket is valid.
 const KEPT: Duration = Duration::from_secs(40);
-/// Most repositories for which it is worked out who competes with whom. Beyond, each competes with all.
-const MAX_GROUPS: usize = 64;
 
 impl<Server, Client> Default for Dispatcher<Server, Client> {
     fn default() -> Self {
@@ -118,13 +120,14 @@ impl<Server, Client> Default for Dispatcher<Server, Client> {
             links: HashMap::new(),
             rates: HashMap::new(),
             turns: HashMap::new(),
+            newcomers: Vec::new(),
         }
     }
 }
 
 impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
     /// A client asks for a slot. With a valid ticket it has the place in that; `number` is that of a new ticket. `is_up`
-    /// is whether a server answers.
+    /// is whether a server answers, `terms` on what terms one takes a world by its last report.
     ///
     /// A ticket whose turn has come is not valid any more, unless the server is gone that had to take its client.
     pub fn enter(
@@ -133,6 +136,7 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
         entry: Entry<Client>,
         number: u64,
         is_up: impl Fn(&Server) -> bool,
+        terms: impl Fn(&Server, &ProjectUrl) -> Option<Admission>,
         now: Moment,
     ) -> Entered<Server, Client> {
         let mut place = Place {
@@ -151,7 +155,8 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
                 Some(_) => {}
             }
         }
-        let (place, displaced) = self.line.enter(place, entry, now.instant);
+        let (place, displaced) = self.line.enter(place, entry, terms, now.instant);
+        self.newcomers.push(place);
         Entered::Waits(place, displaced)
     }
 
@@ -166,9 +171,9 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
         }
     }
 
-    /// The client of a connection leaves its place.
-    pub fn leave(&mut self, place: Place, connection: u64) {
-        self.line.leave(place, connection);
+    /// The client of a connection waits no longer.
+    pub fn leave(&mut self, connection: u64) {
+        self.line.leave(connection);
     }
 
     /// A server reserves slots from now on.
@@ -181,10 +186,22 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
         self.links.remove(server);
     }
 
-    /// Keeps what is known of these servers only.
-    pub fn retain(&mut self, is_known: impl Fn(&Server) -> bool) {
-        self.links.retain(|server, _| is_known(server));
-        self.rates.retain(|server, _| is_known(server));
+    /// The fleet consists of these servers now. `terms` is on what terms one takes a world by its last report.
+    pub fn set_servers(&mut self, servers: &[Server], terms: impl Fn(&Server, &ProjectUrl) -> Option<Admission>) {
+        let known: HashSet<&Server> = servers.iter().collect();
+        self.links.retain(|server, _| known.contains(server));
+        self.rates.retain(|server, _| known.contains(server));
+        self.line.set_servers(servers, terms);
+    }
+
+    /// A server takes other worlds now, or on other terms.
+    pub fn rules_changed(&mut self, server: &Server, terms: impl Fn(&Server, &ProjectUrl) -> Option<Admission>) {
+        self.line.rules_changed(server, terms);
+    }
+
+    /// Forgets tickets that are not valid any more.
+    pub fn forget(&mut self, now: Instant) {
+        self.turns.retain(|_, past| now < past.kept);
     }
 
     /// A server reports how many slots have become free since its start.
@@ -232,24 +249,22 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
                 fleet.place(server, now.instant);
                 turns.extend(self.turn(place, server, Some((pass, valid)), now));
             } else if let Some(link) = self.links.get_mut(server) {
-                link.back.push(offer.reservation);
+                link.give_back(offer.reservation);
             }
         }
         turns
     }
 
-    /// Gives turns on servers that only report, and will not reserve slots soon, and says what the others must be told: of these, only one if only its
-    /// state has changed.
+    /// Gives turns on servers that only report and will not reserve slots soon, and says what the others must be told.
+    /// `admission` is on what terms a server takes a world at a load, in percent.
     pub fn serve(
         &mut self,
         fleet: &mut LoadBalancer<Server>,
         admission: impl Fn(&Server, &ProjectUrl, f64) -> Option<Admission>,
         will_reserve: impl Fn(&Server) -> bool,
         ready: &ReadyWorlds<Server>,
-        only: Option<&Server>,
         now: Moment,
     ) -> Served<Server, Client> {
-        self.turns.retain(|_, past| now.instant < past.kept);
         let Shares {
             mut assigned,
             starved,
@@ -261,32 +276,31 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
         }
         let line = &self.line;
         let mut wishes = Vec::new();
-        for (server, link) in &mut self.links {
-            let room = assigned.remove(server);
-            if room.is_none() && only.is_some_and(|only| only != server) {
-                continue;
-            }
-            let mut first = room.unwrap_or_default();
+        // Servers that take the same classes are told of the same clients.
+        let mut lists: HashMap<Vec<ClassId>, Vec<Place>> = HashMap::new();
+        for (server, link) in self.links.iter_mut().filter(|(_, link)| !link.owes_answer()) {
+            let mut first = assigned.remove(server).unwrap_or_default();
             let mut all = first.len();
-            if !starved.is_empty() && fleet.would_take(server) {
-                let load = fleet.effective_load(server);
-                let accepts = |world: &ProjectUrl| load.is_some_and(|load| admission(server, world, load).is_some());
-                let taken: HashSet<&str> = starved
-                    .iter()
-                    .filter(|group| accepts(&group.world))
-                    .map(|group| group.repository())
-                    .collect();
-                let waiting = line.iter().filter(|(_, one)| taken.contains(one.group.repository()));
-                first.extend(
-                    waiting
-                        .map(|(place, _)| *place)
-                        .take(if taken.is_empty() { 0 } else { LISTED }),
-                );
+            let load = fleet.effective_load(server).filter(|_| fleet.would_take(server));
+            let may_come = |class: &&ClassId| {
+                let world = line.classes().get(**class).map(|class| &class.world);
+                let world_and_load = world.zip(load);
+                world_and_load.is_some_and(|(world, load)| admission(server, world, load).is_some())
+            };
+            let taken: Vec<ClassId> = starved.iter().filter(may_come).copied().collect();
+            if !taken.is_empty() {
+                let waiting = taken.iter().filter_map(|class| line.classes().get(*class));
+                let waiting: usize = waiting.map(|class| class.waiting as usize).sum();
+                if link.passed.is_empty() {
+                    let list = lists.entry(taken);
+                    first.extend(list.or_insert_with_key(|taken| line.first(taken, &[])).iter());
+                } else {
+                    first.extend(line.first(&taken, &link.passed));
+                }
                 first.sort_unstable();
                 first.dedup();
                 first.truncate(LISTED);
-                let counted = line.groups().filter(|(group, _)| taken.contains(group.repository()));
-                all = first.len().max(counted.map(|(_, count)| count as usize).sum());
+                all = first.len().max(waiting);
             }
             let all = u32::try_from(all).unwrap_or(u32::MAX);
             let waits = |place: &Place| line.place_of(place.number).is_some();
@@ -322,20 +336,26 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
                 }
             }
         }
-        let groups = self.line.groups().count();
+        let classes = self.line.classes().occupied();
+        // Those of which nobody else gets a slot either.
+        let mut exhausted = HashSet::new();
         // The simulations that are kept ready and go to those ahead.
         let mut used: HashMap<(Server, &ProjectUrl), usize> = HashMap::new();
-        let mut starved: HashSet<*const Group> = HashSet::new();
         for (place, waiting) in self.line.iter() {
-            if starved.len() == groups {
+            let class = waiting.group.class.get();
+            if exhausted.len() == classes {
                 break;
             }
-            if pending.contains(place) || starved.contains(&Arc::as_ptr(&waiting.group)) {
+            if exhausted.contains(&class) || pending.contains(place) {
                 continue;
             }
+            let passes_over = |server: &Server| {
+                let link = self.links.get(server);
+                link.is_some_and(|link| link.passed.iter().any(|passed| waiting.is_of(passed)))
+            };
             let terms = |server: &Server, load| {
                 let is_ready = self.links.contains_key(server) || !will_reserve(server);
-                admission(server, &waiting.group.world, load).filter(|_| is_ready)
+                admission(server, &waiting.group.world, load).filter(|_| is_ready && !passes_over(server))
             };
             let world = &waiting.world;
             let of_ready = |server: &Server, load| {
@@ -351,8 +371,12 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
             }
             match ready_one.or_else(|| fleet.pick_admitted(now.instant, true, terms)) {
                 None => {
-                    starved.insert(Arc::as_ptr(&waiting.group));
-                    shares.starved.push(Arc::clone(&waiting.group));
+                    if !self.links.keys().any(passes_over) {
+                        exhausted.insert(class);
+                    }
+                    if !shares.starved.contains(&class) {
+                        shares.starved.push(class);
+                    }
                 }
                 Some(server) if self.links.contains_key(&server) => {
                     shares.assigned.entry(server.clone()).or_default().push(*place);
@@ -364,6 +388,7 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
         for server in placed {
             fleet.withdraw(&server);
         }
+        shares.starved.sort_unstable();
         shares
     }
 
@@ -401,9 +426,8 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
         load: f64,
         admission: impl Fn(&Server, &ProjectUrl, f64) -> Option<Admission>,
     ) -> bool {
-        self.line
-            .groups()
-            .any(|(group, _)| admission(server, &group.world, load).is_some())
+        let mut classes = self.line.classes().iter();
+        classes.any(|class| class.waiting > 0 && admission(server, &class.world, load).is_some())
     }
 
     /// Whether nobody waits.
@@ -418,25 +442,25 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
 
     /// What is known of the line at this time, in milliseconds since 1970.
     pub fn status(&self, now: u64) -> LineStatus {
-        let mut found: Vec<WaitingFor> = Vec::new();
-        let mut seen = HashMap::new();
+        let mut worlds = Vec::new();
+        let mut seen = HashSet::new();
         for (place, waiting) in self.line.iter() {
-            let group = waiting.group.repository();
-            let index = *seen.entry(group).or_insert(found.len());
-            if index == found.len() {
-                found.push(WaitingFor {
-                    repository: waiting.group.world.repository(),
-                    waiting: 0,
+            if seen.len() == self.line.repositories() {
+                break;
+            }
+            let group = &waiting.group;
+            if seen.insert(&group.repository) {
+                worlds.push(WaitingFor {
+                    repository: group.world.repository(),
+                    waiting: self.line.count_of(group),
+                    since: place.since,
                     longest: Duration::from_millis(now.saturating_sub(place.since)),
                 });
-            }
-            if let Some(one) = found.get_mut(index) {
-                one.waiting += 1;
             }
         }
         LineStatus {
             waiting: self.line.len(),
-            worlds: found,
+            worlds,
         }
     }
 
@@ -445,142 +469,53 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
         self.line.renewals(now, Ticket::RENEWAL)
     }
 
-    /// How a client stands that has just come, if it waits.
-    pub fn first_news(
-        &mut self,
-        place: Place,
-        servers: &[Server],
-        accepts: impl Fn(&Server, &ProjectUrl) -> bool,
-        now: Instant,
-    ) -> Option<Progress> {
-        self.standings(servers, accepts, now, |line, progress| {
-            line.first_news(place, now, progress)
-        })
+    /// How the clients stand that have just come.
+    pub fn first_news(&mut self, now: Instant) -> Vec<(Client, Progress)> {
+        let newcomers = std::mem::take(&mut self.newcomers);
+        let Some(first) = newcomers.into_iter().min() else {
+            return Vec::new();
+        };
+        let Self { line, links, rates, .. } = self;
+        line.first_news(first, |classes, class| doors(links, rates, classes, class, now), now)
     }
 
     /// For each client the progress that it has to hear now, if any.
-    pub fn news(
-        &mut self,
-        servers: &[Server],
-        accepts: impl Fn(&Server, &ProjectUrl) -> bool,
-        now: Instant,
-    ) -> Vec<(Client, Progress)> {
-        self.standings(servers, accepts, now, |line, progress| line.news(now, progress))
+    pub fn news(&mut self, now: Instant) -> Vec<(Client, Progress)> {
+        self.newcomers.clear();
+        let Self { line, links, rates, .. } = self;
+        let classes = line.classes();
+        let all = 0..classes.iter().count();
+        let doors: Vec<Doors> = all.map(|class| doors(links, rates, classes, class, now)).collect();
+        line.news(&doors, now)
     }
+}
 
-    /// Calls `tell` with how clients stand, which it must ask in the order of the line.
-    fn standings<News>(
-        &mut self,
-        servers: &[Server],
-        accepts: impl Fn(&Server, &ProjectUrl) -> bool,
-        now: Instant,
-        tell: impl FnOnce(&mut WaitingLine<Client>, &mut dyn FnMut(&Place, &Arc<Group>) -> Progress) -> News,
-    ) -> News {
-        let classes = Classes::new(&self.line, servers, accepts);
-        let queue_of = |server: &Server| {
-            self.links
-                .get(server)
-                .map(|link| link.queue.as_slice())
-                .unwrap_or_default()
-        };
-        // For each class: those ahead so far, those who wait at the doors of its servers, and the rates of these.
-        let mut ahead = vec![0_u32; classes.sets.len()];
-        let mut queues = Vec::new();
-        let mut rates = Vec::new();
-        for set in &classes.sets {
-            let its_servers = || {
-                servers
-                    .iter()
-                    .zip(set)
-                    .filter(|(_, accepts)| **accepts)
-                    .map(|(server, _)| server)
-            };
-            let mut queue: Vec<u64> = its_servers().flat_map(queue_of).copied().collect();
-            queue.sort_unstable();
-            queues.push(queue);
-            let mut of_class = Vec::new();
-            for server in its_servers() {
-                of_class.extend(self.rates.get_mut(server).map(|(_, rate)| rate.freed(now)));
-            }
-            rates.push(of_class);
-        }
-        tell(&mut self.line, &mut |place, group| {
-            let class = classes.of(group);
-            let competing = classes.competitors.get(class).into_iter().flatten();
-            let of_line: u32 = competing.filter_map(|other| ahead.get(*other)).sum();
-            let at_doors = queues
-                .get(class)
-                .map_or(0, |queue| queue.partition_point(|since| *since < place.since));
-            let all = of_line.saturating_add(u32::try_from(at_doors).unwrap_or(u32::MAX));
-            if let Some(count) = ahead.get_mut(class) {
-                *count += 1;
-            }
-            let rates = rates.get(class).into_iter().flatten().copied();
-            Progress {
-                ahead: all,
-                estimate: estimate(rates, all),
-            }
-        })
-    }
+/// What is known of the servers that take a class.
+fn doors<Server: Clone + Eq + Hash>(
+    links: &HashMap<Server, Link>,
+    rates: &mut HashMap<Server, (u64, Rate)>,
+    classes: &Classes<Server>,
+    class: ClassId,
+    now: Instant,
+) -> Doors {
+    let queues = classes.servers_of(class).filter_map(|server| links.get(server));
+    let mut queue: Vec<u64> = queues.flat_map(|link| &link.queue).copied().collect();
+    queue.sort_unstable();
+    let rates = classes
+        .servers_of(class)
+        .filter_map(|server| rates.get_mut(server).map(|(_, rate)| rate.freed(now)));
+    let basis = Basis::of(rates);
+    Doors { queue, basis }
 }
 
 /// What a look at the fleet yields.
 struct Shares<Server> {
     /// The clients for which reserving servers have room.
     assigned: HashMap<Server, Vec<Place>>,
-    /// The groups for which no server has room.
-    starved: Vec<Arc<Group>>,
+    /// The classes of which somebody gets no slot.
+    starved: Vec<ClassId>,
     /// The clients that servers take which only report.
     plain: Vec<(Place, Server)>,
-}
-
-/// The groups of a line by the servers that accept them.
-struct Classes {
-    /// For each class, whether each server accepts it.
-    sets: Vec<Vec<bool>>,
-    /// For each class, the classes that some server accepts too, and itself.
-    competitors: Vec<Vec<usize>>,
-    of_group: HashMap<*const Group, usize>,
-}
-
-impl Classes {
-    fn new<Server, Client: Clone>(
-        line: &WaitingLine<Client>,
-        servers: &[Server],
-        accepts: impl Fn(&Server, &ProjectUrl) -> bool,
-    ) -> Self {
-        let mut sets: Vec<Vec<bool>> = Vec::new();
-        let mut of_group = HashMap::new();
-        if line.groups().count() > MAX_GROUPS {
-            sets.push(vec![true; servers.len()]);
-        } else {
-            for (group, _) in line.groups() {
-                let set: Vec<bool> = servers.iter().map(|server| accepts(server, &group.world)).collect();
-                let class = sets.iter().position(|one| *one == set).unwrap_or(sets.len());
-                if class == sets.len() {
-                    sets.push(set);
-                }
-                of_group.insert(Arc::as_ptr(group), class);
-            }
-        }
-        let competes = |one: &[bool], other: &[bool]| one.iter().zip(other).any(|(one, other)| *one && *other);
-        let competitors = sets.iter().enumerate().map(|(class, set)| {
-            let others = sets.iter().enumerate();
-            others
-                .filter(|(other, theirs)| *other == class || competes(set, theirs))
-                .map(|(other, _)| other)
-                .collect()
-        });
-        Self {
-            competitors: competitors.collect(),
-            sets,
-            of_group,
-        }
-    }
-
-    fn of(&self, group: &Arc<Group>) -> usize {
-        self.of_group.get(&Arc::as_ptr(group)).copied().unwrap_or_default()
-    }
 }
 
 #[cfg(test)]
@@ -624,6 +559,11 @@ mod tests {
             let owner = &world.repository_segments()[0];
             owners[*server].iter().any(|one| OWNERS[*one] == owner)
         }
+    }
+
+    fn terms(servers: &[FakeServer]) -> impl Fn(&usize, &ProjectUrl) -> Option<Admission> + use<> {
+        let accepts = accepts(servers);
+        move |server, world| accepts(server, world).then_some(Admission::Dedicated)
     }
 
     /// A client that wants a world of this owner.
@@ -679,6 +619,8 @@ mod tests {
                 }
             }
             fleet.report();
+            let all: Vec<usize> = (0..servers.len()).collect();
+            fleet.dispatcher.set_servers(&all, terms(&fleet.servers));
             fleet
         }
 
@@ -707,9 +649,9 @@ mod tests {
         }
 
         fn enter(&mut self, owner: usize, ticket: Option<Ticket>, number: u64) -> Entered<usize, u64> {
-            let entered = self
-                .dispatcher
-                .enter(ticket, entry(owner, number), number, |_| true, self.now);
+            let entry = entry(owner, number);
+            let terms = terms(&self.servers);
+            let entered = self.dispatcher.enter(ticket, entry, number, |_| true, terms, self.now);
             if let Entered::Waits(place, _) = entered {
                 self.waiting.insert((place, owner));
             }
@@ -728,7 +670,6 @@ mod tests {
                     admission,
                     |_| false,
                     &ReadyWorlds::default(),
-                    None,
                     self.now,
                 );
                 if turns.is_empty() && wishes.is_empty() {
@@ -793,7 +734,7 @@ mod tests {
             let Some(&(place, owner)) = self.waiting.iter().find(|(place, _)| place.number == number) else {
                 return;
             };
-            self.dispatcher.leave(place, number);
+            self.dispatcher.leave(number);
             self.waiting.remove(&(place, owner));
             self.serve();
         }
@@ -893,8 +834,10 @@ mod tests {
             fleet.pass_time(Duration::from_millis(1));
             fleet.enter(owner, None, number);
         }
-        let accepts = accepts(&fleet.servers);
-        let news = fleet.dispatcher.news(&[0, 1, 2], &accepts, fleet.now.instant);
+        let first = fleet.dispatcher.first_news(fleet.now.instant);
+        let mut news = fleet.dispatcher.news(fleet.now.instant);
+        assert_eq!(news, [], "they have heard it");
+        news.extend(first.into_iter().rev());
         let ahead: Vec<_> = news
             .iter()
             .map(|(client, progress)| (*client, progress.ahead))
@@ -920,8 +863,7 @@ mod tests {
         fleet.report();
         fleet.enter(0, None, 1);
         fleet.enter(1, None, 2);
-        let accepts = accepts(&fleet.servers);
-        let news = fleet.dispatcher.news(&[0, 1], &accepts, fleet.now.instant);
+        let news = fleet.dispatcher.news(fleet.now.instant);
         let estimates: Vec<_> = news.iter().map(|(_, progress)| progress.estimate).collect();
         assert_eq!(estimates, [Some(20), None], "six slots in 110 seconds, and none");
     }
@@ -1004,18 +946,17 @@ mod tests {
         for number in 1..=5_000 {
             fleet.pass_time(Duration::from_millis(1));
             let owner = usize::from(number % 2 == 0);
-            fleet
-                .dispatcher
-                .enter(None, entry(owner, number), number, |_| true, fleet.now);
+            let terms = terms(&fleet.servers);
+            let entry = entry(owner, number);
+            fleet.dispatcher.enter(None, entry, number, |_| true, terms, fleet.now);
         }
-        let accepts = accepts(&fleet.servers);
-        fleet.dispatcher.news(&[0, 1], &accepts, fleet.now.instant);
+        fleet.dispatcher.news(fleet.now.instant);
         let mut sent = 0;
         for _ in 0..60 {
             fleet.pass_time(Duration::from_secs(1));
             let first = *fleet.dispatcher.line.iter().next().unwrap().0;
             fleet.dispatcher.line.remove(first);
-            sent += fleet.dispatcher.news(&[0, 1], &accepts, fleet.now.instant).len();
+            sent += fleet.dispatcher.news(fleet.now.instant).len();
         }
         assert!(sent < 60 * 700, "{sent} messages in a minute");
     }

@@ -2,11 +2,14 @@
 
 use std::time::Duration;
 
-use super::waiting_line::Place;
-use crate::shared::domain::{Hello, Offers, ReservationId, ServerRun, Wish, Wishes};
+use super::waiting_line::{LISTED, Place};
+use crate::shared::domain::{Hello, Offers, Passed, ReservationId, ServerRun, Wish, Wishes};
 
-/// Most clients that a simulation server is told of.
-pub(super) const LISTED: usize = 32;
+/// The longest time that a reservation may hold.
+const MAX_PASS: Duration = Duration::from_hours(1);
+/// Most reservations that are given back at once. A server makes no more than it was told of clients; others that it
+/// claims to have made end by themselves.
+const MAX_BACK: usize = 2 * LISTED;
 
 /// The connection to a simulation server that reserves slots.
 #[derive(Debug)]
@@ -21,9 +24,11 @@ pub(super) struct Link {
     sent: u64,
     answered: u64,
     /// Reservations to give back with the next wishes.
-    pub(super) back: Vec<ReservationId>,
+    back: Vec<ReservationId>,
     /// When the clients at its own door have come, in milliseconds since 1970, in order.
     pub(super) queue: Vec<u64>,
+    /// Whom it passes over, of those that it was told of.
+    pub(super) passed: Vec<Passed>,
 }
 
 impl Link {
@@ -31,23 +36,37 @@ impl Link {
     pub(super) fn new(hello: &Hello) -> Self {
         Self {
             server: hello.server,
-            pass: Duration::try_from_secs_f64(hello.pass).unwrap_or_default(),
+            pass: Duration::try_from_secs_f64(hello.pass).map_or(MAX_PASS, |pass| pass.min(MAX_PASS)),
             listed: Vec::new(),
             sent: 0,
             answered: 0,
             back: Vec::new(),
             queue: Vec::new(),
+            passed: Vec::new(),
         }
     }
 
     /// The clients that it has not answered for yet.
     pub(super) fn unanswered(&self) -> &[Place] {
-        if self.answered < self.sent { &self.listed } else { &[] }
+        if self.owes_answer() { &self.listed } else { &[] }
+    }
+
+    /// Whether it has not answered yet, so that it is told nothing else.
+    pub(super) fn owes_answer(&self) -> bool {
+        self.answered < self.sent
+    }
+
+    /// Gives a reservation back with the next wishes.
+    pub(super) fn give_back(&mut self, reservation: ReservationId) {
+        if self.back.len() < MAX_BACK {
+            self.back.push(reservation);
+        }
     }
 
     /// Records what it has sent at `now`, in milliseconds since 1970.
     pub(super) fn answered(&mut self, offers: &Offers, now: u64) {
-        self.answered = offers.number;
+        self.answered = offers.number.min(self.sent);
+        self.passed.clone_from(&offers.passed);
         self.queue = offers.queue.iter().map(|waited| now.saturating_sub(*waited)).collect();
         self.queue.sort_unstable();
     }
@@ -62,7 +81,7 @@ impl Link {
         waits: impl Fn(&Place) -> bool,
         wish: impl Fn(&Place) -> Option<Wish>,
     ) -> Option<Wishes> {
-        if self.answered < self.sent {
+        if self.owes_answer() {
             return None;
         }
         let gone = self.listed.iter().filter(|place| !waits(place)).count();
@@ -161,7 +180,7 @@ mod tests {
         let mut link = link();
         ask(&mut link, 0, 2);
         answer(&mut link);
-        link.back.push(ReservationId(4));
+        link.give_back(ReservationId(4));
         let wishes = link.wishes(Vec::new(), 0, |_| false, |_| None).unwrap();
         assert_eq!(wishes.back, [ReservationId(4)]);
     }

@@ -2,12 +2,14 @@
 //!
 //! - `ticket`: what a client keeps of its place;
 //! - `waiting_line`: who waits, in the order of arrival;
+//! - `classes`: who competes with whom;
 //! - `link`: what one simulation server was asked for;
 //! - `dispatcher`: who gets the next slot of which server;
 //! - `rate`: how often slots become free, for the estimate.
 //!
 //! Nothing here reads a clock or does I/O: the caller passes the time. `docs/line.md` explains the rules.
 
+mod classes;
 mod dispatcher;
 mod link;
 mod rate;

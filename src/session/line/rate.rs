@@ -63,19 +63,31 @@ impl Rate {
     }
 }
 
-/// Seconds until a client has a slot that has `ahead` clients ahead of it, from the rates of the servers that may take
-/// it, coarsely rounded; `None` without a basis.
-pub(super) fn estimate(rates: impl Iterator<Item = (u32, Duration)>, ahead: u32) -> Option<u32> {
-    let mut freed = 0_u32;
-    let mut per_second = 0.0;
-    for (slots, time) in rates.filter(|(_, time)| !time.is_zero()) {
-        freed = freed.saturating_add(slots);
-        per_second += f64::from(slots) / time.as_secs_f64();
+/// How often slots of some servers become free.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Basis {
+    freed: u32,
+    per_second: f64,
+}
+
+impl Basis {
+    /// That of servers with these rates.
+    pub(super) fn of(rates: impl Iterator<Item = (u32, Duration)>) -> Self {
+        let mut basis = Self::default();
+        for (slots, time) in rates.filter(|(_, time)| !time.is_zero()) {
+            basis.freed = basis.freed.saturating_add(slots);
+            basis.per_second += f64::from(slots) / time.as_secs_f64();
+        }
+        basis
     }
-    if freed < BASIS {
+}
+
+/// Seconds until a client has a slot that has `ahead` clients ahead of it, coarsely rounded; `None` without a basis.
+pub(super) fn estimate(basis: Basis, ahead: u32) -> Option<u32> {
+    if basis.freed < BASIS {
         return None;
     }
-    let seconds = (f64::from(ahead) + 1.0) / per_second;
+    let seconds = (f64::from(ahead) + 1.0) / basis.per_second;
     let step = if seconds < 120.0 { 10.0 } else { 60.0 };
     #[expect(
         clippy::cast_possible_truncation,
@@ -107,13 +119,11 @@ mod tests {
     #[test]
     fn an_estimate_needs_a_basis() {
         let minute = Duration::from_mins(1);
-        assert_eq!(estimate([(2, minute)].into_iter(), 0), None);
-        assert_eq!(estimate([(9, Duration::ZERO)].into_iter(), 0), None);
-        assert_eq!(estimate([(2, minute), (4, minute)].into_iter(), 4), Some(50));
-        assert_eq!(estimate([(3, 10 * minute)].into_iter(), 1), Some(420));
-        assert_eq!(
-            estimate([(u32::MAX, minute), (1, minute)].into_iter(), u32::MAX),
-            Some(60)
-        );
+        let estimate = |rates: &[(u32, Duration)], ahead| estimate(Basis::of(rates.iter().copied()), ahead);
+        assert_eq!(estimate(&[(2, minute)], 0), None);
+        assert_eq!(estimate(&[(9, Duration::ZERO)], 0), None);
+        assert_eq!(estimate(&[(2, minute), (4, minute)], 4), Some(50));
+        assert_eq!(estimate(&[(3, 10 * minute)], 1), Some(420));
+        assert_eq!(estimate(&[(u32::MAX, minute), (1, minute)], u32::MAX), Some(60));
     }
 }

@@ -1,11 +1,15 @@
 //! Who waits, in the order of arrival.
 
+use std::cell::Cell;
 use std::collections::{BTreeMap, HashMap};
 use std::net::IpAddr;
+use std::rc::Rc;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use crate::shared::domain::{ProjectUrl, Wish};
+use super::classes::{ClassId, Classes, Doors, Group};
+use super::rate::estimate;
+use crate::shared::domain::{Admission, Passed, ProjectUrl, Wish};
 
 /// A place in the line. Places sort by the time of arrival.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -55,19 +59,11 @@ pub struct Progress {
     pub estimate: Option<u32>,
 }
 
-/// The worlds of one repository: each server accepts all of them, or none.
-#[derive(Debug)]
-pub(super) struct Group {
-    /// One of its worlds.
-    pub(super) world: ProjectUrl,
-    repository: String,
-}
-
 /// A client in the line.
 #[derive(Debug)]
 pub(super) struct Waiting<Client> {
     label: Option<Box<str>>,
-    pub(super) group: Arc<Group>,
+    pub(super) group: Rc<Group>,
     pub(super) world: ProjectUrl,
     pub(super) client: Client,
     connection: u64,
@@ -79,23 +75,28 @@ pub(super) struct Waiting<Client> {
     ticket: Instant,
 }
 
-/// The clients that wait. Everything about one of them is in one entry, and in the indices by number and user.
+/// The clients that wait. Everything about one of them is in one entry, and in the indices by number, connection and
+/// user.
 #[derive(Debug)]
-pub(super) struct WaitingLine<Client> {
+pub(super) struct WaitingLine<Server, Client> {
     waiting: BTreeMap<Place, Waiting<Client>>,
     since: HashMap<u64, u64>,
+    connections: HashMap<u64, Place>,
     users: HashMap<Arc<str>, Place>,
-    /// The groups of those who wait, each with the number of them.
-    groups: HashMap<String, (Arc<Group>, u32)>,
+    /// The groups of those who wait by their repositories, each with the number of them.
+    groups: HashMap<String, (Rc<Group>, u32)>,
+    classes: Classes<Server>,
 }
 
-impl<Client> Default for WaitingLine<Client> {
+impl<Server, Client> Default for WaitingLine<Server, Client> {
     fn default() -> Self {
         Self {
             waiting: BTreeMap::new(),
             since: HashMap::new(),
+            connections: HashMap::new(),
             users: HashMap::new(),
             groups: HashMap::new(),
+            classes: Classes::default(),
         }
     }
 }
@@ -103,11 +104,26 @@ impl<Client> Default for WaitingLine<Client> {
 /// Shortest interval between two positions of a client. That of a client with more than a hundred ahead grows with its
 /// position, so that a long line costs no more than a short one.
 const INTERVAL: Duration = Duration::from_secs(1);
+/// Most clients that a simulation server is told of.
+pub(super) const LISTED: usize = 32;
+/// Most clients of an address or user that a simulation server is told of while it passes these over: it needs the first
+/// of them for its next slot that they may have.
+const LISTED_OF_PASSED: usize = 2;
+/// Most bytes of worlds and users' names that a simulation server is told of, unless one client has more: it refuses
+/// messages of more than 8 KiB.
+const MAX_TEXTS: usize = 4096;
 
-impl<Client: Clone> WaitingLine<Client> {
+impl<Server: Clone + Eq, Client: Clone> WaitingLine<Server, Client> {
     /// Adds a client at a place. If its ticket or its user has a place already, the client takes that over: it gets the
-    /// earlier one of the two. Returns its place, and the client that has lost it.
-    pub(super) fn enter(&mut self, place: Place, entry: Entry<Client>, now: Instant) -> (Place, Option<Client>) {
+    /// earlier one of the two. Returns its place, and the client that has lost it. `terms` is on what terms a server
+    /// takes a world.
+    pub(super) fn enter(
+        &mut self,
+        place: Place,
+        entry: Entry<Client>,
+        terms: impl Fn(&Server, &ProjectUrl) -> Option<Admission>,
+        now: Instant,
+    ) -> (Place, Option<Client>) {
         let user: Option<Arc<str>> = entry.user.map(Arc::from);
         let of_user = user.as_ref().and_then(|user| self.users.get(user)).copied();
         let of_ticket = self.place_of(place.number);
@@ -118,14 +134,22 @@ impl<Client: Clone> WaitingLine<Client> {
             displaced = self.remove(before).map(|waiting| waiting.client).or(displaced);
         }
         let repository = entry.world.repository().to_lowercase();
+        let classes = &mut self.classes;
         let (group, count) = self.groups.entry(repository.clone()).or_insert_with(|| {
             let world = entry.world.clone();
-            (Arc::new(Group { world, repository }), 0)
+            let class = Cell::new(classes.of(&world, terms));
+            let group = Group {
+                world,
+                repository,
+                class,
+            };
+            (Rc::new(group), 0)
         });
         *count += 1;
+        classes.add(group.class.get(), 1);
         let waiting = Waiting {
             label: entry.label.map(String::into_boxed_str),
-            group: Arc::clone(group),
+            group: Rc::clone(group),
             world: entry.world,
             client: entry.client,
             connection: entry.connection,
@@ -135,6 +159,7 @@ impl<Client: Clone> WaitingLine<Client> {
             ticket: now,
         };
         self.since.insert(first.number, first.since);
+        self.connections.insert(entry.connection, first);
         if let Some(user) = user {
             self.users.insert(user, first);
         }
@@ -142,14 +167,10 @@ impl<Client: Clone> WaitingLine<Client> {
         (first, displaced)
     }
 
-    /// Removes the client of a connection from its place. Another connection may have that place by now.
-    pub(super) fn leave(&mut self, place: Place, connection: u64) {
-        if self
-            .waiting
-            .get(&place)
-            .is_some_and(|waiting| waiting.connection == connection)
-        {
-            self.remove(place);
+    /// Removes the client of a connection, if it waits. Another connection may have its place by now.
+    pub(super) fn leave(&mut self, connection: u64) {
+        if let Some(place) = self.connections.get(&connection) {
+            self.remove(*place);
         }
     }
 
@@ -157,9 +178,11 @@ impl<Client: Clone> WaitingLine<Client> {
     pub(super) fn remove(&mut self, place: Place) -> Option<Waiting<Client>> {
         let waiting = self.waiting.remove(&place)?;
         self.since.remove(&place.number);
+        self.connections.remove(&waiting.connection);
         if let Some(user) = &waiting.user {
             self.users.remove(user);
         }
+        self.classes.subtract_one(waiting.group.class.get());
         if let Some((_, count)) = self.groups.get_mut(&waiting.group.repository) {
             *count -= 1;
             if *count == 0 {
@@ -190,14 +213,68 @@ impl<Client: Clone> WaitingLine<Client> {
         self.waiting.iter()
     }
 
-    /// The groups of those who wait, each with the number of them.
-    pub(super) fn groups(&self) -> impl Iterator<Item = (&Arc<Group>, u32)> {
-        self.groups.values().map(|(group, count)| (group, *count))
+    /// Number of those of a repository who wait.
+    pub(super) fn count_of(&self, group: &Group) -> u32 {
+        self.groups.get(&group.repository).map_or(0, |(_, count)| *count)
+    }
+
+    /// Number of the repositories that are waited for.
+    pub(super) fn repositories(&self) -> usize {
+        self.groups.len()
+    }
+
+    /// Who competes with whom.
+    pub(super) fn classes(&self) -> &Classes<Server> {
+        &self.classes
     }
 
     /// Number of those who wait.
     pub(super) fn len(&self) -> usize {
         self.waiting.len()
+    }
+
+    /// The fleet consists of these servers now.
+    pub(super) fn set_servers(
+        &mut self,
+        servers: &[Server],
+        terms: impl Fn(&Server, &ProjectUrl) -> Option<Admission>,
+    ) {
+        let groups = self.groups.values().map(|(group, count)| (group, *count));
+        self.classes.set_servers(servers, groups, terms);
+    }
+
+    /// A server has other rules now.
+    pub(super) fn rules_changed(&mut self, server: &Server, terms: impl Fn(&Server, &ProjectUrl) -> Option<Admission>) {
+        let groups = self.groups.values().map(|(group, count)| (group, *count));
+        self.classes.rules_changed(server, groups, terms);
+    }
+
+    /// The first clients of these classes, as many as a simulation server is told of. `passed` are those whom it passes
+    /// over.
+    pub(super) fn first(&self, classes: &[ClassId], passed: &[Passed]) -> Vec<Place> {
+        let mut listed = Vec::new();
+        let mut passed: Vec<(&Passed, usize)> = passed.iter().map(|one| (one, LISTED_OF_PASSED)).collect();
+        let mut texts = 0;
+        for (place, waiting) in &self.waiting {
+            if listed.len() == LISTED {
+                break;
+            }
+            if !classes.contains(&waiting.group.class.get()) {
+                continue;
+            }
+            if let Some((_, left)) = passed.iter_mut().find(|(one, _)| waiting.is_of(one)) {
+                if *left == 0 {
+                    continue;
+                }
+                *left -= 1;
+            }
+            texts += waiting.world.to_string().len() + waiting.user.as_ref().map_or(0, |user| user.len());
+            if texts > MAX_TEXTS && !listed.is_empty() {
+                break;
+            }
+            listed.push(*place);
+        }
+        listed
     }
 
     /// What a simulation server is told about the client at a place.
@@ -212,16 +289,16 @@ impl<Client: Clone> WaitingLine<Client> {
         })
     }
 
-    /// For each client the progress that it has to hear now, if any. `progress` says how a client stands; it is called
-    /// in the order of the line.
-    pub(super) fn news(
-        &mut self,
-        now: Instant,
-        mut progress: impl FnMut(&Place, &Arc<Group>) -> Progress,
-    ) -> Vec<(Client, Progress)> {
+    /// For each client the progress that it has to hear now, if any. `doors` are those of each class.
+    pub(super) fn news(&mut self, doors: &[Doors], now: Instant) -> Vec<(Client, Progress)> {
         let mut news = Vec::new();
+        let mut ahead = vec![0_u32; doors.len()];
         for (place, waiting) in &mut self.waiting {
-            let stands = progress(place, &waiting.group);
+            let class = waiting.group.class.get();
+            let stands = progress(&self.classes, *place, class, &ahead, doors.get(class));
+            if let Some(count) = ahead.get_mut(class) {
+                *count += 1;
+            }
             let is_due = |(heard, at): (Progress, Instant)| {
                 heard != stands && now.saturating_duration_since(at) >= INTERVAL.max(INTERVAL * stands.ahead / 100)
             };
@@ -233,20 +310,30 @@ impl<Client: Clone> WaitingLine<Client> {
         news
     }
 
-    /// How a client stands that has just come, as the first that it hears; `None` if it does not wait.
+    /// How the clients stand that have heard nothing yet; none of them is before this place. Most of them are at the end
+    /// of the line, so the others are counted from there. `doors` says those of a class.
     pub(super) fn first_news(
         &mut self,
-        place: Place,
+        from: Place,
+        mut doors: impl FnMut(&Classes<Server>, ClassId) -> Doors,
         now: Instant,
-        mut progress: impl FnMut(&Place, &Arc<Group>) -> Progress,
-    ) -> Option<Progress> {
-        let mut stands = None;
-        for (before, waiting) in self.waiting.range(..=place) {
-            stands = Some(progress(before, &waiting.group));
+    ) -> Vec<(Client, Progress)> {
+        let mut news = Vec::new();
+        let mut ahead: Vec<u32> = self.classes.iter().map(|class| class.waiting).collect();
+        let mut known = HashMap::new();
+        for (place, waiting) in self.waiting.range_mut(from..).rev() {
+            let class = waiting.group.class.get();
+            if let Some(count) = ahead.get_mut(class) {
+                *count -= 1;
+            }
+            if waiting.heard.is_none() {
+                let doors = known.entry(class).or_insert_with(|| doors(&self.classes, class));
+                let stands = progress(&self.classes, *place, class, &ahead, Some(doors));
+                waiting.heard = Some((stands, now));
+                news.push((waiting.client.clone(), stands));
+            }
         }
-        let waiting = self.waiting.get_mut(&place)?;
-        waiting.heard = stands.map(|stands| (stands, now));
-        stands
+        news
     }
 
     /// The clients whose tickets must be sent again.
@@ -262,16 +349,37 @@ impl<Client: Clone> WaitingLine<Client> {
     }
 }
 
-impl Group {
-    /// The repository, in lower case.
-    pub(super) fn repository(&self) -> &str {
-        &self.repository
+impl<Client> Waiting<Client> {
+    /// Whether it is one of these.
+    pub(super) fn is_of(&self, passed: &Passed) -> bool {
+        match passed {
+            Passed::Address(address) => self.address == Some(*address),
+            Passed::User(user) => self.user.as_deref() == Some(user),
+        }
+    }
+}
+
+/// How a client of a class stands, if `ahead` are those ahead of it by class.
+fn progress<Server: Clone + Eq>(
+    classes: &Classes<Server>,
+    place: Place,
+    class: ClassId,
+    ahead: &[u32],
+    doors: Option<&Doors>,
+) -> Progress {
+    let of_line = classes.competing(class, ahead);
+    let at_doors = doors.map_or(0, |doors| doors.queue.partition_point(|since| *since < place.since));
+    let ahead = of_line.saturating_add(u32::try_from(at_doors).unwrap_or(u32::MAX));
+    Progress {
+        ahead,
+        estimate: doors.and_then(|doors| estimate(doors.basis, ahead)),
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::session::line::rate::Basis;
 
     fn entry(repository: &str, client: u32, user: Option<&str>) -> Entry<u32> {
         Entry {
@@ -288,65 +396,83 @@ mod tests {
         Place { since, number }
     }
 
-    fn clients(line: &WaitingLine<u32>) -> Vec<u32> {
+    fn line() -> WaitingLine<u32, u32> {
+        let mut line = WaitingLine::default();
+        line.set_servers(&[0], takes_all);
+        line
+    }
+
+    #[expect(
+        clippy::unnecessary_wraps,
+        clippy::trivially_copy_pass_by_ref,
+        reason = "the terms of a server"
+    )]
+    fn takes_all(_: &u32, _: &ProjectUrl) -> Option<Admission> {
+        Some(Admission::Dedicated)
+    }
+
+    fn clients(line: &WaitingLine<u32, u32>) -> Vec<u32> {
         line.iter().map(|(_, waiting)| waiting.client).collect()
     }
 
     #[test]
     fn a_ticket_and_a_user_have_one_place_each() {
         let now = Instant::now();
-        let mut line = WaitingLine::default();
-        line.enter(place(10, 1), entry("lab/arm", 1, None), now);
-        line.enter(place(20, 2), entry("lab/arm", 2, Some("anna")), now);
-        line.enter(place(30, 3), entry("lab/leg", 3, None), now);
+        let mut line = line();
+        line.enter(place(10, 1), entry("lab/arm", 1, None), takes_all, now);
+        line.enter(place(20, 2), entry("lab/arm", 2, Some("anna")), takes_all, now);
+        line.enter(place(30, 3), entry("lab/leg", 3, None), takes_all, now);
         // The same ticket on another connection, before and after the first one has ended.
         assert_eq!(
-            line.enter(place(10, 1), entry("lab/arm", 4, None), now),
+            line.enter(place(10, 1), entry("lab/arm", 4, None), takes_all, now),
             (place(10, 1), Some(1))
         );
-        line.leave(place(10, 1), 1);
+        line.leave(1);
         assert_eq!(clients(&line), [4, 2, 3]);
         // Another tab of the same user.
         assert_eq!(
-            line.enter(place(40, 5), entry("lab/arm", 5, Some("anna")), now),
+            line.enter(place(40, 5), entry("lab/arm", 5, Some("anna")), takes_all, now),
             (place(20, 2), Some(2))
         );
         assert_eq!(clients(&line), [4, 5, 3]);
-        line.leave(place(10, 1), 4);
-        line.leave(place(20, 2), 5);
-        line.leave(place(30, 3), 3);
+        line.leave(4);
+        line.leave(5);
+        line.leave(3);
         assert!(line.waiting.is_empty() && line.since.is_empty() && line.users.is_empty() && line.groups.is_empty());
+        assert!(line.connections.is_empty() && line.classes.occupied() == 0);
     }
 
     #[test]
     fn one_who_comes_back_with_a_ticket_is_where_it_was() {
         let now = Instant::now();
-        let mut line = WaitingLine::default();
-        line.enter(place(20, 2), entry("lab/arm", 2, None), now);
-        line.enter(place(30, 3), entry("lab/arm", 3, None), now);
-        line.enter(place(10, 1), entry("lab/arm", 1, None), now);
+        let mut line = line();
+        line.enter(place(20, 2), entry("lab/arm", 2, None), takes_all, now);
+        line.enter(place(30, 3), entry("lab/arm", 3, None), takes_all, now);
+        line.enter(place(10, 1), entry("lab/arm", 1, None), takes_all, now);
         assert_eq!(clients(&line), [1, 2, 3]);
     }
 
     #[test]
     fn only_changes_are_heard_and_rarely_by_those_far_behind() {
         let start = Instant::now();
-        let mut line = WaitingLine::default();
+        let mut line = line();
         for number in 0..400 {
             line.enter(
                 place(number, number),
                 entry("lab/arm", number.try_into().unwrap(), None),
+                takes_all,
                 start,
             );
         }
-        let mut heard = |at: f64, gone: u32| {
-            let mut ahead = 0;
-            let news = line.news(start + Duration::from_secs_f64(at), |_, _| {
-                ahead += 1;
-                let ahead = (ahead - 1_u32).saturating_sub(gone);
-                Progress { ahead, estimate: None }
-            });
-            news.len()
+        let mut heard = |at: f64, gone: u64| {
+            for number in 0..gone {
+                line.remove(place(number, number));
+            }
+            let doors = Doors {
+                queue: Vec::new(),
+                basis: Basis::default(),
+            };
+            line.news(&[doors], start + Duration::from_secs_f64(at)).len()
         };
         assert_eq!(heard(0.0, 0), 400, "each hears where it is");
         assert_eq!(heard(5.0, 0), 0, "nothing has changed");
@@ -362,9 +488,9 @@ mod tests {
     fn a_ticket_takes_less_than_a_kilobyte() {
         // A node of the tree, the indices and the parts on the heap, with long names and a URL.
         let texts = 60 + 60 + 150;
-        let index = 2 * (size_of::<u64>() * 2 + size_of::<Arc<str>>() + size_of::<Place>() + 16);
+        let index = 2 * (size_of::<u64>() * 3 + size_of::<Arc<str>>() + 2 * size_of::<Place>() + 16);
         let entry = 2 * (size_of::<Place>() + size_of::<Waiting<actix::Recipient<Ping>>>());
-        assert!(entry + index + texts < 900, "{}", entry + index + texts);
+        assert!(entry + index + texts < 1000, "{}", entry + index + texts);
     }
 
     #[derive(actix::Message)]

@@ -46,8 +46,6 @@ pub struct WebClient {
 /// A client that waits in the line.
 struct Waiting {
     world: ProjectUrl,
-    /// Its place; `None` until the registry has answered.
-    place: Option<Place>,
     /// The seconds until its turn, as last sent.
     estimate: Option<u32>,
 }
@@ -116,7 +114,6 @@ impl WebClient {
         };
         self.waiting = Some(Waiting {
             world: world.clone(),
-            place: None,
             estimate: None,
         });
         let wait = Wait {
@@ -132,13 +129,10 @@ impl WebClient {
         let server = Arc::clone(&self.server);
         async move { server.wait(wait).await }
             .into_actor(self)
-            .map(move |entered, client, ctx| match (entered, &mut client.waiting) {
-                (Ok(Some(place)), Some(waiting)) => {
-                    waiting.place = Some(place);
-                    client.send_ticket(place, ctx);
-                }
-                (Ok(_), _) => {}
-                (Err(failure), _) => {
+            .map(move |entered, client, ctx| match entered {
+                Ok(Some(place)) => client.send_ticket(place, ctx),
+                Ok(None) => {}
+                Err(failure) => {
                     client.waiting = None;
                     Self::refuse(&failure, wants_reason, ctx);
                 }
@@ -146,12 +140,10 @@ impl WebClient {
             .wait(ctx);
     }
 
+    /// Leaves the line, also if the registry has not answered yet: it handles what it was asked before first.
     fn stop_waiting(&mut self) {
-        if let Some(place) = self.waiting.take().and_then(|waiting| waiting.place) {
-            self.server.registry.do_send(StopWaiting {
-                place,
-                connection: self.connection,
-            });
+        if self.waiting.take().is_some() {
+            self.server.registry.do_send(StopWaiting(self.connection));
         }
     }
 
@@ -271,7 +263,8 @@ impl Handler<LineEvent> for WebClient {
                 }
                 ctx.text(self.server.client_urls.websocket_url(&turn.server));
                 self.server.picks.with_label_values(&[PLACED]).inc();
-                self.waiting = None;
+                // It may have asked for another world meanwhile.
+                self.stop_waiting();
             }
             LineEvent::TakenOver => {
                 ctx.text("Error: another connection has this place in the line.");

@@ -128,6 +128,17 @@ impl ServerReport {
         }
     }
 
+    /// Whether by both reports the server accepts the same worlds on the same terms.
+    pub fn has_rules_of(&self, other: &Self) -> bool {
+        let rules = |report: &Self| {
+            let has_idle_time = report.load.percent() <= report.share_idle_time;
+            (report.docker, report.share_idle_time.to_bits(), has_idle_time)
+        };
+        rules(self) == rules(other)
+            && self.allowed_repositories == other.allowed_repositories
+            && self.blocked_repositories == other.blocked_repositories
+    }
+
     /// Whether the server accepts this world at this load, by this report.
     ///
     /// A report without `docker` comes from a Python server. The Python session server expects such a server to run

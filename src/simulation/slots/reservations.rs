@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use actix::{Message, Recipient};
 
 use super::simulation_record::Party;
-use crate::shared::domain::{Failure, Offer, Offers, ProjectUrl, Reason, ReservationId, Wish, Wishes};
+use crate::shared::domain::{Failure, Offer, Offers, Passed, ProjectUrl, Reason, ReservationId, Wish, Wishes};
 use crate::shared::http::AddressQuota;
 use crate::simulation::simulation_id::SimulationId;
 
@@ -85,6 +85,8 @@ struct Link {
     has_news: bool,
     /// When the clients of the queue have come, as it was told last.
     queue: Vec<Instant>,
+    /// Whom of those in `wanted` this server passes over, as it was told last.
+    passed: Vec<Passed>,
 }
 
 /// A place in the order of all who want a slot: who is behind comes after the others.
@@ -115,6 +117,7 @@ impl Reservations {
             news: Offers::default(),
             has_news: true,
             queue: Vec::new(),
+            passed: Vec::new(),
         };
         self.links.insert(id, link);
     }
@@ -131,17 +134,19 @@ impl Reservations {
         }
         let Some(link) = self.links.get_mut(&id) else { return };
         let now = Instant::now();
-        link.wanted = wishes
-            .first
-            .iter()
-            .map(|wish| Wanted {
+        let known: HashMap<u64, Instant> = link.wanted.iter().map(|one| (one.ticket, one.since)).collect();
+        let wanted = wishes.first.iter().map(|wish| {
+            let since = now.checked_sub(Duration::from_millis(wish.waited)).unwrap_or(now);
+            Wanted {
                 ticket: wish.ticket,
-                since: now.checked_sub(Duration::from_millis(wish.waited)).unwrap_or(now),
+                // The message that was the least time on its way tells it best.
+                since: known.get(&wish.ticket).map_or(since, |known| since.min(*known)),
                 address: wish.address,
                 parties: parties(wish),
                 world: wish.world.clone(),
-            })
-            .collect();
+            }
+        });
+        link.wanted = wanted.collect();
         link.all = (wishes.all as usize).max(link.wanted.len());
         link.news.number = wishes.number;
         link.has_news = true;
@@ -282,19 +287,23 @@ impl Reservations {
         wanted.filter(|wanted| may_have(&wanted.parties)).count()
     }
 
-    /// Tells each session server what is new. `queue` is when the clients of the queue have come.
-    pub(super) fn tell(&mut self, free: usize, queue: &[Instant]) {
+    /// Tells each session server what is new. `queue` is when the clients of the queue have come, `has_share` whether an
+    /// address or user has all the slots that it may have.
+    pub(super) fn tell(&mut self, free: usize, queue: &[Instant], has_share: impl Fn(&(Party, usize)) -> bool) {
         let now = Instant::now();
         for link in self.links.values_mut() {
-            if !link.has_news && link.queue == queue {
+            let passed = passed_over(&link.wanted, &self.behind, &has_share);
+            if !link.has_news && link.queue == queue && link.passed == passed {
                 continue;
             }
             queue.clone_into(&mut link.queue);
+            link.passed.clone_from(&passed);
             let waited = |since: &Instant| u64::try_from(now.duration_since(*since).as_millis()).unwrap_or(u64::MAX);
             let number = link.news.number;
             let news = Offers {
                 free: u32::try_from(free).unwrap_or(u32::MAX),
                 queue: queue.iter().map(waited).collect(),
+                passed,
                 ..std::mem::take(&mut link.news)
             };
             link.news.number = number;
@@ -302,4 +311,27 @@ impl Reservations {
             link.listener.do_send(Reserved(news));
         }
     }
+}
+
+/// Whom of these a server passes over for now, each once.
+fn passed_over(
+    wanted: &VecDeque<Wanted>,
+    behind: &HashMap<IpAddr, Instant>,
+    has_share: impl Fn(&(Party, usize)) -> bool,
+) -> Vec<Passed> {
+    let mut passed = Vec::new();
+    for one in wanted {
+        let is_behind = one.address.filter(|address| behind.contains_key(address));
+        let full = one.parties.iter().filter(|party| has_share(party));
+        let full = full.map(|(party, _)| match party {
+            Party::Address(address) => Passed::Address(*address),
+            Party::User(user) => Passed::User(user.clone()),
+        });
+        for found in full.chain(is_behind.map(Passed::Address)) {
+            if !passed.contains(&found) {
+                passed.push(found);
+            }
+        }
+    }
+    passed
 }

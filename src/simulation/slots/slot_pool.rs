@@ -314,7 +314,9 @@ impl Slots {
             .filter(|record| record.simulation.port.is_some() && record.spare.is_none());
         let used = of_clients.count() + self.reservations.reserved.len();
         let free = self.ports.len().saturating_sub(used);
-        self.reservations.tell(free, &queue);
+        let lent = self.lent();
+        let has_share = |(party, most): &(Party, usize)| lent.get(party).is_some_and(|slots| slots >= most);
+        self.reservations.tell(free, &queue, has_share);
         for (before, waiting) in self
             .records
             .values_mut()

@@ -1,0 +1,68 @@
+//! The WebSocket `/slots` to simulation servers that lie or send too much: others, and the line, are not disturbed.
+
+use serde_json::json;
+use webots_fleet::shared::domain::{Offer, Offers, ReservationId};
+
+use super::until_states;
+use crate::support::client::Client;
+use crate::support::git::arm;
+use crate::support::program::{Server, demo_server, session_server};
+use crate::support::reserving::ReservingServer;
+
+const SECRET: &str = "a secret of this test";
+
+/// A client in the line.
+async fn enter(session: &Server) -> Client {
+    let mut client = Client::connect(&session.websocket("/session")).await;
+    client.send(&json!({"url": arm(), "wait": true}).to_string()).await;
+    client.until("ticket: ").await;
+    client
+}
+
+#[actix_rt::test]
+async fn a_server_that_lies_and_floods_disturbs_no_other_and_no_turn() {
+    let honest = demo_server(1).set("fleetKey", SECRET).start().await;
+    let inside = Client::ready(&honest).await;
+    // Its reservations hold longer than any clock can count.
+    let mut liar = ReservingServer::start(1, 1e18).await;
+    liar.report(1, 1);
+    let session = session_server(&[honest.address(), liar.address.clone()])
+        .set("fleetKey", SECRET)
+        .set("loadThreshold", 1000)
+        .start()
+        .await;
+    until_states(&session, &["full", "full"]).await;
+    let mut link = liar.link().await;
+    let mut first = enter(&session).await;
+    let wishes = link.wishes().await.unwrap();
+    link.reserve(wishes.number, [wishes.first[0].ticket]).await;
+    first.until("pass: ").await;
+    assert_eq!(first.until("ws://").await, format!("ws://{}", liar.address));
+    let mut second = enter(&session).await;
+    assert_eq!(second.until("queue: ").await, "queue: 0");
+    // Slots for tickets that nobody has, answers to what nobody asked, times before the world began.
+    for number in 0..200 {
+        let offer = |ticket| Offer {
+            ticket,
+            reservation: ReservationId(ticket),
+        };
+        let offers = Offers {
+            number: u64::MAX - number,
+            offers: (0..500).map(offer).collect(),
+            free: u32::MAX,
+            used: (0..500).map(ReservationId).collect(),
+            queue: vec![u64::MAX; 100],
+            passed: Vec::new(),
+        };
+        assert!(link.offer(&offers).await, "{number}");
+    }
+    // What is too long, or no offer, ends the link, which is opened again.
+    link.say("x".repeat(1 << 20)).await;
+    let mut link = liar.link().await;
+    link.say("[]".to_owned()).await;
+    liar.link().await;
+    inside.leave().await;
+    second.until("pass: ").await;
+    assert_eq!(second.until("ws://").await, format!("ws://{}", honest.address()));
+    assert_eq!(session.status().await["line"]["waiting"], 0);
+}
