@@ -1,15 +1,20 @@
 //! The session server's HTML pages: the monitor of its fleet, and the viewer.
 
 use std::collections::VecDeque;
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use askama::Template;
 
 use crate::session::config::Example;
 use crate::session::fleet::{FleetStatus, ServerStatus, StateChange, StateName};
+use crate::session::line::WaitingFor;
 use crate::shared::domain::{ClientUrls, Instances, ServerReport};
 use crate::shared::http::{PageView, TableRow};
+use crate::shared::run::timestamp;
 use crate::shared::text::one_line;
+
+/// Most repositories in the table of those that are waited for.
+const MAX_WORLDS: usize = 50;
 
 /// The whole page `/monitor`.
 #[derive(Template)]
@@ -44,6 +49,13 @@ struct ServerRow<'server> {
     /// Its last report, unless it is down.
     report: Option<&'server ServerReport>,
     monitor: String,
+}
+
+/// The cells of one repository whose worlds are waited for.
+#[derive(Template)]
+#[template(path = "session/waiting_row.html")]
+struct WaitingRow<'line> {
+    waiting: &'line WaitingFor,
 }
 
 /// The administrator's announcement.
@@ -111,6 +123,13 @@ pub fn view(
         })
     });
     let rows = rows.collect::<Result<Vec<TableRow>, askama::Error>>()?;
+    let waiting = status.line.worlds.iter().take(MAX_WORLDS).map(|waiting| {
+        Ok(TableRow {
+            key: waiting.repository.clone(),
+            html: WaitingRow { waiting }.render()?,
+        })
+    });
+    let waiting = waiting.collect::<Result<Vec<TableRow>, askama::Error>>()?;
     let parts = [
         ("announcement", Announced { text: announcement }.render()?),
         ("glance", Glance::new(status, clients).render()?),
@@ -124,7 +143,7 @@ pub fn view(
     ];
     Ok(PageView {
         parts: parts.into(),
-        tables: [("servers", rows)].into(),
+        tables: [("servers", rows), ("waiting", waiting)].into(),
         sample: Vec::new(),
     })
 }
@@ -147,6 +166,18 @@ impl<'status> Glance<'status> {
             queued: sum(|instances| instances.queued),
             slots: sum(|instances| instances.slots),
         }
+    }
+}
+
+impl WaitingRow<'_> {
+    /// When the first of them has come. How long it has waited changes each second, and the page with it.
+    fn since(&self) -> String {
+        timestamp(SystemTime::UNIX_EPOCH + Duration::from_millis(self.waiting.since))
+    }
+
+    fn repository(&self) -> String {
+        let url = &self.waiting.repository;
+        one_line(url.split_once("://").map_or(url, |(_, rest)| rest))
     }
 }
 
