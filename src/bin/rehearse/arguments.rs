@@ -9,9 +9,8 @@ use webots_fleet::shared::run::raise_open_files;
 
 use crate::behaviour::Mix;
 use crate::localhost::is_localhost;
+use crate::stay::{Stay, time};
 
-/// Longest time of an argument: 30 days.
-const LONGEST: Duration = Duration::from_hours(30 * 24);
 /// Open files that one client needs (its connections), and those that the program itself needs.
 const FILES: (u64, u64) = (4, 64);
 
@@ -35,9 +34,12 @@ pub(crate) struct Arguments {
     /// Time over which the clients arrive, at regular intervals; 0s: all at once
     #[arg(long, default_value = "60s", value_parser = time)]
     pub(crate) over: Duration,
-    /// Time for which each client stays once its simulation runs
-    #[arg(long, default_value = "2m", value_parser = time)]
-    pub(crate) stay: Duration,
+    /// Time for which each client stays once its simulation runs, or two between which it is drawn: 5s..15s
+    #[arg(long, default_value = "2m", value_parser = str::parse::<Stay>)]
+    pub(crate) stay: Stay,
+    /// Wait for a simulation server in the session server's line, as its page /viewer does, instead of asking again and again
+    #[arg(long)]
+    pub(crate) line: bool,
     /// Time after which a client gives up if its simulation does not run
     #[arg(long, default_value = "5m", value_parser = time)]
     pub(crate) patience: Duration,
@@ -61,7 +63,7 @@ pub(crate) struct Arguments {
     #[arg(long, default_value = "w3d", value_parser = ["w3d", "x3d"])]
     pub(crate) viewer: String,
     /// Take one client through all steps, and compare each message with what a fleet and Webots should send
-    #[arg(long, conflicts_with_all = ["clients", "over", "stay", "real_time", "misbehave", "soak", "expect", "json"])]
+    #[arg(long, conflicts_with_all = ["clients", "over", "stay", "line", "real_time", "misbehave", "soak", "expect", "json"])]
     pub(crate) explain: bool,
     /// Allow a fleet that is not on this machine
     #[arg(long)]
@@ -117,9 +119,10 @@ impl Arguments {
             format!("within {}", words(self.over))
         };
         format!(
-            "{} clients {over}, each for {}{how_long}",
+            "{} clients {over}, each for {}{how_long}{}",
             self.clients,
-            words(self.stay)
+            self.stay,
+            if self.line { ", in the line" } else { "" }
         )
     }
 }
@@ -131,15 +134,6 @@ fn fleet(text: &str) -> Result<Url, String> {
         Ok(url)
     } else {
         Err("allowed is http://HOST:PORT or https://HOST".to_owned())
-    }
-}
-
-fn time(text: &str) -> Result<Duration, String> {
-    let time = humantime::parse_duration(text).map_err(|error| error.to_string())?;
-    if time <= LONGEST {
-        Ok(time)
-    } else {
-        Err("allowed is up to 30d".to_owned())
     }
 }
 

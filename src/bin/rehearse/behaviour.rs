@@ -1,10 +1,13 @@
 //! The behaviours of clients, good and bad. Pure.
 
 use std::str::FromStr;
+use std::time::Duration;
 
 use rand::rngs::SmallRng;
 use rand::{RngExt, SeedableRng};
 use serde::Serialize;
+
+use crate::stay::Stay;
 
 /// How one client behaves.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -84,6 +87,11 @@ impl Draw {
         }
     }
 
+    /// How long the next client stays.
+    pub(crate) fn stay(&mut self, stay: Stay) -> Duration {
+        self.random.random_range(stay.least..=stay.most)
+    }
+
     /// The behaviour of the next client.
     pub(crate) fn next(&mut self) -> Behaviour {
         let mut number = self.random.random_range(0..100_u32);
@@ -118,6 +126,20 @@ mod tests {
             );
         }
         assert_eq!(percent(Behaviour::Hasty), 0);
+    }
+
+    #[test]
+    fn a_stay_is_drawn_between_its_times() {
+        let mut draw = Draw::new(Mix::default());
+        let mut drawn = |stay: &str| -> Vec<Duration> {
+            let stay = stay.parse().unwrap();
+            std::iter::repeat_with(|| draw.stay(stay)).take(1000).collect()
+        };
+        let at = |seconds| Duration::from_secs(seconds);
+        let all = drawn("5s..15s");
+        assert!(all.iter().all(|time| (at(5)..=at(15)).contains(time)));
+        assert!(all.iter().any(|time| *time < at(6)) && all.iter().any(|time| *time > at(14)));
+        assert!(drawn("2m").iter().all(|time| *time == at(120)));
     }
 
     #[test]

@@ -3,6 +3,8 @@
 use std::cell::RefCell;
 use std::time::{Duration, Instant};
 
+use serde::Serialize;
+
 use crate::arguments::Arguments;
 use crate::behaviour::Behaviour;
 use crate::board::{Board, Stage};
@@ -25,6 +27,7 @@ pub(crate) struct Browser<'class> {
     board: &'class Board,
     session_server: &'class SessionServer,
     behaviour: Behaviour,
+    stay: Duration,
     visit: Visit,
     /// Receives the visit at its end.
     visits: &'class RefCell<Vec<Visit>>,
@@ -38,6 +41,16 @@ struct Running {
     stream: Connection,
     /// For a client that returns.
     way_back: Option<WayBack>,
+}
+
+/// A request for a simulation. What is absent, the original does not know.
+#[derive(Serialize)]
+struct Start<'world> {
+    url: &'world str,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    resumable: Option<bool>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pass: Option<String>,
 }
 
 /// Why a start failed.
@@ -61,7 +74,7 @@ impl<'class> Browser<'class> {
         board: &'class Board,
         session_server: &'class SessionServer,
         visits: &'class RefCell<Vec<Visit>>,
-        (client, behaviour): (u32, Behaviour),
+        (client, behaviour, stay): (u32, Behaviour, Duration),
     ) -> Self {
         let asked = board.now();
         let visit = Visit {
@@ -69,6 +82,8 @@ impl<'class> Browser<'class> {
             behaviour,
             asked,
             server: None,
+            place: None,
+            turn: None,
             outcome: Outcome::Left,
             steps: Steps::default(),
             pace: Vec::new(),
@@ -79,6 +94,7 @@ impl<'class> Browser<'class> {
             board,
             session_server,
             behaviour,
+            stay,
             visit,
             visits,
             full: None,
@@ -117,15 +133,20 @@ impl<'class> Browser<'class> {
     async fn start(&mut self, meet: impl Fn(&str)) -> Result<Running, StartError> {
         let waiting = self.board.enter(Stage::Waiting);
         let asked = Instant::now();
-        let server = self.find_server().await?;
+        let (server, pass) = if self.arguments.line {
+            self.wait_in_line().await?
+        } else {
+            (self.find_server().await?, None)
+        };
         meet(&server);
         self.visit.server = server.split_once("://").map(|(_, address)| address.to_owned());
         let mut lease = Connection::open(&format!("{server}/client")).await?;
-        let start = match self.behaviour {
-            Behaviour::Return => serde_json::json!({"start": {"url": self.arguments.world, "resumable": true}}),
-            _ => serde_json::json!({"start": {"url": self.arguments.world}}),
+        let start = Start {
+            url: &self.arguments.world,
+            resumable: (self.behaviour == Behaviour::Return).then_some(true),
+            pass,
         };
-        lease.say(&start.to_string()).await?;
+        lease.say(&serde_json::json!({ "start": start }).to_string()).await?;
         if self.behaviour == Behaviour::Hasty {
             lease.close().await;
             return Err(StartError::Left);
@@ -137,6 +158,7 @@ impl<'class> Browser<'class> {
         drop(waiting);
         let _starting = self.board.enter(Stage::Starting);
         let granted = Instant::now();
+        self.visit.turn.get_or_insert(self.board.now());
         self.visit.steps.waiting = Some((granted - asked).as_secs_f64());
         let mut launched = None;
         let mut text = first;
@@ -163,6 +185,22 @@ impl<'class> Browser<'class> {
             stream,
             way_back,
         })
+    }
+
+    /// Waits in the line for a simulation server. Returns its URL and the pass for it, if there is one.
+    async fn wait_in_line(&mut self) -> Result<(String, Option<String>), StartError> {
+        self.full.get_or_insert_with(|| "it waited in the line".to_owned());
+        let first = &mut self.visit.place;
+        let place = |ahead| {
+            first.get_or_insert(ahead);
+        };
+        let turn = self.session_server.turn(&self.arguments.world, place).await;
+        let (server, pass) = turn.map_err(StartError::Refused)?;
+        self.full = None;
+        if pass.is_some() {
+            self.visit.turn = Some(self.board.now());
+        }
+        Ok((server, pass))
     }
 
     /// Waits until the fleet is available and requests a simulation server; retries if other clients were faster.
@@ -219,7 +257,7 @@ impl<'class> Browser<'class> {
 
     /// Watches a simulation until its client leaves.
     async fn watch(&mut self, mut running: Running) -> Outcome {
-        let stay = self.arguments.stay;
+        let stay = self.stay;
         let attentive = match self.behaviour {
             Behaviour::Ordinary | Behaviour::Drop | Behaviour::Hasty => stay,
             Behaviour::Reload | Behaviour::Return | Behaviour::Sleep | Behaviour::Vanish => stay / 2,

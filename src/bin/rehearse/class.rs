@@ -84,7 +84,8 @@ impl Class<'_> {
     }
 
     async fn visit(&self, client: u32, behaviour: Behaviour) {
-        let who = (client, behaviour);
+        let stay = self.draw.borrow_mut().stay(self.arguments.stay);
+        let who = (client, behaviour, stay);
         let browser = Browser::new(self.arguments, &self.board, &self.session_server, &self.visits, who);
         browser.visit(|server| self.servers.met(server)).await;
     }

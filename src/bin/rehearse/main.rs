@@ -2,7 +2,8 @@
 //!
 //! It uses only the original's protocol, so that it also measures a fleet of Python servers. `arguments` is the command
 //! line; `class` starts the clients, each of which is a `browser` that goes through the steps of Webots' web page and
-//! records a `visit`; `servers` monitors the load; `report` and `table` show the result, with `real_time_factors`.
+//! records a `visit`; `servers` monitors the load; `report` and `table` show the result, with `real_time_factors` and
+//! `line`.
 //! `explain` goes through the steps with one client and compares the results with the expected ones; `step_log` prints
 //! the steps, `words` the texts.
 
@@ -15,12 +16,14 @@ mod connection;
 mod explain;
 mod http;
 mod interruption;
+mod line;
 mod localhost;
 mod real_time_factors;
 mod report;
 mod returning;
 mod servers;
 mod session_server;
+mod stay;
 mod step_log;
 mod table;
 mod visit;

@@ -6,6 +6,7 @@ use std::path::Path;
 use serde::Serialize;
 
 use crate::arguments::Arguments;
+use crate::line::Line;
 use crate::real_time_factors::{RealTimeFactors, factors, factors_of, quantile, sorted};
 use crate::visit::{Outcome, Steps, Visit};
 
@@ -23,6 +24,8 @@ pub(crate) struct Report {
     pub(crate) seats: Seats,
     /// The time until a simulation ran, in seconds.
     pub(crate) times: Vec<Row>,
+    /// How fair it was to those who waited. `None` if nobody did.
+    pub(crate) line: Option<Line>,
     /// The speed of simulated time; 1 is real time. `None` if no simulation ran for long enough.
     pub(crate) pace: Option<RealTimeFactors>,
     /// Each simulation server.
@@ -122,6 +125,7 @@ impl Report {
             world: arguments.world.clone(),
             played: arguments.summary(),
             times: times(visits),
+            line: Line::of(visits),
             pace: factors(visits.iter().flat_map(factors_of)),
             verdict: verdict(&seats),
             expected: arguments.expect,
@@ -291,6 +295,8 @@ mod tests {
             behaviour: Behaviour::Ordinary,
             asked,
             server,
+            place: None,
+            turn: ran.map(|step| asked + step),
             outcome,
             steps,
             pace: pace.collect(),

@@ -82,6 +82,38 @@ impl SessionServer {
         }
     }
 
+    /// Waits for a simulation server in the line. Returns its URL and the pass for it, if it has reserved a slot.
+    /// `place` receives the number of clients ahead.
+    ///
+    /// # Errors
+    /// The text that was received instead, or why the connection has ended.
+    pub(crate) async fn turn(
+        &self,
+        world: &str,
+        mut place: impl FnMut(u32),
+    ) -> Result<(String, Option<String>), String> {
+        let url = format!("{}/session", self.base().replacen("http", "ws", 1));
+        let mut line = Connection::open(&url).await.map_err(|ended| ended.to_string())?;
+        let request = serde_json::json!({"url": world, "wait": true});
+        line.say(&request.to_string())
+            .await
+            .map_err(|ended| ended.to_string())?;
+        let mut pass = None;
+        loop {
+            let text = line.receive().await.map_err(|ended| ended.to_string())?;
+            match text.split_once(": ") {
+                Some(("queue", ahead)) => ahead.parse().map_or((), &mut place),
+                Some(("pass", given)) => pass = Some(given.to_owned()),
+                Some(("Error", _)) => return Err(text),
+                _ if text.starts_with("ws://") || text.starts_with("wss://") => {
+                    line.close().await;
+                    return Ok((text.trim_end_matches('/').to_owned(), pass));
+                }
+                _ => {}
+            }
+        }
+    }
+
     fn base(&self) -> String {
         self.url
             .as_str()

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::fmt;
 
+use crate::line::Line;
 use crate::real_time_factors::RealTimeFactors;
 use crate::report::Report;
 
@@ -15,6 +16,9 @@ pub(crate) fn text(report: &Report) -> String {
     parts.push(seats(report));
     if !report.times.is_empty() {
         parts.push(times(report));
+    }
+    if let Some(line) = &report.line {
+        parts.push(self::line(line));
     }
     if !report.servers.is_empty() {
         parts.push(servers(report));
@@ -69,6 +73,26 @@ fn times(report: &Report) -> String {
         let seconds = [row.median, row.p95, row.worst].map(|time| format!("{time:.1} s"));
         table.add(std::iter::once(row.step.to_owned()).chain(seconds).collect::<Vec<_>>());
     }
+    table.to_string()
+}
+
+fn line(line: &Line) -> String {
+    let mut table = Table::new(&["Those who waited", ""]);
+    let mut add = |what: &str, found: String| table.add(vec![what.to_owned(), found]);
+    add("clients", line.waited.to_string());
+    if let Some(longest) = line.longest {
+        add("most ahead of one when it came", longest.to_string());
+    }
+    add("overtakings", line.overtakings.to_string());
+    add("most overtakings of one", line.most_overtaken.to_string());
+    let (idle, percent) = (line.idle, 100.0 * line.idle_share);
+    add(
+        "slots free meanwhile, all together",
+        format!("{idle:.1} s, {percent:.1} %"),
+    );
+    let (median, worst) = (line.idle_median, line.idle_worst);
+    add("a slot that became free, median", format!("{median:.3} s"));
+    add("a slot that became free, worst", format!("{worst:.3} s"));
     table.to_string()
 }
 

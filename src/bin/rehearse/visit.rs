@@ -16,6 +16,10 @@ pub(crate) struct Visit {
     pub(crate) asked: f64,
     /// The simulation server that it was sent to, as `HOST:PORT` or `HOST/PORT`.
     pub(crate) server: Option<String>,
+    /// The number of clients ahead when it entered the line, if it was told.
+    pub(crate) place: Option<u32>,
+    /// When it was its turn: a simulation server had a slot for it.
+    pub(crate) turn: Option<f64>,
     /// Its outcome.
     pub(crate) outcome: Outcome,
     /// The duration of each step that it completed.
