@@ -14,7 +14,7 @@ const FIRST: usize = 1000;
 const CLIENTS: usize = 8000;
 
 /// The anonymous memory of a process, in KiB.
-fn memory(process: u32) -> f64 {
+pub(crate) fn memory(process: u32) -> f64 {
     let process = procfs::process::Process::new(i32::try_from(process).expect("a process id"));
     let status = process.and_then(|process| process.status()).expect("the server runs");
     status.rssanon.expect("Linux 4.5 or newer") as f64

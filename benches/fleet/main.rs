@@ -5,9 +5,10 @@
 //! 2. how much processor time the server needs to probe 10 and 1,000 servers each second;
 //! 3. how long a change takes to reach 10,000 connected clients;
 //! 4. how many requests it answers on 64 connections, compared with a bare handler of actix, in turns (by `wrk`);
-//! 5. how much memory an idle WebSocket client costs, compared with one bare actor per client.
+//! 5. how much memory an idle WebSocket client costs, compared with one bare actor per client;
+//! 6. what 5,000 clients in the line cost: memory, and processor time while it stands still and while it moves.
 //!
-//! `cargo bench --bench fleet -- door`, `watch`, `push`, `storm` or `idle` measures one of them. It fails if a bound is
+//! `cargo bench --bench fleet -- door`, `watch`, `push`, `storm`, `idle` or `line` measures one of them. It fails if a bound is
 //! exceeded; a missed goal is only reported.
 //! Other load of the machine affects the results: each part also prints a reference measurement.
 
@@ -23,10 +24,21 @@
 mod bare;
 mod door;
 mod idle;
+mod line;
 mod push;
 mod server;
 mod stand_ins;
 mod storm;
+#[allow(
+    missing_docs,
+    unreachable_pub,
+    clippy::pedantic,
+    clippy::unwrap_used,
+    clippy::panic,
+    reason = "these are the tools of tests"
+)]
+#[path = "../../tests/support/mod.rs"]
+mod support;
 mod watch;
 
 use std::process::ExitCode;
@@ -79,6 +91,9 @@ fn main() -> ExitCode {
     }
     if is_wanted("idle") {
         idle::measure();
+    }
+    if is_wanted("line") {
+        line::measure(&mut verdict);
     }
     if verdict.failed {
         ExitCode::FAILURE

@@ -26,13 +26,21 @@ pub(crate) fn raise_file_limit() {
 impl Server {
     /// Starts a session server that probes these simulation servers each second, and waits until all have reported.
     pub(crate) fn start(simulation_servers: &[String]) -> Self {
+        Self::start_with(simulation_servers, &serde_json::json!({}))
+    }
+
+    /// As [`Server::start`], with more keys of the configuration.
+    pub(crate) fn start_with(simulation_servers: &[String], keys: &serde_json::Value) -> Self {
         let folder = tempfile::tempdir().expect("a folder");
         let port = free_port();
-        let config = serde_json::json!({
+        let mut config = serde_json::json!({
             "server": "localhost", "ssl": false, "portRewrite": false, "bind": "127.0.0.1", "port": port,
             "simulationServers": simulation_servers, "clientCost": 0.25, "timing": {"placement": 0.05},
             "logDir": folder.path().join("log"),
         });
+        for (key, value) in keys.as_object().expect("keys") {
+            config[key] = value.clone();
+        }
         let file = folder.path().join("config.json");
         std::fs::write(&file, config.to_string()).expect("the configuration can be written");
         let child = Command::new(env!("CARGO_BIN_EXE_session-server"))

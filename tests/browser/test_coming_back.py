@@ -1,5 +1,6 @@
 """The viewer resumes after a reload, Back or a lost connection, and shows the correct state in between."""
 
+import itertools
 import json
 import pathlib
 import re
@@ -216,15 +217,27 @@ class InLine(Running):
     session = {"fleetKey": key, "loadThreshold": 1000, "port": free_ports(64) + 63}
     simulation = {"maxConnections": 1, "fleetKey": key}
 
+    # What the page tells screen readers from now on, how often it rings, and whether it is hidden behind another tab,
+    # which a browser without a window never does.
+    watch = """() => {
+      [window.said, window.rings, window.isAway] = [[], 0, false];
+      const spoken = document.getElementById('spoken');
+      new MutationObserver(() => window.said.push(spoken.textContent)).observe(spoken, { childList: true });
+      const Sound = window.AudioContext;
+      window.AudioContext = class extends Sound { constructor() { super(); window.rings += 1; } };
+      Object.defineProperty(document, 'hidden', { get: () => window.isAway });
+    }"""
+
     def join(self):
         """A page that asks for a world."""
         page = self.open(self.fleet.session.url("viewer"))
+        page.tab.evaluate(self.watch)
         expect(page.tab.locator("#availability")).not_to_contain_text("Connecting")
         page.tab.get_by_role("button", name="Playground").click()
         page.tab.get_by_role("button", name="Connect", exact=True).click()
         return page
 
-    def test_six_pages_wait_in_order_one_reloads_and_one_goes_away(self):
+    def test_six_pages_wait_in_order_one_reloads_one_goes_away_and_one_is_in_the_background(self):
         running = [self.running()[0], self.running()[0]]
         line = []
         for ahead in range(6):
@@ -238,16 +251,31 @@ class InLine(Running):
             # Screen readers hear it.
             expect(page.tab.locator("#spoken")).to_contain_text(word)
         line[2].tab.reload()
+        line[2].tab.evaluate(self.watch)
+        background = line[3]
+        background.tab.evaluate("window.isAway = true")
         expect(line[2].tab).to_have_title(re.compile(r"^\(3\) "))
         line.pop(4).tab.get_by_role("button", name="Stop waiting").click()
         expect(line[4].tab).to_have_title(re.compile(r"^\(5\) "))
         for page in line:
             running.pop(0).tab.get_by_role("button", name="Disconnect").click()
             expect(page.tab.locator("[data-step=simulation].done")).to_be_visible()
+            # Screen readers hear that it is its turn; there is a sound, and another title for who does not see the page.
+            self.assertEqual(page.tab.evaluate("said").count("It is your turn."), 1)
+            self.assertEqual(page.tab.evaluate("rings"), 1)
+            expect(page.tab).to_have_title(re.compile("^It is your turn" if page is background else "^Try a world"))
             others = line[line.index(page) + 1 :]
             for ahead, other in enumerate(others):
                 expect(other.tab).to_have_title(re.compile(rf"^\({ahead + 1}\) "))
             running.append(page)
+        # They heard each position; who looks at the page again sees its own title.
+        heard = background.tab.evaluate("said")
+        positions = [found[0] for found in map(re.compile("you are next|[0-9]+ client").search, heard) if found]
+        # With another estimate a position is told again.
+        positions = [position for position, _ in itertools.groupby(positions)]
+        self.assertEqual(positions, ["3 client", "2 client", "1 client", "you are next"])
+        background.tab.evaluate("window.isAway = false; document.dispatchEvent(new Event('visibilitychange'))")
+        expect(background.tab).to_have_title(re.compile("^Try a world"))
         for page in running:
             self.assertEqual(page.faults(), [])
             page.tab.get_by_role("button", name="Disconnect").click()
