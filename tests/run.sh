@@ -96,7 +96,7 @@ run_beside() { # COMMAND...
     start "$@"
     ((memory > 10000)) || finish "$@"
 }
-run_beside tests/own_network.sh "${CARGO[@]}" --test containers
+run_beside tests/own_network.sh "${CARGO[@]}" --test containers -- --skip on_a_quiet_machine
 run_beside tests/deploy/package.sh
 tests/own_tmp.sh "${CARGO[@]}" --lib --bins --test integration -- --skip on_a_quiet_machine || failed+=('cargo test')
 run_beside tests/browser/run
@@ -115,6 +115,8 @@ start "${CARGO[@]}" --test integration --test faults on_a_quiet_machine
 finish "${CARGO[@]}" --test integration --test faults on_a_quiet_machine
 start env QUIET_MACHINE=1 tests/browser/run test_embedding.PrintedPages.test_on_a_quiet_machine_it_is_drawn_within_100_ms
 finish env QUIET_MACHINE=1 tests/browser/run test_embedding.PrintedPages.test_on_a_quiet_machine_it_is_drawn_within_100_ms
+start tests/own_network.sh "${CARGO[@]}" --test containers on_a_quiet_machine
+finish tests/own_network.sh "${CARGO[@]}" --test containers on_a_quiet_machine
 rm "$logs/busy"
 [[ -n ${jobs[tests/swarm.sh]-} ]] || start tests/swarm.sh
 # The guide mostly unpacks packages with apt, while the Swarm test waits.

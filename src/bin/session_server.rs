@@ -26,6 +26,9 @@ struct Arguments {
 
 fn main() -> ExitCode {
     let arguments = Arguments::parse();
+    if arguments.options.schema {
+        return start::print_schema::<SessionConfig>();
+    }
     let loaded = start::read::<SessionConfig>(&arguments.config);
     if arguments.options.check {
         start::print(&loaded);

@@ -52,6 +52,9 @@ fn main() -> ExitCode {
         let remove = || arguments.containers.iter().for_each(sweep);
         return ExitCode::from(guardian::guard(arguments, remove));
     }
+    if arguments.options.schema {
+        return start::print_schema::<SimulationConfig>();
+    }
     let loaded = start::read::<SimulationConfig>(&arguments.config);
     if arguments.options.check {
         start::print(&loaded);

@@ -3,10 +3,11 @@
 use webots_fleet::simulation::container::ResourceOwner;
 
 use super::daemon::{
-    ask, containers, docker, dockerfile, of_service, refused, running, server, server_built, server_with,
+    self, alone, ask, containers, docker, dockerfile, of_service, refused, running, server, server_built, server_with,
 };
 use super::image::NAME;
-use crate::support::{Client, WORLD, arm, arm_at, is_told, until};
+use super::registry::Registry;
+use crate::support::{Client, WORLD, arm, arm_at, is_told, skip, until};
 
 #[actix_rt::test]
 async fn a_projects_dockerfile_is_built_once_for_all_clients() {
@@ -218,6 +219,90 @@ async fn an_image_that_is_too_large_is_told_and_removed() {
         .patiently("webots:")
         .await;
     assert_eq!(images(), 1);
+}
+
+#[actix_rt::test]
+async fn on_a_quiet_machine_of_several_builds_the_one_that_fills_the_disk_ends() {
+    let Some(_docker) = alone().await else { return };
+    let disk = nix::sys::statvfs::statvfs(daemon::folder().as_path()).unwrap();
+    let free = (disk.blocks_available() * disk.fragment_size()) >> 20;
+    if free < 5000 {
+        return skip("a disk with less than 5 GB of room");
+    }
+    // Nobody else may write as much meanwhile.
+    let server = server(2).set("diskReserve", free - 1000);
+    for (branch, line) in [
+        ("greedy", "RUN fallocate -l 1500M /file && sleep 60"),
+        ("modest", "RUN fallocate -l 20M /file && sleep 20"),
+    ] {
+        server
+            .forge()
+            .commit("lab/arm", branch, &[("Dockerfile", &dockerfile(line))]);
+    }
+    let server = server.start().await;
+    let mut modest = Client::start(&server, &arm_at("modest")).await;
+    modest.patiently("loading: Step 4/6").await;
+    let mut greedy = Client::start(&server, &arm_at("greedy")).await;
+    greedy.patiently("loading: Error:").await;
+    assert_eq!(greedy.reason()["code"], "image-too-large");
+    assert_eq!(greedy.closed().await, Some(1000));
+    assert_eq!(server.status().await["failedStarts"], 0);
+    modest.patiently("webots:").await;
+}
+
+#[actix_rt::test]
+async fn above_their_size_images_are_removed_that_were_not_used_for_longest() {
+    let Some(_docker) = docker().await else { return };
+    // A project is copied out of its image, and the home is made readable: less than 1 MiB.
+    let server = server(2).set("container", serde_json::json!({ "imagesSize": 50 }));
+    for branch in ["a", "b", "c"] {
+        let line = format!("RUN head -c 20M /dev/zero >/usr/local/{branch}");
+        server
+            .forge()
+            .commit("lab/arm", branch, &[("Dockerfile", &dockerfile(&line))]);
+    }
+    let server = server.start().await;
+    let owner = ResourceOwner::of(&server.cache());
+    let images = || {
+        let name = format!("webots-fleet/{}", owner.0);
+        let ids = ask(&["image", "ls", "--quiet", "--no-trunc", &name]);
+        ids.lines().map(str::to_owned).collect::<Vec<_>>()
+    };
+    // Of the first two the first is used again, and a container uses the last.
+    let mut seen = Vec::new();
+    for branch in ["a", "b", "a"] {
+        let mut client = Client::start(&server, &arm_at(branch)).await;
+        client.patiently("webots:").await;
+        seen.extend(images().into_iter().find(|id| !seen.contains(id)));
+        client.leave().await;
+        until("its container is gone", async || containers(&server).is_empty()).await;
+    }
+    assert_eq!(images().len(), 2, "two fit");
+    let mut last = Client::start(&server, &arm_at("c")).await;
+    last.patiently("webots:").await;
+    until("there are two again", async || images().len() == 2).await;
+    assert!(images().contains(&seen[0]) && !images().contains(&seen[1]), "{seen:?}");
+}
+
+#[actix_rt::test]
+async fn an_image_that_a_build_has_pulled_is_removed_too() {
+    let Some(_docker) = docker().await else { return };
+    let registry = Registry::start();
+    let base = format!("127.0.0.1:{}/base:1", registry.port);
+    let folder = tempfile::tempdir().unwrap();
+    let line = format!("FROM {base}\nRUN true\n");
+    let builder = server_with(&[("Dockerfile", &line)]).folder(folder.path());
+    let mut server = builder.start().await;
+    // The base is empty, so that its first step fails.
+    let (told, _) = refused(&server, &arm()).await;
+    assert!(told.contains("can't be built"), "{told}");
+    let is_there = || !ask(&["image", "ls", "--quiet", &base]).is_empty();
+    assert!(is_there());
+    server.stops().await;
+    drop(server);
+    let full = server_with(&[]).folder(folder.path()).set("diskReserve", 100_000_000);
+    let _server = full.start().await;
+    until("the base is gone", async || !is_there()).await;
 }
 
 #[actix_rt::test]

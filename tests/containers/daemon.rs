@@ -222,6 +222,11 @@ fn made(folder: &Path, arguments: &[&str]) {
     assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
 }
 
+/// The folder with its files.
+pub fn folder() -> PathBuf {
+    daemon().folder.clone()
+}
+
 /// The value of `DOCKER_HOST` for the daemon.
 pub fn host() -> String {
     daemon().socket()

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use serde_json::{Value, json};
 
 use super::daemon::{self, ask, containers, docker, of_service, running, server};
-use crate::support::{Client, WORLD, arm, instance_folders_in, is_told, until, world};
+use crate::support::{Client, SOON, WORLD, arm, instance_folders_in, is_told, until, world};
 
 /// Longest time until nothing of a simulation remains.
 const GONE: Duration = Duration::from_secs(10);
@@ -191,4 +191,21 @@ async fn more_simulations_run_than_docker_has_networks() {
         client.patiently("webots:").await;
     }
     assert_eq!(containers(&server).len(), usize::from(count));
+}
+
+#[actix_rt::test]
+async fn a_container_that_nobody_views_ends() {
+    let Some(_docker) = docker().await else { return };
+    let server = server(2).set("timing.arrival", 10).start().await;
+    let mut watched = Client::start(&server, &arm()).await;
+    let told = watched.patiently("webots:").await;
+    let url = told.trim_start_matches("webots:").replace("localhost", "127.0.0.1");
+    let _viewer = Client::connect(&format!("{url}/")).await;
+    let mut unseen = Client::start(&server, &arm()).await;
+    unseen.patiently("webots:").await;
+    unseen.within("loading: Error:", 2 * SOON).await;
+    assert_eq!(unseen.reason()["code"], "no-viewer");
+    // The other's time was over before.
+    until("one is left", async || server.simulations().await.len() == 1).await;
+    assert_eq!(server.simulations().await[0]["id"], watched.id());
 }

@@ -25,3 +25,4 @@ mod image;
 mod kinds;
 mod life;
 mod page;
+mod registry;

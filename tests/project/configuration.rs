@@ -70,13 +70,24 @@ impl Kind {
         part.split("\n## ").next().unwrap().to_owned()
     }
 
-    /// The rows of the page's tables: each key, and its documented default.
-    fn rows(&self) -> Vec<(String, String)> {
+    /// What `--schema` prints.
+    fn schema(&self) -> Value {
+        let output = Command::new(self.program).arg("--schema").output().unwrap();
+        assert!(output.status.success() && output.stderr.is_empty(), "{output:?}");
+        serde_json::from_slice(&output.stdout).unwrap()
+    }
+
+    /// The rows of the page's tables: each key, its documented kind of value, and its default.
+    fn rows(&self) -> Vec<(String, String, String)> {
         let page = self.page();
         let rows = page.lines().filter_map(|line| line.strip_prefix("| `"));
         rows.map(|row| {
             let cells: Vec<&str> = row.split(" | ").collect();
-            (cells[0].trim_end_matches('`').to_owned(), cells[2].to_owned())
+            (
+                cells[0].trim_end_matches('`').to_owned(),
+                cells[1].to_owned(),
+                cells[2].to_owned(),
+            )
         })
         .collect()
     }
@@ -127,14 +138,14 @@ fn the_page_names_every_key_once_with_its_default_and_no_other() {
     for kind in kinds() {
         let defaults = kind.defaults();
         let rows = kind.rows();
-        let mut named: Vec<&str> = rows.iter().map(|(key, _)| key.as_str()).collect();
+        let mut named: Vec<&str> = rows.iter().map(|(key, ..)| key.as_str()).collect();
         named.sort_unstable();
         let known: Vec<&str> = defaults.keys().map(String::as_str).collect();
         assert_eq!(named, known, "{}", kind.heading);
         for alias in kind.aliases {
             assert!(kind.page().contains(&format!("`{alias}`")), "{alias}");
         }
-        for (key, told) in &rows {
+        for (key, _, told) in &rows {
             let default = &defaults[key];
             if told == "required" {
                 let output = kind.check("{}");
@@ -143,17 +154,93 @@ fn the_page_names_every_key_once_with_its_default_and_no_other() {
                     output.status.code() == Some(2) && told.ends_with(&format!(" {key}: it is missing")),
                     "{told}"
                 );
-            } else if told == "none" {
-                let empty = [json!(null), json!([]), json!({})];
-                assert!(empty.contains(default), "{key}: the page says none, it is {default}");
             } else {
-                let value = serde_json::from_str(told.trim_matches('`'));
-                let value: Value = value.unwrap_or_else(|error| panic!("{key}: {told}: {error}"));
-                let same = match (value.as_f64(), default.as_f64()) {
-                    (Some(one), Some(other)) => one == other,
-                    _ => &value == default,
-                };
-                assert!(same, "{key}: the page says {told}, it is {default}");
+                assert_eq!(is_default(told, default), Ok(()), "{key}");
+            }
+        }
+    }
+}
+
+/// Whether the page tells this default.
+fn is_default(told: &str, default: &Value) -> Result<(), String> {
+    let is_told = if told == "none" {
+        [json!(null), json!([]), json!({})].contains(default)
+    } else {
+        let value: Value = serde_json::from_str(told.trim_matches('`')).map_err(|error| format!("{told}: {error}"))?;
+        match (value.as_f64(), default.as_f64()) {
+            (Some(one), Some(other)) => one == other,
+            _ => value == *default,
+        }
+    };
+    let problem = || format!("the page says {told}, it is {default}");
+    is_told.then_some(()).ok_or_else(problem)
+}
+
+/// The kinds of JSON values that a schema allows: `string`, `array`, ...
+fn types(schema: &Value) -> Vec<&str> {
+    let own = match &schema["type"] {
+        Value::String(one) => vec![one.as_str()],
+        Value::Array(many) => many.iter().filter_map(Value::as_str).collect(),
+        _ => Vec::new(),
+    };
+    let others = ["anyOf", "oneOf"].map(|way| schema[way].as_array().into_iter().flatten());
+    own.into_iter()
+        .chain(others.into_iter().flatten().flat_map(types))
+        .collect()
+}
+
+/// The smallest and the largest number that the page tells for a kind of value.
+fn bounds(told: &str) -> Option<(f64, f64)> {
+    if told == "seconds" {
+        return Some((0.01, 31_536_000.0));
+    }
+    let (least, most) = told.rsplit(", ").next()?.split_once(" to ")?;
+    Some((least.parse().ok()?, most.parse().ok()?))
+}
+
+#[test]
+fn the_schema_has_the_keys_kinds_and_defaults_of_the_page() {
+    for kind in kinds() {
+        let schema = kind.schema();
+        assert_eq!(schema["additionalProperties"], false);
+        let properties = schema["properties"].as_object().unwrap();
+        let is_own = |key: &str| key != "$schema" && !kind.aliases.contains(&key);
+        let mut keys = BTreeMap::new();
+        for (key, about) in properties.iter().filter(|(key, _)| is_own(key)) {
+            match about["properties"].as_object() {
+                Some(part) => keys.extend(part.iter().map(|(inner, about)| (format!("{key}.{inner}"), about))),
+                None => drop(keys.insert(key.clone(), about)),
+            }
+        }
+        let rows = kind.rows();
+        let mut named: Vec<&str> = rows.iter().map(|(key, ..)| key.as_str()).collect();
+        named.sort_unstable();
+        assert_eq!(named, keys.keys().map(String::as_str).collect::<Vec<_>>());
+        assert!(kind.aliases.iter().all(|alias| properties.contains_key(*alias)));
+        for (key, told, default) in &rows {
+            let about = keys[key];
+            if default == "required" {
+                assert_eq!(schema["required"], json!([key]));
+            } else {
+                assert_eq!(is_default(default, &about["default"]), Ok(()), "{key}");
+            }
+            let of_schema = about["minimum"].as_f64().zip(about["maximum"].as_f64());
+            assert_eq!(bounds(told), of_schema, "{key}: {told}: {about}");
+            let types = types(about);
+            let expected = match told.as_str() {
+                "true or false" => "boolean",
+                "URL prefixes and replacements" => "object",
+                _ if bounds(told).is_some() => *types.iter().find(|one| ["integer", "number"].contains(one)).unwrap(),
+                _ if told.starts_with("list") || told == "addresses and networks" => "array",
+                _ => "string",
+            };
+            assert!(types.contains(&expected), "{key}: {told}: {about}");
+            if told.contains(" or list") {
+                assert!(types.contains(&"array"), "{key}: {told}: {about}");
+            }
+            let choices = about["oneOf"].as_array().into_iter().flatten();
+            for choice in choices.map(|choice| choice["const"].to_string()) {
+                assert!(kind.page().contains(&choice), "{key}: the page does not name {choice}");
             }
         }
     }

@@ -1,27 +1,57 @@
 //! Mail addresses in the configuration.
 
-use lettre::message::Mailbox;
-use serde::{Deserialize, Deserializer};
+use std::borrow::Cow;
 
-/// Reads a mail address that may be absent, as `NAME@HOST` or `Some Name <NAME@HOST>`. An empty text counts as absent.
-///
-/// # Errors
-/// When the text is not a mail address, is several, or its address is not ASCII: other characters need SMTPUTF8, which
-/// few servers support.
-pub fn optional<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Mailbox>, D::Error> {
-    let Some(text) = Option::<String>::deserialize(deserializer)?.filter(|text| !text.is_empty()) else {
-        return Ok(None);
-    };
-    let is_plain = |mailbox: &Mailbox| AsRef::<str>::as_ref(&mailbox.email).is_ascii();
-    let mailbox = text
-        .parse()
-        .ok()
-        .filter(is_plain)
-        .filter(|_| !text.contains(char::is_control));
-    mailbox.map(Some).ok_or_else(|| {
-        let allowed = "allowed is one NAME@HOST in ASCII, or Some Name <NAME@HOST>";
-        serde::de::Error::custom(format!("{text:?} is no mail address; {allowed}"))
-    })
+use lettre::message::Mailbox;
+use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+
+/// A mail address that may be absent, as `NAME@HOST` or `Some Name <NAME@HOST>`. An empty text counts as absent.
+pub struct MailAddress;
+
+impl MailAddress {
+    /// Reads the address.
+    ///
+    /// # Errors
+    /// When the text is not a mail address, is several, or its address is not ASCII: other characters need SMTPUTF8, which
+    /// few servers support.
+    pub fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Mailbox>, D::Error> {
+        let Some(text) = Option::<String>::deserialize(deserializer)?.filter(|text| !text.is_empty()) else {
+            return Ok(None);
+        };
+        let is_plain = |mailbox: &Mailbox| AsRef::<str>::as_ref(&mailbox.email).is_ascii();
+        let mailbox = text
+            .parse()
+            .ok()
+            .filter(is_plain)
+            .filter(|_| !text.contains(char::is_control));
+        mailbox.map(Some).ok_or_else(|| {
+            let allowed = "allowed is one NAME@HOST in ASCII, or Some Name <NAME@HOST>";
+            serde::de::Error::custom(format!("{text:?} is no mail address; {allowed}"))
+        })
+    }
+
+    /// Writes the address.
+    ///
+    /// # Errors
+    /// When the output fails.
+    pub fn serialize<T: Serialize, S: Serializer>(address: &T, serializer: S) -> Result<S::Ok, S::Error> {
+        address.serialize(serializer)
+    }
+}
+
+impl JsonSchema for MailAddress {
+    fn inline_schema() -> bool {
+        true
+    }
+
+    fn schema_name() -> Cow<'static, str> {
+        "MailAddress".into()
+    }
+
+    fn json_schema(_: &mut SchemaGenerator) -> Schema {
+        json_schema!({"type": ["string", "null"]})
+    }
 }
 
 #[cfg(test)]
@@ -29,7 +59,7 @@ mod tests {
     use super::*;
 
     fn read(text: &str) -> Result<Option<Mailbox>, serde_json::Error> {
-        optional(serde_json::Value::from(text))
+        MailAddress::deserialize(serde_json::Value::from(text))
     }
 
     #[test]

@@ -5,32 +5,34 @@ use std::time::Duration;
 
 use actix_web::http::header::HeaderName;
 use lettre::message::Mailbox;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::mail_address;
+use super::mail_address::MailAddress;
 use super::server_entry::ServerEntry;
 use super::timing::Timing;
 use crate::session::placement::PlacementPolicy;
 use crate::shared::config::keys::keys;
 use crate::shared::config::{
-    ApiToken, Configuration, ExpandedPath, Secret, check_api_tokens, check_fleet_key, expanded, is_web_url,
-    one_or_many, optional_whole, percent, require, seconds, whole,
+    ApiToken, Configuration, Expanded, ExpandedPath, OneOrMany, OptionalWhole, Percent, Seconds, Secret, Whole,
+    check_api_tokens, check_fleet_key, is_web_url, require,
 };
 use crate::shared::domain::{PublicAddress, PublicUrl, ReadyEntry, complete_host};
 use crate::shared::http::{Origin, TrustedProxies};
 
 keys! {
 /// Every key of the session server. The original's keys keep their meaning.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "camelCase", default)]
 pub struct SessionConfig {
     /// Fully qualified domain name of the session server. Default: `localhost`, with a warning.
-    #[serde(deserialize_with = "expanded")]
+    #[serde(with = "Expanded")]
+    #[schemars(extend("default" = "localhost"))]
     pub server: String = String::new(),
     /// Whether URLs begin with `https` and `wss`. Default: true.
     pub ssl: bool = true,
     /// Local port; 0 takes any free one. Default: 1999.
-    #[serde(deserialize_with = "whole::<0, 65535, _, _>")]
+    #[serde(with = "Whole::<0, 65535>")]
     pub port: u16 = 1999,
     /// Local address to listen on. Default: `::`, all addresses of IPv4 and IPv6.
     pub bind: IpAddr = Ipv6Addr::UNSPECIFIED.into(),
@@ -45,17 +47,17 @@ pub struct SessionConfig {
     /// Those of `simulationServers` that get no new clients. They are still monitored. Default: none.
     pub drained_servers: Vec<PublicAddress> = Vec::new(),
     /// Mail address of the administrator, who gets notifications. Default: none, and no mail is sent.
-    #[serde(deserialize_with = "mail_address::optional")]
+    #[serde(with = "MailAddress")]
     pub administrator: Option<Mailbox> = None,
     /// Host of the SMTP server. Default: none, and no mail is sent.
     pub mail_server: Option<String> = None,
     /// SMTP port. Default: 25, with a password 587.
-    #[serde(deserialize_with = "optional_whole::<1, 65535, _, _>")]
+    #[serde(with = "OptionalWhole::<1, 65535>")]
     pub mail_server_port: Option<u16> = None,
     /// Whether the SMTP server encrypts from the first byte, without STARTTLS. Default: true for port 465, else false.
     pub mail_server_implicit_tls: Option<bool> = None,
     /// Mail address that notifications come from. Default: none, and no mail is sent.
-    #[serde(deserialize_with = "mail_address::optional")]
+    #[serde(with = "MailAddress")]
     pub mail_sender: Option<Mailbox> = None,
     /// User name for SMTP. Default: `mailSender`.
     pub mail_sender_user: Option<String> = None,
@@ -66,7 +68,7 @@ pub struct SessionConfig {
     /// Password for actions such as `/announcement`. Default: none, and actions are off.
     pub admin_password: Option<Secret> = None,
     /// Tokens of programs, each with what it may do. Default: none.
-    #[serde(deserialize_with = "one_or_many")]
+    #[serde(with = "OneOrMany::<ApiToken>")]
     pub api_tokens: Vec<ApiToken> = Vec::new(),
     /// Secret of at least 16 letters that all servers of a fleet share: it signs the passes and tickets of the line.
     /// Default: none, and a free slot is for the first client that comes.
@@ -82,36 +84,36 @@ pub struct SessionConfig {
     pub debug: bool = false,
     /// A simulation server with this load (percent) or more gets no client. Above 100, the load does not matter.
     /// Default: 95.
-    #[serde(deserialize_with = "percent::<1000, _>")]
+    #[serde(with = "Percent::<1000>")]
     pub load_threshold: f64 = PlacementPolicy::default().threshold,
     /// Interval between two probes of a simulation server, in seconds. Default: 1.
-    #[serde(with = "seconds")]
+    #[serde(with = "Seconds")]
     pub load_refresh: Duration = Duration::from_secs(1),
     /// Load (percent) that a client adds to a simulation server that reports only its load. For the others it is
     /// learned, starting from this. Default: 2.
-    #[serde(deserialize_with = "percent::<100, _>")]
+    #[serde(with = "Percent::<100>")]
     pub client_cost: f64 = PlacementPolicy::default().client_cost,
     /// Limit of open client `WebSockets` in all. Default: 20000.
-    #[serde(deserialize_with = "whole::<1, 1_000_000, _, _>")]
+    #[serde(with = "Whole::<1, 1_000_000>")]
     pub max_clients: usize = 20_000,
     /// Limit of open client `WebSockets` per client address. Default: three quarters of `maxClients`, but at most 1000,
     /// because a class shares one address.
-    #[serde(deserialize_with = "optional_whole::<1, 1_000_000, _, _>")]
+    #[serde(with = "OptionalWhole::<1, 1_000_000>")]
     pub max_clients_per_address: Option<usize> = None,
     /// Reverse proxies, as addresses or networks, whose header `X-Forwarded-For` is trusted.
     /// Default: `["127.0.0.0/8", "::1/128"]`.
     pub trusted_proxies: TrustedProxies = TrustedProxies::default(),
     /// Worlds that the page `/viewer` offers: `{"title": ..., "url": ...}`. Default: none.
-    #[serde(deserialize_with = "one_or_many")]
+    #[serde(with = "OneOrMany::<Example>")]
     pub examples: Vec<Example> = Vec::new(),
     /// Worlds of which the fleet keeps simulations ready: `{"world": ..., "count": ..., "when": ...}`; needs `fleetKey`.
     /// Default: none.
-    #[serde(deserialize_with = "one_or_many")]
+    #[serde(with = "OneOrMany::<ReadyEntry>")]
     pub ready: Vec<ReadyEntry> = Vec::new(),
     /// URL of Webots' own viewer (`WebotsView.js`), for simulation servers that don't have it. Default: none.
     pub viewer_script: Option<url::Url> = None,
     /// Origins of web pages, such as `https://lab.org`, that may show `/viewer?embed=1` in a frame. Default: none.
-    #[serde(deserialize_with = "one_or_many")]
+    #[serde(with = "OneOrMany::<Origin>")]
     pub frame_ancestors: Vec<Origin> = Vec::new(),
     /// All other durations.
     pub timing: Timing = Timing::default(),
@@ -119,7 +121,7 @@ pub struct SessionConfig {
 }
 
 /// The key `askName`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum AskName {
     /// A visitor may give a name.
@@ -129,7 +131,7 @@ pub enum AskName {
 }
 
 /// An example on the page `/viewer`.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Example {
     /// Its title.

@@ -6,13 +6,16 @@
 use std::io;
 use std::path::Path;
 
+use schemars::JsonSchema;
+use schemars::generate::SchemaSettings;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
+use serde_json::{Value, json};
 
 use crate::shared::text::one_line;
 
 /// A server's configuration.
-pub trait Configuration: DeserializeOwned + Serialize {
+pub trait Configuration: DeserializeOwned + Serialize + JsonSchema {
     /// Aliases of keys.
     const ALIASES: &'static [&'static str] = &[];
     /// Keys that the file must contain.
@@ -81,6 +84,27 @@ pub fn load<C: Configuration>(file: &Path) -> Result<LoadedConfig<C>, String> {
         warnings: parsed.warnings.into_iter().map(of_file).collect(),
         unknown: parsed.unknown.into_iter().map(of_file).collect(),
     })
+}
+
+/// The JSON schema of a configuration file, for editors: its keys with their kinds of values, defaults and meanings. The
+/// rules between values are not in it.
+pub fn schema<C: Configuration>() -> Value {
+    let settings = SchemaSettings::draft07().with(|settings| settings.inline_subschemas = true);
+    let mut schema = settings.into_generator().into_root_schema_for::<C>();
+    let properties = schema.ensure_object().entry("properties").or_insert_with(|| json!({}));
+    if let Value::Object(keys) = properties {
+        keys.insert(
+            SCHEMA.to_owned(),
+            json!({"type": "string", "description": "The schema of this file, for editors."}),
+        );
+        for alias in C::ALIASES {
+            keys.insert((*alias).to_owned(), json!({"description": "Another name of a key."}));
+        }
+    }
+    schema.insert("required".to_owned(), json!(C::REQUIRED));
+    // An unknown key is probably mistyped.
+    schema.insert("additionalProperties".to_owned(), json!(false));
+    schema.to_value()
 }
 
 /// Reads a regular file. A FIFO would block until another process writes to it, and a device may never end.
@@ -153,7 +177,7 @@ fn alike<'a>(key: &str, known: &[&'a str]) -> Option<&'a str> {
 mod tests {
     use super::*;
 
-    #[derive(serde::Deserialize, Serialize)]
+    #[derive(serde::Deserialize, Serialize, JsonSchema)]
     #[serde(rename_all = "camelCase")]
     struct Small {
         load_refresh: f64,

@@ -9,9 +9,9 @@ mod value;
 
 pub use api_token::{ApiToken, Permission, check_api_tokens};
 pub use fleet_key::check_fleet_key;
-pub use loading::{Configuration, LoadedConfig, load, require};
+pub use loading::{Configuration, LoadedConfig, load, require, schema};
 pub use secret::Secret;
 pub use value::{
-    ExpandedPath, expand, expanded, is_web_url, minutes, one_or_many, optional_whole, percent, seconds,
-    seconds_or_zero, sentence, whole,
+    Expanded, ExpandedPath, Minutes, OneOrMany, OptionalWhole, Percent, Seconds, SecondsOrZero, Sentence, Whole,
+    expand, is_web_url,
 };

@@ -3,20 +3,21 @@
 use std::fmt;
 use std::path::{Path, PathBuf};
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize, Serializer};
 
 use super::loading::read_file;
 use super::value::ExpandedPath;
 
 /// A text that is never printed or logged; output shows `********`. The configuration contains it, or names its file.
-#[derive(Clone, Deserialize)]
+#[derive(Clone, Deserialize, JsonSchema)]
 #[serde(try_from = "WireSecret")]
 pub struct Secret {
     text: String,
     file: Option<PathBuf>,
 }
 
-#[derive(Deserialize)]
+#[derive(Deserialize, JsonSchema)]
 #[serde(
     untagged,
     deny_unknown_fields,

@@ -6,13 +6,14 @@ use std::num::NonZeroU16;
 use std::str::FromStr;
 use std::sync::Arc;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// A server's public address.
 ///
 /// With port rewrite (a reverse proxy on port 443 forwards `https://HOST/PORT/...` to that local port) the port is the
 /// first segment of the path: `HOST/PORT`. Without port rewrite, the address is `HOST:PORT`.
-#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize, JsonSchema)]
 #[serde(try_from = "String", into = "String")]
 pub struct PublicAddress {
     /// Shared, because addresses are used as keys and are cloned often.

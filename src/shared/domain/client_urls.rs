@@ -1,5 +1,6 @@
 //! The URLs under which clients reach the servers of a fleet. Pure.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::address::PublicAddress;
@@ -7,7 +8,7 @@ use crate::shared::config::expand;
 
 /// The WebSocket URL of servers behind one reverse proxy, with placeholders: `wss://DOOR/{host}/{port}`. `$VARIABLE` is
 /// expanded in it.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(try_from = "String", into = "String")]
 pub struct PublicUrl {
     /// The WebSocket URL of the reverse proxy, without a slash at its end.

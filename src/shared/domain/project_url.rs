@@ -4,6 +4,7 @@ use std::fmt;
 use std::path::Path;
 
 use percent_encoding::percent_decode_str;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use url::Url;
 
@@ -11,8 +12,9 @@ use url::Url;
 ///
 /// The reference may contain slashes (`feature/arm`), so the URL alone does not show where it ends;
 /// [`ProjectUrl::candidates`] returns the possible readings, and the repository's branches and tags decide.
-#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize, JsonSchema)]
 #[serde(try_from = "String", into = "String")]
+#[schemars(with = "String")]
 pub struct ProjectUrl {
     host: String,
     /// The path segments that name the repository, percent-decoded, as are the other segments.

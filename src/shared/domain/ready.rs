@@ -8,15 +8,17 @@ use std::str::FromStr;
 use jiff::civil::{Date, DateTime, Time, Weekday};
 use jiff::tz::TimeZone;
 use jiff::{Timestamp, ToSpan};
+use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 use serde_json::Value;
 
 use super::project_url::ProjectUrl;
-use crate::shared::config::{one_or_many, whole};
+use crate::shared::config::{OneOrMany, Whole};
 
 /// How a simulation is shown: Webots is started for one of them.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
+#[schemars(with = "String")]
 pub enum View {
     /// A 3D scene that the browser renders, in both spellings of the protocol.
     #[default]
@@ -27,16 +29,16 @@ pub enum View {
 }
 
 /// A world to keep ready, as an entry of the key `ready`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "camelCase", deny_unknown_fields)]
 pub struct ReadyEntry {
     /// The world.
     pub world: ProjectUrl,
     /// Number of simulations that are kept ready; 0: only its repository stays in the cache.
-    #[serde(deserialize_with = "whole::<0, 10_000, _, _>")]
+    #[serde(with = "Whole::<0, 10_000>")]
     pub count: u32,
     /// When: `always`, or times of the week. Default: always.
-    #[serde(default = "always", deserialize_with = "one_or_many")]
+    #[serde(default = "always", with = "OneOrMany::<When>")]
     pub when: Vec<When>,
     /// The time zone of `when`, `from` and `until`, such as `Europe/Zurich`. Default: that of the machine.
     #[serde(default)]
@@ -84,8 +86,9 @@ impl ReadyEntry {
 }
 
 /// One of the times of an entry, as text.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(try_from = "String", into = "String")]
+#[schemars(with = "String")]
 pub struct When(WhenKind);
 
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -179,8 +182,9 @@ impl From<When> for String {
 }
 
 /// A time zone, by its name.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(try_from = "String", into = "String")]
+#[schemars(with = "String")]
 pub struct Zone {
     name: String,
     zone: TimeZone,
@@ -206,8 +210,9 @@ impl From<Zone> for String {
 }
 
 /// A date, or a date and time, as text.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(try_from = "String", into = "String")]
+#[schemars(with = "String")]
 pub struct Moment {
     text: String,
     kind: MomentKind,

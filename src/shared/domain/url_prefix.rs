@@ -1,5 +1,6 @@
 //! Lists of repositories that a server allows or blocks.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::project_url::{ProjectUrl, ProjectUrlError, plain_repository, split_repository, split_url};
@@ -7,7 +8,7 @@ use super::project_url::{ProjectUrl, ProjectUrlError, plain_repository, split_re
 /// A URL prefix of whole path segments: a host, an owner or a repository. `https://github.com/lab` covers
 /// `https://github.com/lab/x`, but not `https://github.com/lab-evil/x` (the original compares characters, and accepts
 /// it).
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(try_from = "String", into = "String")]
 pub struct UrlPrefix {
     text: String,

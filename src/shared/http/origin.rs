@@ -1,10 +1,11 @@
 //! Origins of web pages, as browsers send them (RFC 6454, section 6.1). Pure.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use url::Url;
 
 /// Scheme, host and port of web pages, such as `https://lab.org`.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(try_from = "String")]
 pub struct Origin(pub String);
 

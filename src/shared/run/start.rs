@@ -24,6 +24,9 @@ pub struct CommonArgs {
     /// Print the effective configuration, and on the simulation server what the machine lacks, and end
     #[arg(long)]
     pub check: bool,
+    /// Print the JSON schema of configuration files, by which editors complete and check them, and end
+    #[arg(long)]
+    pub schema: bool,
     /// Write the process id to this file, and keep the file locked while the server runs
     #[arg(long, value_name = "FILE")]
     pub pid_file: Option<PathBuf>,
@@ -45,6 +48,13 @@ pub fn print<C: Configuration>(loaded: &LoadedConfig<C>) {
     let text = serde_json::to_string_pretty(&loaded.config).unwrap_or_else(|error| refuse(&error.to_string()));
     // The reader may have closed the pipe.
     writeln!(io::stdout(), "{text}").ok();
+}
+
+/// Prints the JSON schema of a configuration to standard output.
+pub fn print_schema<C: Configuration>() -> ExitCode {
+    // The reader may have closed the pipe.
+    writeln!(io::stdout(), "{:#}", config::schema::<C>()).ok();
+    ExitCode::SUCCESS
 }
 
 /// Prints the warnings about a configuration to the error output. Returns the exit code of `--check`: an unknown key is

@@ -31,7 +31,6 @@ pub struct CheckoutService {
     runtime: Handle,
     /// Limits the number of projects that are copied at a time.
     copies: Semaphore,
-    _keeps_within_budget: AbortOnDropHandle<()>,
 }
 
 /// Keeps a repository in the cache until this is dropped.
@@ -58,17 +57,15 @@ impl CheckoutService {
     /// When the cache can't be created.
     pub fn open(dir: CacheDir, run: &Path, config: Arc<SimulationConfig>, rules: AdmissionRules) -> io::Result<Self> {
         let git = Arc::new(Git::new(run, Arc::clone(&config)));
-        let cache = Arc::new(RepositoryCache::open(dir, git)?);
-        let resolver = Arc::new(CommitResolver::new(Arc::clone(&cache), Arc::clone(&config), rules));
+        let cache = RepositoryCache::open(dir, git)?;
+        let resolver = Arc::new(CommitResolver::new(cache, Arc::clone(&config), rules));
         let runtime = Handle::current();
         let copies = Semaphore::new(COPIES);
-        let keeper = AbortOnDropHandle::new(runtime.spawn(cache.keep_within_budget()));
         Ok(Self {
             resolver,
             config,
             runtime,
             copies,
-            _keeps_within_budget: keeper,
         })
     }
 

@@ -6,12 +6,12 @@
 use std::ffi::OsStr;
 use std::io;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
+use std::sync::{Arc, mpsc};
 
 use parking_lot::Mutex;
 use rustix::process::Resource;
-use tokio::sync::{Notify, Semaphore, watch};
+use tokio::sync::{Semaphore, watch};
 
 use super::disk::{has_unfinished_pack, remove_leftovers, spawn_blocking_io};
 use super::git::{Git, GitError, GitExit, LITTLE_MEMORY, stall_timeout};
@@ -34,7 +34,7 @@ pub struct Repository {
     /// The number of its generation: another one after it was replaced or discarded.
     generation: AtomicU64,
     /// Notified on drop if the repository has grown.
-    growth: Arc<Notify>,
+    growth: mpsc::Sender<()>,
     /// Held by the task that changes the repository.
     lock: Arc<tokio::sync::Mutex<()>>,
     /// Limits concurrent queries of the remote: a class may request many worlds of one repository at once.
@@ -81,7 +81,7 @@ const MAX_QUERIES: usize = 4;
 
 impl Repository {
     /// The repository at `path`, which need not exist yet, for commits of `remote`.
-    pub fn new(path: PathBuf, remote: Remote, git: Arc<Git>, growth: Arc<Notify>) -> Self {
+    pub fn new(path: PathBuf, remote: Remote, git: Arc<Git>, growth: mpsc::Sender<()>) -> Self {
         Self {
             path,
             remote: Mutex::new(remote),
@@ -427,7 +427,8 @@ impl std::fmt::Debug for Repository {
 impl Drop for Repository {
     fn drop(&mut self) {
         if *self.has_grown.get_mut() {
-            self.growth.notify_one();
+            // The cache may be gone.
+            self.growth.send(()).ok();
         }
     }
 }

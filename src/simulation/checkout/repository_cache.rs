@@ -6,11 +6,11 @@ use std::collections::HashMap;
 use std::fs::File;
 use std::io;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Weak};
+use std::sync::{Arc, Weak, mpsc};
 use std::time::{Duration, Instant, SystemTime};
 
 use sha2::{Digest, Sha256};
-use tokio::sync::{Mutex, Notify};
+use tokio::sync::Mutex;
 
 use super::disk::{spawn_blocking_io, sum};
 use super::git::Git;
@@ -32,7 +32,7 @@ pub struct RepositoryCache {
     /// The repositories in use.
     in_use: Mutex<HashMap<PathBuf, Weak<Repository>>>,
     /// Signals that a repository has grown, and is no longer in use.
-    growth: Arc<Notify>,
+    growth: mpsc::Sender<()>,
     _dir: CacheDir,
 }
 
@@ -72,20 +72,25 @@ impl CacheDir {
 }
 
 impl RepositoryCache {
-    /// Opens the cache in `dir`.
+    /// Opens the cache in `dir`, and starts the thread that keeps it within its budget.
     ///
     /// # Errors
-    /// When its directory can't be created.
-    pub fn open(dir: CacheDir, git: Arc<Git>) -> io::Result<Self> {
+    /// When its directory can't be created, or there is no thread.
+    pub fn open(dir: CacheDir, git: Arc<Git>) -> io::Result<Arc<Self>> {
         let folder = dir.folder.join("git");
         std::fs::create_dir_all(&folder)?;
-        Ok(Self {
+        let (growth, grown) = mpsc::channel();
+        let cache = Arc::new(Self {
             folder,
             git,
             in_use: Mutex::default(),
-            growth: Arc::default(),
+            growth,
             _dir: dir,
-        })
+        });
+        let kept = Arc::downgrade(&cache);
+        let keep = move || keep_within_budget(&kept, &grown);
+        std::thread::Builder::new().name("cache".to_owned()).spawn(keep)?;
+        Ok(cache)
     }
 
     /// The repository with this content of `remote`. It is in use until the returned value is dropped.
@@ -100,7 +105,7 @@ impl RepositoryCache {
             let known = in_use.get(&path).and_then(Weak::upgrade);
             let repository = known.unwrap_or_else(|| {
                 let git = Arc::clone(&self.git);
-                let growth = Arc::clone(&self.growth);
+                let growth = self.growth.clone();
                 Arc::new(Repository::new(path.clone(), remote.clone(), git, growth))
             });
             in_use.insert(path.clone(), Arc::downgrade(&repository));
@@ -118,15 +123,6 @@ impl RepositoryCache {
         })
         .await?;
         Ok(repository)
-    }
-
-    /// Keeps the cache within its budget. Never returns.
-    pub async fn keep_within_budget(self: Arc<Self>) {
-        loop {
-            let this = Arc::clone(&self);
-            actix_rt::task::spawn_blocking(move || this.shrink()).await.ok();
-            self.growth.notified().await;
-        }
     }
 
     /// Evicts unused repositories until the others fit into the budget. Blocks.
@@ -165,6 +161,19 @@ impl RepositoryCache {
                 Err(error) => log::warn!("{} can't be removed: {error}", path.display()),
             }
         }
+    }
+}
+
+/// Keeps a cache within its budget until it is dropped. Repositories in use keep the channel open, too.
+fn keep_within_budget(cache: &Weak<RepositoryCache>, growth: &mpsc::Receiver<()>) {
+    while let Some(kept) = cache.upgrade() {
+        kept.shrink();
+        drop(kept);
+        if growth.recv().is_err() {
+            return;
+        }
+        // One look is enough for all that have grown meanwhile.
+        while growth.try_recv().is_ok() {}
     }
 }
 

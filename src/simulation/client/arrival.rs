@@ -5,7 +5,6 @@
 
 use actix::prelude::*;
 use actix_rt::task::spawn_blocking;
-use nix::unistd::getpid;
 
 use super::session::{Arrival, Client, Ready, Session, State};
 use crate::simulation::ends::StopReason;
@@ -67,26 +66,15 @@ impl Session {
         let port = ready.port;
         let containers = self.server.containers.clone();
         let seen = async move {
-            let processes = match containers {
-                None => vec![getpid().as_raw()],
-                Some(containers) => containers.processes_of(port).await,
-            };
-            let is_viewed = move || {
-                let seen: Vec<bool> = processes
-                    .into_iter()
-                    .filter_map(|process| has_connection(process, port))
-                    .collect();
-                // What can't be seen is no reason to end a simulation.
-                seen.is_empty() || seen.contains(&true)
-            };
-            spawn_blocking(is_viewed).await.unwrap_or(true)
-        };
-        let check = seen.into_actor(self).map(|is_viewed, this, ctx| {
-            if is_viewed {
-                this.settle_arrival(ctx);
-            } else {
-                this.end_unviewed(ctx);
+            match containers {
+                Some(containers) => containers.has_connection(port).await,
+                None => spawn_blocking(move || has_connection(port)).await.ok().flatten(),
             }
+        };
+        let check = seen.into_actor(self).map(|is_viewed, this, ctx| match is_viewed {
+            Some(false) => this.end_unviewed(ctx),
+            // What is not known is no reason to end a simulation.
+            Some(true) | None => this.settle_arrival(ctx),
         });
         ctx.spawn(check);
     }

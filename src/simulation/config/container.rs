@@ -1,13 +1,14 @@
 //! The key `container`: how simulations run in containers.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::shared::config::keys::keys;
-use crate::shared::config::{one_or_many, whole};
+use crate::shared::config::{OneOrMany, Whole};
 
 keys! {
 /// How simulations run in containers.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "camelCase", default, deny_unknown_fields)]
 pub struct ContainerSettings {
     /// The image of Webots for a world whose project has no Dockerfile. `{version}` is that of the world, such as R2023b,
@@ -28,25 +29,28 @@ pub struct ContainerSettings {
     /// Whether programs may gain privileges, as `sudo` does. Default: false.
     pub new_privileges: bool = false,
     /// Linux capabilities that containers keep, such as `SYS_PTRACE`. Default: none.
-    #[serde(deserialize_with = "one_or_many")]
+    #[serde(with = "OneOrMany::<String>")]
     pub capabilities: Vec<String> = Vec::new(),
     /// Directories of the machine that are mounted in containers, as `FOLDER:PATH` or `FOLDER:PATH:ro`. Default: none.
-    #[serde(deserialize_with = "one_or_many")]
+    #[serde(with = "OneOrMany::<String>")]
     pub mounts: Vec<String> = Vec::new(),
     /// Images that are built or pulled at a time; for one address one less, if there are several. Default: 3.
-    #[serde(deserialize_with = "whole::<1, 1000, _, _>")]
+    #[serde(with = "Whole::<1, 1000>")]
     pub builds: usize = 3,
     /// Maximum size of a project's image with the image that it begins with, in MiB. Default: 16384.
-    #[serde(deserialize_with = "whole::<1, 100_000_000, _, _>")]
+    #[serde(with = "Whole::<1, 100_000_000>")]
     pub image_size: u64 = 16_384,
+    /// Maximum size of all images that this server has built or pulled, in MiB. Default: 65536.
+    #[serde(with = "Whole::<1, 100_000_000>")]
+    pub images_size: u64 = 65_536,
     /// Days after which an image that this server has built is removed, unless a container uses it. Default: 14.
-    #[serde(deserialize_with = "whole::<1, 10_000, _, _>")]
+    #[serde(with = "Whole::<1, 10_000>")]
     pub images_age: u64 = 14,
 }
 }
 
 /// The display of Webots in its container.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum ContainerDisplay {
     /// A virtual display.
@@ -57,7 +61,7 @@ pub enum ContainerDisplay {
 }
 
 /// The network that containers reach.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum ContainerNetwork {
     /// The internet, without private addresses and the machine itself.

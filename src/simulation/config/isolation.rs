@@ -3,15 +3,16 @@
 use std::fmt;
 use std::path::Path;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::shared::config::{ExpandedPath, one_or_many};
+use crate::shared::config::{ExpandedPath, OneOrMany};
 
 /// Paths that each sandbox mounts itself.
 const OF_EACH: [&str; 3] = ["/", "/proc", "/dev"];
 
 /// The key `isolation`: the isolation level of simulations.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum IsolationSetting {
     /// As the server's own user, in a process group, without isolation.
@@ -32,7 +33,7 @@ impl fmt::Display for IsolationSetting {
 }
 
 /// The key `sandbox.network`: which network the programs in a sandbox have.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum SandboxNetwork {
     /// A separate one for each simulation; the server does not start without it.
@@ -54,14 +55,14 @@ impl SandboxNetwork {
 }
 
 /// The key `sandbox`: what a sandbox has besides the system and Webots.
-#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct SandboxFolders {
     /// Files and directories that are readable. Default: none.
-    #[serde(deserialize_with = "one_or_many")]
+    #[serde(with = "OneOrMany::<ExpandedPath>")]
     pub readable: Vec<ExpandedPath>,
     /// Files and directories that are also writable. Default: none.
-    #[serde(deserialize_with = "one_or_many")]
+    #[serde(with = "OneOrMany::<ExpandedPath>")]
     pub writable: Vec<ExpandedPath>,
     /// Which network it has. Default: auto.
     pub network: SandboxNetwork,
@@ -102,7 +103,7 @@ impl SandboxFolders {
 }
 
 /// The name of an environment variable, or the prefix of such names, ended by `*`.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(try_from = "String")]
 pub struct VariableName(String);
 

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use actix_web::http::header::HeaderName;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::container::{ContainerDisplay, ContainerSettings, EDITOR_PORT};
@@ -15,8 +16,8 @@ use super::timing::Timing;
 use super::urls::Streaming;
 use crate::shared::config::keys::keys;
 use crate::shared::config::{
-    ApiToken, Configuration, ExpandedPath, Secret, check_api_tokens, check_fleet_key, expanded, minutes, one_or_many,
-    optional_whole, percent, require, seconds, sentence, whole,
+    ApiToken, Configuration, Expanded, ExpandedPath, Minutes, OneOrMany, OptionalWhole, Percent, Seconds, Secret,
+    Sentence, Whole, check_api_tokens, check_fleet_key, require,
 };
 use crate::shared::domain::{PublicUrl, ReadyEntry, UrlPrefix, complete_host};
 use crate::shared::http::{Origin, TrustedProxies};
@@ -24,16 +25,17 @@ use crate::simulation::machine::display;
 
 keys! {
 /// Every key of the simulation server. The original's keys keep their meaning.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "camelCase", default)]
 pub struct SimulationConfig {
     /// Fully qualified domain name of the simulation server. Default: `localhost`, with a warning.
-    #[serde(alias = "fullyQualifiedDomainName", deserialize_with = "expanded")]
+    #[serde(alias = "fullyQualifiedDomainName", with = "Expanded")]
+    #[schemars(extend("default" = "localhost"))]
     pub server: String = String::new(),
     /// Whether URLs begin with `https` and `wss`. Default: true.
     pub ssl: bool = true,
     /// Local port. Webots uses the ports that follow it. Default: 2000.
-    #[serde(deserialize_with = "whole::<1, 65000, _, _>")]
+    #[serde(with = "Whole::<1, 65000>")]
     pub port: u16 = 2000,
     /// Local address to listen on. Default: `::`, all addresses of IPv4 and IPv6.
     pub bind: IpAddr = Ipv6Addr::UNSPECIFIED.into(),
@@ -65,46 +67,46 @@ pub struct SimulationConfig {
     /// How simulations run in containers.
     pub container: ContainerSettings = ContainerSettings::default(),
     /// Environment variables that simulations get besides those that Webots needs. Default: none.
-    #[serde(deserialize_with = "one_or_many")]
+    #[serde(with = "OneOrMany::<VariableName>")]
     pub environment: Vec<VariableName> = Vec::new(),
     /// The resource limits of one simulation.
     pub limits: ResourceLimits = ResourceLimits::default(),
     /// Run Webots in containers: the original's key for `isolation: "container"`. Default: false.
     pub docker: bool = false,
     /// A key of the original, without effect: only images that this server has built are ever removed.
-    #[serde(alias = "persistentDockerImages", deserialize_with = "one_or_many")]
+    #[serde(alias = "persistentDockerImages", with = "OneOrMany::<String>")]
     pub persistant_docker_images: Vec<String> = Vec::new(),
     /// Repositories whose worlds may run, as URL prefixes of whole path segments. Default: none.
-    #[serde(deserialize_with = "one_or_many")]
+    #[serde(with = "OneOrMany::<UrlPrefix>")]
     pub allowed_repositories: Vec<UrlPrefix> = Vec::new(),
     /// Repositories whose worlds never run, as URL prefixes. Default: none.
-    #[serde(deserialize_with = "one_or_many")]
+    #[serde(with = "OneOrMany::<UrlPrefix>")]
     pub blocked_repositories: Vec<UrlPrefix> = Vec::new(),
     /// With docker, worlds of other repositories run while the load (percent) is at most this; 0: never. Default: 50.
-    #[serde(deserialize_with = "percent::<100, _>")]
+    #[serde(with = "Percent::<100>")]
     pub share_idle_time: f64 = 50.0,
     /// URLs to which the server announces itself when it starts. Default: none.
-    #[serde(deserialize_with = "one_or_many")]
+    #[serde(with = "OneOrMany::<url::Url>")]
     pub notify: Vec<url::Url> = Vec::new(),
     /// Number of slots: simulations that may run at a time. Webots uses port+1 .. port+maxConnections. Default: 100.
-    #[serde(deserialize_with = "whole::<1, 10_000, _, _>")]
+    #[serde(with = "Whole::<1, 10_000>")]
     pub max_connections: u16 = 100,
     /// Limit of clients that wait for a slot. Default: 100.
-    #[serde(deserialize_with = "whole::<0, 100_000, _, _>")]
+    #[serde(with = "Whole::<0, 100_000>")]
     pub waiting_line: usize = 100,
     /// Limit of open client `WebSockets` in all, with or without a simulation. Default: 1000.
-    #[serde(deserialize_with = "whole::<1, 1_000_000, _, _>")]
+    #[serde(with = "Whole::<1, 1_000_000>")]
     pub max_clients: usize = 1000,
     /// Limit of open client `WebSockets` per client address. Default: three quarters of `maxClients`, but at most 1000,
     /// because a class sits behind one address.
-    #[serde(deserialize_with = "optional_whole::<1, 1_000_000, _, _>")]
+    #[serde(with = "OptionalWhole::<1, 1_000_000>")]
     pub max_clients_per_address: Option<usize> = None,
     /// Limit of slots per client address; the same number of its clients may wait. Default: all, because a class sits
     /// behind one address.
-    #[serde(deserialize_with = "optional_whole::<1, 10_000, _, _>")]
+    #[serde(with = "OptionalWhole::<1, 10_000>")]
     pub max_places_per_address: Option<usize> = None,
     /// Limit of slots per user (`userHeader`); the same number of the user's clients may wait. Default: all.
-    #[serde(deserialize_with = "optional_whole::<1, 10_000, _, _>")]
+    #[serde(with = "OptionalWhole::<1, 10_000>")]
     pub max_places_per_user: Option<usize> = None,
     /// The header in which a reverse proxy of `trustedProxies` sends the user's name, such as `X-Forwarded-User`.
     /// Default: none.
@@ -113,15 +115,15 @@ pub struct SimulationConfig {
     /// Default: `["127.0.0.0/8", "::1/128"]`.
     pub trusted_proxies: TrustedProxies = TrustedProxies::default(),
     /// Seconds after which a simulation is closed, at least 360. Default: 7200.
-    #[serde(deserialize_with = "whole::<360, 31_536_000, _, _>")]
+    #[serde(with = "Whole::<360, 31_536_000>")]
     pub timeout: u64 = 7200,
     /// Minutes after which a simulation that is paused is closed; 0: never. Default: 0.
-    #[serde(deserialize_with = "minutes")]
+    #[serde(with = "Minutes")]
     pub idle_timeout: f64 = 0.0,
     /// Write `simulation/monitor.csv`. Default: true.
     pub monitor_log_enabled: bool = true,
     /// Months for which the lines of `simulations.csv` are kept after the month in which the simulation ended. Default: 12.
-    #[serde(deserialize_with = "whole::<1, 120, _, _>")]
+    #[serde(with = "Whole::<1, 120>")]
     pub record_months: u32 = 12,
     /// Whether a world's URL may name any commit by its hash, not only one that is in a branch or tag. Git hosts also
     /// serve commits of forks and pull requests, which the repository's owner never accepted. Default: false.
@@ -134,49 +136,49 @@ pub struct SimulationConfig {
     /// Directory of cached repositories and of the projects of running simulations. Default: `cache`.
     pub cache_dir: ExpandedPath = ExpandedPath("cache".into()),
     /// Size limit of all cached repositories, in MiB. Default: 10240.
-    #[serde(deserialize_with = "whole::<1, 100_000_000, _, _>")]
+    #[serde(with = "Whole::<1, 100_000_000>")]
     pub cache_size: u64 = 10 * 1024,
     /// Size limit of the assets that Webots has downloaded in sandboxes, in MiB; 0: none are kept. Default: 2048.
-    #[serde(deserialize_with = "whole::<0, 100_000_000, _, _>")]
+    #[serde(with = "Whole::<0, 100_000_000>")]
     pub assets_size: u64 = 2048,
     /// Size limit of a project, in MiB, for the fetch and for the checkout. Default: 1024.
-    #[serde(deserialize_with = "whole::<1, 100_000_000, _, _>")]
+    #[serde(with = "Whole::<1, 100_000_000>")]
     pub project_size: u64 = 1024,
     /// Free space that the disk of `cacheDir` must have for new simulations, in MiB; 0: any. Default: 512.
-    #[serde(deserialize_with = "whole::<0, 100_000_000, _, _>")]
+    #[serde(with = "Whole::<0, 100_000_000>")]
     pub disk_reserve: u64 = 512,
     /// Whether the server is ready only while it sees GPUs and none is lost. Default: false.
     pub require_gpu: bool = false,
     /// Which GPU a simulation gets, of several. Default: the first.
     pub gpus: GpuUse = GpuUse::default(),
     /// The X screen that each GPU drives, in the order of `nvidia-smi`; with `gpus: "spread"`. Default: none.
-    #[serde(deserialize_with = "one_or_many")]
+    #[serde(with = "OneOrMany::<String>")]
     pub displays: Vec<String> = Vec::new(),
     /// The display that Webots opens its window on. Default: the environment variable `DISPLAY`, else `:0`.
     pub display: Option<String> = None,
     /// Give each Webots a virtual display of its own (needs `Xvfb`). Default: false.
     pub xvfb: bool = false,
     /// Seconds after six missed heartbeats until a simulation is ended. Default: 60.
-    #[serde(with = "seconds")]
+    #[serde(with = "Seconds")]
     pub hang_limit: Duration = Duration::from_mins(1),
     /// Worlds of which simulations are kept ready: `{"world": ..., "count": ..., "when": ...}`. Default: none.
-    #[serde(deserialize_with = "one_or_many")]
+    #[serde(with = "OneOrMany::<ReadyEntry>")]
     pub ready: Vec<ReadyEntry> = Vec::new(),
     /// Load (percent) from which none is started to be kept ready; from 10 more, in memory of the machine or its GPUs, they
     /// end. Above 100: the load does not matter. Default: 80.
-    #[serde(deserialize_with = "percent::<1000, _>")]
+    #[serde(with = "Percent::<1000>")]
     pub ready_load: f64 = 80.0,
     /// Pages from which browsers may open `/client`, as origins (`https://lab.org`). Default: any.
-    #[serde(deserialize_with = "one_or_many")]
+    #[serde(with = "OneOrMany::<Origin>")]
     pub allowed_origins: Vec<Origin> = Vec::new(),
     /// Password for actions such as `/drain`. Default: none, and actions are off.
     pub admin_password: Option<Secret> = None,
     /// What the client of a simulation is told that an administrator stops, before the reason. Default: `The administrator
     /// has stopped this simulation`.
-    #[serde(deserialize_with = "sentence")]
+    #[serde(with = "Sentence")]
     pub stop_text: String = "The administrator has stopped this simulation".to_owned(),
     /// Tokens of programs, each with what it may do. Default: none.
-    #[serde(deserialize_with = "one_or_many")]
+    #[serde(with = "OneOrMany::<ApiToken>")]
     pub api_tokens: Vec<ApiToken> = Vec::new(),
     /// Secret of at least 16 letters that all servers of a fleet share: it signs the passes and tickets of the line.
     /// Default: none, and a free slot is for the first client that comes.

@@ -10,7 +10,7 @@ use tokio_util::task::AbortOnDropHandle;
 
 use super::build_plan::{BuildPlan, ImageBuild, PROJECT_PATH, participant_folder};
 use super::built_image::export;
-use super::compose_project::{ComposeProject, ContainerRequest};
+use super::compose_project::{ComposeProject, ContainerRequest, WEBOTS};
 use super::docker::{Docker, SHORT_TIMEOUT, daemon_fault};
 use super::failures::{of_project, on_thread, refused_by_docker};
 use super::image::Images;
@@ -22,6 +22,7 @@ use super::webots_yml::ProjectKind;
 use crate::shared::domain::Failure;
 use crate::simulation::checkout::OnProgress;
 use crate::simulation::config::SimulationConfig;
+use crate::simulation::process::process_tree::is_connected;
 
 /// Creates the containers of simulations.
 pub struct ContainerService {
@@ -57,7 +58,7 @@ impl ContainerService {
             log::warn!("{why}");
         }
         let images = Arc::new(Images::new(docker.clone(), owner.clone(), Arc::clone(&config)));
-        let remover = AbortOnDropHandle::new(actix_rt::spawn(Arc::clone(&images).remove_old()));
+        let remover = AbortOnDropHandle::new(actix_rt::spawn(Arc::clone(&images.store).keep_within_limits()));
         Ok(Self {
             docker,
             run: owner.run(),
@@ -94,9 +95,11 @@ impl ContainerService {
         };
         network::join(docker, self.config.container.network.name()).await?;
         let is_projects = image.folder.is_some() || controller.is_some();
-        let made = async |build: ImageBuild, from: &Path, to: &Path| {
+        let mut kept = Vec::new();
+        let mut made = async |build: ImageBuild, from: &Path, to: &Path| {
             let has_project = build.folder.is_some();
-            let image = self.images.build(project, build, address, progress).await?;
+            let (image, uses) = self.images.build(project, build, address, progress).await?;
+            kept.extend(uses);
             if has_project {
                 export(&image, (docker, &self.config), &guard.name, from, project, to).await?;
             }
@@ -112,6 +115,7 @@ impl ContainerService {
         };
         let has_editor = yml.kind != ProjectKind::Default;
         if has_editor {
+            kept.push(self.images.store.keep(&self.config.container.editor_image));
             self.images
                 .pull(&self.config.container.editor_image, address, progress)
                 .await?;
@@ -146,6 +150,8 @@ impl ContainerService {
             return Err(docker.explain(error, self.config.disk_reserve, otherwise).await);
         }
         drop(turn);
+        // From now on its containers keep them.
+        drop(kept);
         // An editor has a port of its own, which the relay of streams does not reach.
         let ide = (has_editor && self.config.ports_are_public()).then(|| "ide: enable".to_owned());
         let texts = ide.into_iter().chain(yml.project_type).collect();
@@ -161,20 +167,16 @@ impl ContainerService {
         })
     }
 
-    /// The root processes of the running containers of the simulation on this port; none if Docker does not tell.
-    pub async fn processes_of(&self, port: u16) -> Vec<i32> {
+    /// Whether a connection to the Webots of the simulation on this port is open; `None` if that is not known. The kernel
+    /// of the container tells: Docker may run in another namespace of processes, and forward without a process.
+    pub async fn has_connection(&self, port: u16) -> Option<bool> {
         let name = format!("name=^{}", self.run.prefix_of(port));
-        let Ok(ids) = self
-            .docker
-            .run(&["ps", "--quiet", "--filter", &name], SHORT_TIMEOUT)
-            .await
-        else {
-            return Vec::new();
-        };
-        let inspect = ["inspect", "--format", "{{.State.Pid}}"];
-        let words: Vec<&str> = inspect.into_iter().chain(ids.split_whitespace()).collect();
-        let pids = self.docker.run(&words, SHORT_TIMEOUT).await.unwrap_or_default();
-        pids.split_whitespace().filter_map(|pid| pid.parse().ok()).collect()
+        let service = format!("label=com.docker.compose.service={WEBOTS}");
+        let list = ["ps", "--quiet", "--filter", &name, "--filter", &service];
+        let ids = self.docker.run(&list, SHORT_TIMEOUT).await.ok()?;
+        let tables = ["exec", ids.trim(), "cat", "/proc/net/tcp", "/proc/net/tcp6"];
+        let tables = self.docker.run(&tables, SHORT_TIMEOUT).await.ok()?;
+        is_connected(&tables, port)
     }
 }
 

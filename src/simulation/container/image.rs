@@ -1,13 +1,14 @@
-//! The images of simulations: pulled, and built once for all clients of the same project; old ones are removed.
+//! The images of simulations: pulled, and built once for all clients of the same project.
 
+use std::collections::HashMap;
 use std::ffi::OsString;
 use std::net::IpAddr;
 use std::path::Path;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use actix_rt::task::spawn_blocking;
-use sha2::{Digest, Sha256};
+use parking_lot::Mutex;
 use tokio::sync::watch;
 
 use super::build_plan::{self, ImageBuild};
@@ -15,9 +16,11 @@ use super::builders::{Builder, Builders};
 use super::built_image::BuiltImage;
 use super::compose_project::DEFAULT_MEMORY;
 use super::docker::{Docker, DockerError, SHORT_TIMEOUT, data_folder, docker_disk_fault};
-use super::dockerfile::{Dockerfile, LABEL};
+use super::dockerfile::Dockerfile;
 use super::engine;
 use super::failures::{of_project, on_thread};
+use super::growth::{self, BuildMark};
+use super::image_store::{ImageStore, ImageUse};
 use super::owned_resources::ResourceOwner;
 use crate::shared::domain::{Failure, Reason};
 use crate::simulation::checkout::{OnProgress, Project, SingleFlight};
@@ -30,8 +33,26 @@ pub struct Images {
     /// The owner in their labels.
     pub owner: ResourceOwner,
     config: Arc<SimulationConfig>,
+    /// What becomes of them.
+    pub store: Arc<ImageStore>,
     builders: Builders,
     jobs: SingleFlight<String, Result<(), Failure>>,
+    /// The builds that run, each with the free room of Docker's disk at its begin, in bytes.
+    running: Mutex<HashMap<BuildMark, u64>>,
+    /// When a build was last ended because it has filled the disk.
+    ended: tokio::sync::Mutex<Option<Instant>>,
+}
+
+/// A build that runs. Dropping it ends its entry.
+struct RunningBuild<'images> {
+    mark: BuildMark,
+    images: &'images Images,
+}
+
+impl Drop for RunningBuild<'_> {
+    fn drop(&mut self) {
+        self.images.running.lock().remove(&self.mark);
+    }
 }
 
 /// How a Dockerfile names the image of the world's version of Webots.
@@ -45,24 +66,25 @@ const CONFIG: &str = "{{json .Config}}";
 const MAX_VERSION: usize = 50;
 /// The largest number of steps that Webots' page understands: each number has one digit.
 const STEPS: u64 = 9;
-/// Interval between two prunings, and after a failed one: Docker runs one at a time, also of other servers.
-const PRUNE_INTERVAL: Duration = Duration::from_mins(5);
-const RETRY_INTERVAL: Duration = Duration::from_secs(5);
-/// Minimum age of an image that is removed because the disk is full, in minutes: a newly built one has no container yet.
-const MIN_AGE: u64 = 5;
 /// Interval between two looks at the disk of Docker during a build.
 const LOOK_INTERVAL: Duration = Duration::from_secs(1);
+/// Time in which Docker removes the files of a build that was ended.
+const RELIEF: Duration = Duration::from_secs(3);
 
 impl Images {
     /// The images of this owner.
     pub fn new(docker: Docker, owner: ResourceOwner, config: Arc<SimulationConfig>) -> Self {
         let builders = Builders::new(config.container.builds);
+        let store = Arc::new(ImageStore::new(docker.clone(), owner.clone(), Arc::clone(&config)));
         Self {
             docker,
             owner,
             config,
+            store,
             builders,
             jobs: SingleFlight::default(),
+            running: Mutex::default(),
+            ended: tokio::sync::Mutex::default(),
         }
     }
 
@@ -82,17 +104,21 @@ impl Images {
         let pull = move |sender: watch::Sender<String>| async move {
             let _builder = this.builder(address, &sender).await?;
             let on_line = |line: &str| drop(sender.send(format!("Step 1/{STEPS} : fetching {name}: {line}")));
+            this.store.expect(&name);
             let command = ["docker", "pull", &name].map(OsString::from).to_vec();
             let pulled = this.docker.follow(command, this.config.timing.build, on_line).await;
             match pulled {
-                Ok(()) => Ok(()),
+                Ok(()) => {
+                    this.store.added();
+                    Ok(())
+                }
                 Err(error) => Err(this.not_pulled(&name, error).await),
             }
         };
         self.made(image, ID, progress, pull).await
     }
 
-    /// Builds an image of a project unless it exists, for a client with this address.
+    /// Builds an image of a project unless it exists, for a client with this address. The image stays as long as it is used.
     ///
     /// # Errors
     /// Why it can't be built or used.
@@ -102,7 +128,7 @@ impl Images {
         mut build: ImageBuild,
         address: Option<IpAddr>,
         progress: OnProgress<'_>,
-    ) -> Result<BuiltImage, Failure> {
+    ) -> Result<(BuiltImage, Vec<ImageUse>), Failure> {
         let version = &project.world.version;
         let webots = build_plan::image_of(&self.config.container.image, version);
         if !is_version(version) {
@@ -118,19 +144,22 @@ impl Images {
         );
         // An image's name stays the same when the image is updated, so its id is part of the key. A base that is not
         // here yet has no id: the build fetches it.
+        let mut uses = Vec::new();
         for base in &build.dockerfile.bases {
             let is_default = DEFAULT_BASE.contains(&base.as_str());
-            parts.extend(if is_default {
+            uses.push(self.store.keep(if is_default { &webots } else { base }));
+            let id = if is_default {
                 Some(self.pull(&webots, address, progress).await?)
             } else {
                 self.inspect(base, ID).await?
-            });
+            };
+            if id.is_none() {
+                self.store.expect(base);
+            }
+            parts.extend(id);
         }
-        let name = format!(
-            "webots-fleet/{}:{}",
-            self.owner.0,
-            hex::encode(Sha256::digest(parts.join("\0")))
-        );
+        let name = self.store.name(&parts);
+        uses.push(self.store.keep(&name));
         let this = Arc::clone(self);
         let project = Arc::clone(project);
         let tag = name.clone();
@@ -140,11 +169,14 @@ impl Images {
                 return this.build_now(&tag, &project, build, sender).await;
             }
             let _builder = this.builder(address, &sender).await?;
-            this.build_now(&tag, &project, build, sender).await?;
+            let done = this.build_now(&tag, &project, build, sender).await;
+            this.store.added();
+            done?;
             this.check_size(&tag).await
         };
         let config = self.made(&name, CONFIG, progress, job).await?;
-        BuiltImage::read(name, &config).map_err(of_project)
+        let image = BuiltImage::read(name, &config).map_err(of_project)?;
+        Ok((image, uses))
     }
 
     /// Makes an image by this job unless it exists. Returns what Docker reports about it in this format.
@@ -202,11 +234,13 @@ impl Images {
             &memory,
         ];
         let options = ["--network", network, "--tag", name, "--file"];
+        let running = self.running_build().await;
         let words = limited
             .into_iter()
             .chain(options)
             .map(OsString::from)
-            .chain([file.into()]);
+            .chain([file.into()])
+            .chain(running.mark.option().map(Into::into));
         let arguments = arguments
             .into_iter()
             .flat_map(|argument| ["--build-arg".into(), argument.into()]);
@@ -221,7 +255,7 @@ impl Images {
         let follow = self.docker.follow(words.collect(), self.config.timing.build, on_line);
         let done = tokio::select! {
             done = follow => done,
-            () = self.until_disk_full() => return Err(self.has_filled_disk()),
+            failure = self.until_ended(&running.mark) => return Err(failure),
         };
         match done {
             Ok(()) => Ok(()),
@@ -241,15 +275,51 @@ impl Images {
         Err(Failure::new(Reason::ImageTooLarge, message))
     }
 
-    /// Waits until the disk of Docker has less than `diskReserve` left.
-    async fn until_disk_full(&self) {
+    /// A build that begins now.
+    async fn running_build(&self) -> RunningBuild<'_> {
+        let mark = BuildMark::new();
+        let free = spawn_blocking(free_room).await.ok().flatten().unwrap_or_default();
+        self.running.lock().insert(mark.clone(), free);
+        RunningBuild { mark, images: self }
+    }
+
+    /// Waits until the disk of Docker has less than `diskReserve` left, and this build is why, or none is known to be.
+    async fn until_ended(&self, mark: &BuildMark) -> Failure {
         let reserve = self.config.disk_reserve;
         loop {
             actix_rt::time::sleep(LOOK_INTERVAL).await;
-            if matches!(spawn_blocking(move || docker_disk_fault(reserve)).await, Ok(Some(_))) {
-                return;
+            if !matches!(spawn_blocking(move || docker_disk_fault(reserve)).await, Ok(Some(_))) {
+                continue;
+            }
+            let mut ended = self.ended.lock().await;
+            if ended.is_some_and(|ended| ended.elapsed() < RELIEF) {
+                continue;
+            }
+            match self.filler().await {
+                None => return self.has_filled_disk(),
+                Some(filler) if filler == *mark => {
+                    *ended = Some(Instant::now());
+                    return filled_by_project();
+                }
+                Some(_) => {}
             }
         }
+    }
+
+    /// The build that has taken most of the room that the disk of Docker has lost since the first of these builds began;
+    /// `None` if none is known to have.
+    async fn filler(&self) -> Option<BuildMark> {
+        let running = self.running.lock().clone();
+        let marks: Vec<BuildMark> = running.keys().cloned().collect();
+        if let [only] = &*marks
+            && self.builders.in_use() <= 1
+        {
+            return Some(only.clone());
+        }
+        let before = running.values().copied().max()?;
+        let now = spawn_blocking(free_room).await.ok().flatten()?;
+        let (mark, written) = growth::largest(&self.docker, &marks).await.ok().flatten()?;
+        (written >= before.saturating_sub(now) / 2).then_some(mark)
     }
 
     /// The failure of a build during which the disk of Docker has become full: the server takes no clients with a full
@@ -259,8 +329,7 @@ impl Images {
             let message = "The builds of several projects have filled the disk of Docker (diskReserve), and were ended";
             return Failure::new(Reason::BuildersBusy, message);
         }
-        let message = "The image of this project can't be built: it has filled the disk of Docker (diskReserve)";
-        Failure::new(Reason::ImageTooLarge, message)
+        filled_by_project()
     }
 
     /// Why a configured image can't be pulled: the world's version has none, or this server can't get it. Nothing here is
@@ -336,30 +405,6 @@ impl Images {
             Err(error) => Err(error.into()),
         }
     }
-
-    /// Removes old images that this server has built and no container uses, and leftovers of failed builds. Images
-    /// without this server's label stay, such as base images. Never returns.
-    pub async fn remove_old(self: Arc<Self>) {
-        let reserve = self.config.disk_reserve;
-        loop {
-            let room = || data_folder().and_then(|folder| DiskRoom::of(&folder).ok());
-            let room = spawn_blocking(room).await.ok().flatten();
-            let is_full = room.is_some_and(|room| room.shortage(reserve).is_some());
-            let minutes = if is_full {
-                MIN_AGE
-            } else {
-                24 * 60 * self.config.container.images_age
-            };
-            let mine = format!("label={LABEL}={}", self.owner.0);
-            let old = format!("until={minutes}m");
-            let prune = [
-                "image", "prune", "--all", "--force", "--filter", &mine, "--filter", &old,
-            ];
-            let pruned = self.docker.run(&prune, SHORT_TIMEOUT).await;
-            let is_done = pruned.is_ok() && !is_full;
-            actix_rt::time::sleep(if is_done { PRUNE_INTERVAL } else { RETRY_INTERVAL }).await;
-        }
-    }
 }
 
 /// The step of a build, from Docker's line about it, in at most nine steps; `None` for any other line.
@@ -373,6 +418,17 @@ fn scaled(line: &str) -> Option<String> {
         step
     };
     Some(format!("Step {step}/{} : {instruction}", of.min(STEPS)))
+}
+
+/// The failure of a build that has filled the disk of Docker.
+fn filled_by_project() -> Failure {
+    let message = "The image of this project can't be built: it has filled the disk of Docker (diskReserve)";
+    Failure::new(Reason::ImageTooLarge, message)
+}
+
+/// The free room of the disk of Docker, in bytes. Blocks.
+fn free_room() -> Option<u64> {
+    Some(DiskRoom::of(&data_folder()?).ok()?.bytes)
 }
 
 fn no_image(image: &str) -> Failure {

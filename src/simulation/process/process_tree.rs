@@ -10,7 +10,8 @@ use std::time::Duration;
 
 use nix::sys::signal::{Signal, kill, killpg};
 use nix::unistd::{Pid, getpgid};
-use procfs::net::TcpState;
+use procfs::FromReadSI;
+use procfs::net::{TcpNetEntries, TcpNetEntry, TcpState};
 use procfs::process::{Process, all_processes};
 
 /// The environment variable that marks every process of a simulation: its value is the instance's directory. Children
@@ -53,28 +54,36 @@ pub fn children_listen(pid: i32, port: u16) -> bool {
         if network(&child.to_string()).is_none_or(|network| Some(network) == own) {
             return false;
         }
-        has_socket(child, port, &TcpState::Listen).unwrap_or_default()
+        let Ok(child) = Process::new(child) else { return false };
+        let sockets = child.tcp().into_iter().chain(child.tcp6()).flatten();
+        has_socket(sockets, port, &TcpState::Listen)
     })
 }
 
-/// Whether a connection to this port is open in the network of a process; `None` if that network can't be read.
-pub fn has_connection(pid: i32, port: u16) -> Option<bool> {
-    has_socket(pid, port, &TcpState::Established)
+/// Whether a connection to this port of the machine is open; `None` if that can't be read.
+pub fn has_connection(port: u16) -> Option<bool> {
+    let sockets = procfs::net::tcp().ok()?;
+    // A machine may be without IPv6.
+    let six = procfs::net::tcp6().into_iter().flatten();
+    Some(has_socket(sockets.into_iter().chain(six), port, &TcpState::Established))
 }
 
-/// Whether the network of a process has a TCP socket with this local port in this state; `None` if it can't be read.
-fn has_socket(pid: i32, port: u16, state: &TcpState) -> Option<bool> {
-    let process = Process::new(pid).ok()?;
-    // A machine may be without IPv6.
-    let sockets = process
-        .tcp()
-        .ok()?
-        .into_iter()
-        .chain(process.tcp6().into_iter().flatten());
+/// The same by the text of `/proc/net/tcp` and `/proc/net/tcp6`.
+pub fn is_connected(tables: &str, port: u16) -> Option<bool> {
+    let is_head = |line: &&str| line.trim_start().starts_with("sl");
+    let (heads, rows): (Vec<&str>, Vec<&str>) = tables.lines().partition(is_head);
+    let one = format!("{}\n{}", heads.first()?, rows.join("\n"));
+    let TcpNetEntries(sockets) = TcpNetEntries::from_read(one.as_bytes(), procfs::current_system_info()).ok()?;
+    Some(has_socket(sockets, port, &TcpState::Established))
+}
+
+/// Whether one of these sockets has this local port and state.
+fn has_socket(sockets: impl IntoIterator<Item = TcpNetEntry>, port: u16, state: &TcpState) -> bool {
     let mut ports = sockets
+        .into_iter()
         .filter(|socket| socket.state == *state)
         .map(|socket| socket.local_address.port());
-    Some(ports.any(|local| local == port))
+    ports.any(|local| local == port)
 }
 
 /// Kills every process that has the mark of an instance below `folder`, and the groups that such processes lead.

@@ -1,0 +1,361 @@
+//! The images that this server has built or pulled: how much room they take, when each was used, and which are removed.
+//!
+//! An image that was built has the owner's label. One that was pulled can't get a label: it gets another name, that of the
+//! owner with `base-` in its tag.
+
+use std::cmp::Reverse;
+use std::collections::{HashMap, HashSet};
+use std::sync::Arc;
+use std::time::Duration;
+
+use actix_rt::task::spawn_blocking;
+use jiff::Timestamp;
+use parking_lot::Mutex;
+use sha2::{Digest, Sha256};
+use tokio::sync::Notify;
+
+use super::docker::{Docker, DockerError, SHORT_TIMEOUT, docker_disk_fault};
+use super::dockerfile::LABEL;
+use super::owned_resources::ResourceOwner;
+use crate::shared::run::seconds_since_1970;
+use crate::simulation::config::SimulationConfig;
+
+/// The images of a server.
+pub struct ImageStore {
+    docker: Docker,
+    owner: ResourceOwner,
+    config: Arc<SimulationConfig>,
+    uses: Arc<Mutex<HashMap<String, Use>>>,
+    /// Images that were not there, and are pulled, or will be by a build.
+    expected: Mutex<HashSet<String>>,
+    /// Signals that there are more images.
+    growth: Notify,
+}
+
+/// The uses of an image in this run of the server.
+#[derive(Default)]
+struct Use {
+    /// Number of builds and simulations that need it now, and have no container of it yet.
+    now: usize,
+    /// The end of the last one, in seconds since 1970.
+    last: u64,
+}
+
+/// The use of an image, which is not removed meanwhile. Dropping it ends the use.
+pub struct ImageUse {
+    name: String,
+    uses: Arc<Mutex<HashMap<String, Use>>>,
+}
+
+/// An image of this machine, as Docker reports it.
+#[derive(Debug, PartialEq, Eq)]
+struct Image {
+    id: String,
+    /// With those that it begins with, in bytes.
+    size: u64,
+    /// When it got its last name, in seconds since 1970.
+    named: u64,
+    names: Vec<String>,
+    layers: Vec<String>,
+}
+
+/// Interval between two prunings, and after a failed one: Docker runs one at a time, also of other servers.
+const PRUNE_INTERVAL: Duration = Duration::from_mins(5);
+const RETRY_INTERVAL: Duration = Duration::from_secs(5);
+/// Minimum age of leftovers of failed builds that are removed because the disk is full, in minutes.
+const MIN_AGE: u64 = 5;
+/// What is read about an image.
+const FORMAT: &str =
+    "{{.Id}} {{.Size}} {{json .Metadata.LastTagTime}} {{json .RepoTags}} {{json .RepoDigests}} {{json .RootFS.Layers}}";
+/// Number of images that are read at a time.
+const AT_A_TIME: usize = 100;
+/// The beginning of the tag of an image that was pulled.
+const BASE: &str = "base-";
+
+impl Drop for ImageUse {
+    fn drop(&mut self) {
+        let mut uses = self.uses.lock();
+        let of_image = uses.entry(self.name.clone()).or_default();
+        of_image.now -= 1;
+        of_image.last = seconds_since_1970();
+    }
+}
+
+impl Image {
+    /// Parses a line of [`FORMAT`].
+    fn read(line: &str) -> Option<Self> {
+        let mut words = line.split(' ');
+        let (id, size, named) = (words.next()?, words.next()?, words.next()?);
+        let mut list = || serde_json::from_str::<Option<Vec<String>>>(words.next()?).ok();
+        let (tags, digests, layers) = (list()?, list()?, list()?);
+        Some(Self {
+            id: id.to_owned(),
+            size: size.parse().ok()?,
+            named: seconds(named).unwrap_or_default(),
+            names: tags.into_iter().chain(digests).flatten().collect(),
+            layers: layers.unwrap_or_default(),
+        })
+    }
+
+    /// Whether it has a name with this beginning.
+    fn is_named(&self, beginning: &str) -> bool {
+        self.names.iter().any(|name| name.starts_with(beginning))
+    }
+
+    /// Whether it begins with another image.
+    fn contains(&self, other: &Self) -> bool {
+        let is_after = (self.layers.len(), &self.id) > (other.layers.len(), &other.id);
+        is_after && self.layers.starts_with(&other.layers)
+    }
+}
+
+/// The room that the images take that are `own`, in bytes, besides those of others with which they begin. What several
+/// have in common counts once: the builder keeps an image without a name for each step.
+fn room(all: &[Image], is_own: impl Fn(&Image) -> bool) -> u64 {
+    let is_of_others = |image: &Image| !image.names.is_empty() && !is_own(image);
+    let is_below = |image: &Image, is_above: &dyn Fn(&Image) -> bool| {
+        let mut above = all.iter().filter(|other| is_above(other));
+        above.any(|other| other.contains(image))
+    };
+    let counts = |image: &&Image| {
+        is_own(image) || image.names.is_empty() && is_below(image, &is_own) && !is_below(image, &is_of_others)
+    };
+    let besides_below = |image: &Image| {
+        let below = all.iter().filter(|other| image.contains(other)).map(|other| other.size);
+        image.size.saturating_sub(below.max().unwrap_or_default())
+    };
+    all.iter().filter(counts).map(besides_below).sum()
+}
+
+/// A time in JSON, in seconds since 1970; `None` for the year 1, which an image without a name has.
+fn seconds(json: &str) -> Option<u64> {
+    let time: Timestamp = json.trim_matches('"').parse().ok()?;
+    time.as_second().try_into().ok()
+}
+
+impl ImageStore {
+    /// The images of this owner.
+    pub fn new(docker: Docker, owner: ResourceOwner, config: Arc<SimulationConfig>) -> Self {
+        Self {
+            docker,
+            owner,
+            config,
+            uses: Arc::default(),
+            expected: Mutex::default(),
+            growth: Notify::new(),
+        }
+    }
+
+    /// The name of an image that this server builds from these parts.
+    pub fn name(&self, parts: &[String]) -> String {
+        format!("{}{}", self.prefix(), hex::encode(Sha256::digest(parts.join("\0"))))
+    }
+
+    /// Keeps an image until the returned value is dropped.
+    pub fn keep(&self, name: &str) -> ImageUse {
+        self.uses.lock().entry(name.to_owned()).or_default().now += 1;
+        ImageUse {
+            name: name.to_owned(),
+            uses: Arc::clone(&self.uses),
+        }
+    }
+
+    /// Notes that an image is not there, and will be pulled.
+    pub fn expect(&self, name: &str) {
+        self.expected.lock().insert(name.to_owned());
+    }
+
+    /// Notes that this server has built or pulled an image.
+    pub fn added(&self) {
+        self.growth.notify_one();
+    }
+
+    /// Removes what is too much: images that are old, and leftovers of failed builds; above `container.imagesSize`, and
+    /// while the disk is full, those that were not used for longest. Images that a container uses stay, and those that
+    /// this server has neither built nor pulled. Never returns.
+    pub async fn keep_within_limits(self: Arc<Self>) {
+        loop {
+            let is_done = match self.clean().await {
+                Ok(has_room) => has_room,
+                Err(error) => {
+                    // Docker may be away, or prune for another server.
+                    log::debug!("images are looked at again later: {error}");
+                    false
+                }
+            };
+            let pause = if is_done { PRUNE_INTERVAL } else { RETRY_INTERVAL };
+            actix_rt::time::timeout(pause, self.growth.notified()).await.ok();
+        }
+    }
+
+    /// Returns whether the disk has room now.
+    async fn clean(&self) -> Result<bool, DockerError> {
+        self.mark_pulled().await;
+        let is_full = self.is_disk_full().await;
+        let minutes = if is_full {
+            MIN_AGE
+        } else {
+            24 * 60 * self.config.container.images_age
+        };
+        let mine = format!("label={LABEL}={}", self.owner.0);
+        let old = format!("until={minutes}m");
+        let prune = [
+            "image", "prune", "--all", "--force", "--filter", &mine, "--filter", &old,
+        ];
+        self.docker.run(&prune, SHORT_TIMEOUT).await?;
+        self.evict().await?;
+        Ok(!self.is_disk_full().await)
+    }
+
+    /// Names the images that were pulled, so that they are known after a restart.
+    async fn mark_pulled(&self) {
+        let expected = self.expected.lock().clone();
+        for name in expected {
+            let mark = format!("{}{BASE}{}", self.prefix(), hex::encode(Sha256::digest(&name)));
+            let is_there = self.docker.run(&["tag", &name, &mark], SHORT_TIMEOUT).await.is_ok();
+            let mut expected = self.expected.lock();
+            // Else its build has failed, or it is the name of another stage.
+            if is_there || !self.is_in_use(&name) {
+                expected.remove(&name);
+            }
+        }
+    }
+
+    async fn is_disk_full(&self) -> bool {
+        let reserve = self.config.disk_reserve;
+        matches!(spawn_blocking(move || docker_disk_fault(reserve)).await, Ok(Some(_)))
+    }
+
+    /// Removes images, those first that were not used for longest: while the disk is full or they take too much, and
+    /// pulled ones that are old.
+    async fn evict(&self) -> Result<(), DockerError> {
+        let limit = self.config.container.images_size << 20;
+        let oldest = seconds_since_1970().saturating_sub(self.config.container.images_age * 24 * 60 * 60);
+        let is_old = |image: &Image| image.is_named(&self.mark()) && self.last_use(image) < oldest;
+        let mut all = self.all().await?;
+        let mut stays: Vec<String> = Vec::new();
+        loop {
+            let is_own = |image: &Image| image.is_named(&self.prefix());
+            let own: Vec<&Image> = all.iter().filter(|image| is_own(image)).collect();
+            let total = room(&all, is_own);
+            let is_too_much = total > limit || self.is_disk_full().await;
+            let candidates = own.into_iter().filter(|image| {
+                (is_too_much || is_old(image)) && !stays.contains(&image.id) && !self.is_permanent(image)
+            });
+            // What begins with another image goes before it.
+            let Some(first) = candidates.min_by_key(|image| (self.last_use(image), Reverse(image.layers.len()))) else {
+                return Ok(());
+            };
+            if self.remove(first).await? {
+                log::info!("removed the image {}", first.names.join(" "));
+                all = self.all().await?;
+            } else {
+                stays.push(first.id.clone());
+            }
+        }
+    }
+
+    /// Removes an image with all of its names, unless it is used. Returns whether it did.
+    async fn remove(&self, image: &Image) -> Result<bool, DockerError> {
+        let of_image = format!("ancestor={}", image.id);
+        let users = ["ps", "--all", "--quiet", "--filter", &of_image];
+        let is_used = image.names.iter().any(|name| self.is_in_use(name));
+        if is_used || !self.docker.run(&users, SHORT_TIMEOUT).await?.trim().is_empty() {
+            return Ok(false);
+        }
+        let words: Vec<&str> = ["image", "rm"]
+            .into_iter()
+            .chain(image.names.iter().map(String::as_str))
+            .collect();
+        // A container may just have been created.
+        Ok(self.docker.run(&words, SHORT_TIMEOUT).await.is_ok())
+    }
+
+    fn prefix(&self) -> String {
+        format!("webots-fleet/{}:", self.owner.0)
+    }
+
+    fn mark(&self) -> String {
+        format!("{}{BASE}", self.prefix())
+    }
+
+    fn is_in_use(&self, name: &str) -> bool {
+        self.uses.lock().get(name).is_some_and(|of_image| of_image.now > 0)
+    }
+
+    /// Whether the administrator wants to keep it.
+    fn is_permanent(&self, image: &Image) -> bool {
+        let permanent = &self.config.persistant_docker_images;
+        image.names.iter().any(|name| permanent.contains(name))
+    }
+
+    /// When an image was last used or got its name, in seconds since 1970.
+    fn last_use(&self, image: &Image) -> u64 {
+        let uses = self.uses.lock();
+        let ends = image
+            .names
+            .iter()
+            .filter_map(|name| uses.get(name))
+            .map(|of_image| of_image.last);
+        ends.max().unwrap_or_default().max(image.named)
+    }
+
+    /// All images of this machine.
+    async fn all(&self) -> Result<Vec<Image>, DockerError> {
+        let list = ["image", "ls", "--all", "--quiet", "--no-trunc"];
+        let list = self.docker.run(&list, SHORT_TIMEOUT).await?;
+        let mut ids: Vec<&str> = list.lines().collect();
+        ids.sort_unstable();
+        ids.dedup();
+        let mut all = Vec::new();
+        for some in ids.chunks(AT_A_TIME) {
+            let words: Vec<&str> = ["image", "inspect", "--format", FORMAT]
+                .into_iter()
+                .chain(some.iter().copied())
+                .collect();
+            let told = self.docker.run(&words, SHORT_TIMEOUT).await?;
+            all.extend(told.lines().filter_map(Image::read));
+        }
+        Ok(all)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn image(id: &str, size: u64, layers: &str, name: &str) -> Image {
+        let layers: Vec<String> = layers.chars().map(|layer| format!("\"{layer}\"")).collect();
+        let names = if name.is_empty() {
+            "null".to_owned()
+        } else {
+            format!("[\"{name}\"]")
+        };
+        let time = "2026-11-24T10:35:49.97185664+01:00";
+        Image::read(&format!(r#"{id} {size} "{time}" {names} null [{}]"#, layers.join(","))).unwrap()
+    }
+
+    #[test]
+    fn a_line_of_docker_is_read() {
+        let read = image("a", 7, "xy", "webots-fleet/o:a");
+        assert_eq!((read.size, read.named), (7, 1_795_512_949));
+        assert_eq!(read.names, ["webots-fleet/o:a"]);
+        assert_eq!(read.layers, ["x", "y"]);
+        assert_eq!(seconds("\"0001-01-01T00:00:00Z\""), None);
+    }
+
+    #[test]
+    fn what_images_have_in_common_counts_once_and_what_is_of_others_not() {
+        let is_own = |image: &Image| image.is_named("own");
+        let all = [
+            image("a", 90, "w", ""),
+            image("b", 100, "wx", "others"),
+            image("c", 130, "wxy", ""),
+            image("d", 130, "wxy", "own1"),
+            image("e", 140, "wxyz", "own2"),
+            image("f", 500, "v", ""),
+        ];
+        assert_eq!(room(&all, is_own), 40);
+        assert_eq!(room(&all, |_| false), 0);
+    }
+}
