@@ -1,10 +1,11 @@
-"""Plays the same class against a fleet of this project, of the Python servers, and of both, and prints what `rehearse` finds.
+"""Plays the same class against a fleet of this project, of the Python servers, and of both; prints what rehearse finds.
 
-    ORIGINAL=FOLDER ORIGINAL_PYTHON=PYTHON tests/own_network.sh "$(tests/python.sh)" tests/beside_original.py [FLEET]... [-- ARGUMENT...]
+    export ORIGINAL=FOLDER ORIGINAL_PYTHON=PYTHON
+    tests/own_network.sh "$(tests/python.sh)" tests/beside_original.py [FLEET]... [-- ARGUMENT...]
 
 ORIGINAL is the folder with session_server.py and simulation_server.py, ORIGINAL_PYTHON a Python with what they import
-(tornado, psutil, pynvml, requests, distro). FLEET is one of those below (all); the ARGUMENTs for `rehearse` replace those
-of CLASS. The Python servers listen on all interfaces: hence the network of its own.
+(tornado, psutil, pynvml, requests, distro). FLEET is one of those below (all); the ARGUMENTs for `rehearse` replace
+those of CLASS. The Python servers listen on all interfaces: hence the network of its own.
 """
 
 import json
@@ -33,8 +34,8 @@ FLEETS = {
 # The load of a full machine, in percent. The Python session server takes a server for full from 95 on; ours is told a
 # number that the load of this machine never reaches, since it has slots to go by.
 FULL = {"original": 95, "ours": 150}
-# The Python servers know no slots, only the load. Each simulation is a fifth of what its machine can do, as a heavy world
-# is, so that the fifth one fills it.
+# The Python servers know no slots, only the load. Each simulation is a fifth of what its machine can do, as a heavy
+# world is, so that the fifth one fills it.
 LOAD = f"""
 import psutil, runpy, sys
 full = float(sys.argv.pop(1))
@@ -96,7 +97,8 @@ class Beside(Fleet):
             # Its simulations are in one folder there.
             "TMPDIR": str(folder),
         }
-        command = [os.environ["ORIGINAL_PYTHON"], "-c", LOAD, str(self.full), f"{os.environ['ORIGINAL']}/{program}", str(file)]
+        original = f"{os.environ['ORIGINAL']}/{program}"
+        command = [os.environ["ORIGINAL_PYTHON"], "-c", LOAD, str(self.full), original, str(file)]
         with (folder / "output.txt").open("w") as log:
             process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment)
         self.others.append(process)

@@ -260,7 +260,7 @@ class InLine(Running):
         for page in line:
             running.pop(0).tab.get_by_role("button", name="Disconnect").click()
             expect(page.tab.locator("[data-step=simulation].done")).to_be_visible()
-            # Screen readers hear that it is its turn; there is a sound, and another title for who does not see the page.
+            # Screen readers hear that it is its turn; who does not see the page hears a sound and finds another title.
             self.assertEqual(page.tab.evaluate("said").count("It is your turn."), 1)
             self.assertEqual(page.tab.evaluate("rings"), 1)
             expect(page.tab).to_have_title(re.compile("^It is your turn" if page is background else "^Try a world"))
