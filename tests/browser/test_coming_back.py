@@ -217,21 +217,24 @@ class InLine(Running):
     session = {"fleetKey": key, "loadThreshold": 1000, "port": free_ports(64) + 63}
     simulation = {"maxConnections": 1, "fleetKey": key}
 
-    # What the page tells screen readers from now on, how often it rings, and whether it is hidden behind another tab,
-    # which a browser without a window never does.
-    watch = """() => {
-      [window.said, window.rings, window.isAway] = [[], 0, false];
-      const spoken = document.getElementById('spoken');
-      new MutationObserver(() => window.said.push(spoken.textContent)).observe(spoken, { childList: true });
-      const Sound = window.AudioContext;
-      window.AudioContext = class extends Sound { constructor() { super(); window.rings += 1; } };
-      Object.defineProperty(document, 'hidden', { get: () => window.isAway });
-    }"""
+    def watch(self, page):
+        """Records what the page tells screen readers from now on, and how often it rings; `isAway` hides it behind
+        another tab, which a browser without a window never does."""
+        page.tab.evaluate("""() => {
+          [window.said, window.rings, window.isAway] = [[], 0, false];
+          const Sound = window.AudioContext;
+          window.AudioContext = class extends Sound { constructor() { super(); window.rings += 1; } };
+          Object.defineProperty(document, 'hidden', { get: () => window.isAway });
+        }""")
+        page.tab.locator("#spoken").evaluate("""(spoken) => {
+          const record = (changes) => changes.map(({ addedNodes }) => window.said.push(addedNodes[0]?.textContent));
+          new MutationObserver(record).observe(spoken, { childList: true });
+        }""")
 
     def join(self):
         """A page that asks for a world."""
         page = self.open(self.fleet.session.url("viewer"))
-        page.tab.evaluate(self.watch)
+        self.watch(page)
         expect(page.tab.locator("#availability")).not_to_contain_text("Connecting")
         page.tab.get_by_role("button", name="Playground").click()
         page.tab.get_by_role("button", name="Connect", exact=True).click()
@@ -251,7 +254,7 @@ class InLine(Running):
             # Screen readers hear it.
             expect(page.tab.locator("#spoken")).to_contain_text(word)
         line[2].tab.reload()
-        line[2].tab.evaluate(self.watch)
+        self.watch(line[2])
         background = line[3]
         background.tab.evaluate("window.isAway = true")
         expect(line[2].tab).to_have_title(re.compile(r"^\(3\) "))
@@ -260,8 +263,8 @@ class InLine(Running):
         for page in line:
             running.pop(0).tab.get_by_role("button", name="Disconnect").click()
             expect(page.tab.locator("[data-step=simulation].done")).to_be_visible()
-            # Screen readers hear that it is its turn; who does not see the page hears a sound and finds another title.
-            self.assertEqual(page.tab.evaluate("said").count("It is your turn."), 1)
+            # Screen readers hear that it is its turn; there is a sound, and another title for who sees another tab.
+            self.assertEqual(page.tab.evaluate("said").count("It is your turn."), 1, page.tab.evaluate("said"))
             self.assertEqual(page.tab.evaluate("rings"), 1)
             expect(page.tab).to_have_title(re.compile("^It is your turn" if page is background else "^Try a world"))
             others = line[line.index(page) + 1 :]
