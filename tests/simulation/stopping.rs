@@ -79,7 +79,10 @@ async fn drain_is_off_without_a_password_and_ends_an_empty_server() {
         403
     );
     server.signal(Signal::SIGHUP);
-    until("it is logged", async || server.log().contains("the key ready was read again")).await;
+    until("it is logged", async || {
+        server.log().contains("the key ready was read again")
+    })
+    .await;
     server.signal(Signal::SIGUSR1);
     assert_eq!(server.ended().await, Some(0));
 }
