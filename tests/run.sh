@@ -113,8 +113,6 @@ done
 # These depend on the speed of the machine: nothing runs beside them.
 start "${CARGO[@]}" --test integration --test faults on_a_quiet_machine
 finish "${CARGO[@]}" --test integration --test faults on_a_quiet_machine
-start env QUIET_MACHINE=1 tests/browser/run test_embedding.PrintedPages.test_on_a_quiet_machine_it_is_drawn_within_100_ms
-finish env QUIET_MACHINE=1 tests/browser/run test_embedding.PrintedPages.test_on_a_quiet_machine_it_is_drawn_within_100_ms
 start tests/own_network.sh "${CARGO[@]}" --test containers on_a_quiet_machine
 finish tests/own_network.sh "${CARGO[@]}" --test containers on_a_quiet_machine
 rm "$logs/busy"

@@ -63,7 +63,7 @@ def visit(browser, url, service):
         container = container_of(tab, service)
         say("kill")
         subprocess.run(["docker", "kill", container], check=True, stdout=subprocess.DEVNULL)
-        expect(tab.locator("#problem-text")).to_contain_text("the simulation has ended")
+        expect(tab.locator("#problem-text")).to_contain_text("Your simulation is over")
         say("told")
         connect_until_it_moves(tab)
         say("again")
