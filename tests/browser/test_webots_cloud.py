@@ -87,17 +87,18 @@ class Cloud(BrowserTest):
     def servers(self):
         return [self.fleet.simulation, self.fleet.other]
 
-    def act(self, server, path, body=None):
-        """A request of the administrator."""
+    def ask(self, server, path, **options):
+        """The answer to a request of the administrator."""
         credentials = base64.b64encode(f"admin:{PASSWORD}".encode()).decode()
-        request = urllib.request.Request(
-            server.url(path),
-            data=b"" if body is None else json.dumps(body).encode(),
-            headers={"Authorization": f"Basic {credentials}", "Content-Type": "application/json"},
-            method="POST",
-        )
-        with urllib.request.urlopen(request) as answer:
-            self.assertEqual(answer.status, 202)
+        headers = {"Authorization": f"Basic {credentials}", "Content-Type": "application/json"}
+        with urllib.request.urlopen(urllib.request.Request(server.url(path), headers=headers, **options)) as answer:
+            return answer.read().decode()
+
+    def act(self, server, path, body=None):
+        self.ask(server, path, data=b"" if body is None else json.dumps(body).encode(), method="POST")
+
+    def simulations(self, server):
+        return json.loads(self.ask(server, "status"))["simulations"]
 
     def answer(self):
         """The answer of session.php."""
@@ -125,7 +126,7 @@ class Visitors(Cloud):
         for _ in range(2):
             pages.append(self.run_world(real.world()))
             self.runs(pages[-1])
-        one, other = (server.status()["simulations"] for server in self.servers())
+        one, other = (self.simulations(server) for server in self.servers())
         self.assertEqual((len(one), len(other)), (1, 1), "each has a server of its own")
         self.is_told(self.run_world(real.world()), "Session server error: ")
 
