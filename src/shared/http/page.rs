@@ -22,13 +22,13 @@ pub const VIEWER: &str = "default-src 'none'; script-src 'self'; style-src 'self
     connect-src 'self' http: https: ws: wss:; frame-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'self'";
 
 /// The policy of a page that runs scripts of other servers, with their styles, fonts, images and data. Webots' viewer
-/// compiles WebAssembly, and functions from texts (`glm-js`). Pages of the same server embed it (`frame-ancestors`), and
-/// its own script loads nothing outside of a frame. It has a separate origin (`sandbox`): its scripts can't use the
-/// password or the storage of the server's other pages.
+/// compiles WebAssembly, and functions from texts (`glm-js`), and shows robot windows in frames. Pages of the same server
+/// embed it (`frame-ancestors`), and its own script loads nothing outside of a frame. It has a separate origin
+/// (`sandbox`): its scripts can't use the password or the storage of the server's other pages.
 pub const FOREIGN_SCRIPTS: &str = "default-src 'none'; script-src 'self' http: https: 'unsafe-eval'; \
     style-src 'self' http: https:; font-src 'self' data: http: https:; img-src 'self' data: blob: http: https:; \
-    connect-src 'self' data: blob: http: https: ws: wss:; frame-ancestors 'self'; base-uri 'none'; form-action 'self'; \
-    sandbox allow-scripts allow-modals allow-pointer-lock";
+    connect-src 'self' data: blob: http: https: ws: wss:; frame-src http: https:; frame-ancestors 'self'; \
+    base-uri 'none'; form-action 'self'; sandbox allow-scripts allow-modals allow-pointer-lock";
 
 /// A policy by which pages of these origins may also embed the page.
 pub fn framed_by(policy: &str, origins: &[Origin]) -> String {
