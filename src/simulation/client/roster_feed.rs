@@ -51,7 +51,7 @@ impl RosterFeed {
         let mut told = self.told.take().unwrap_or_default();
         let there: HashSet<SimulationId> = simulations.iter().map(|one| one.id).collect();
         let ended = told.keys().filter(|id| !there.contains(id));
-        let mut ended: Vec<String> = ended.map(ToString::to_string).collect();
+        let ended: Vec<String> = ended.map(ToString::to_string).collect();
         told.retain(|id, _| there.contains(id));
         let mut changed = Vec::new();
         for simulation in simulations {
@@ -71,7 +71,7 @@ impl RosterFeed {
         let first = RosterUpdate {
             all: is_first,
             simulations: parts.next().unwrap_or_default(),
-            ended: std::mem::take(&mut ended),
+            ended,
         };
         let rest = parts.map(|simulations| RosterUpdate {
             simulations,
