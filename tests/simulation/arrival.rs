@@ -5,10 +5,12 @@ use std::time::{Duration, Instant};
 use futures_util::future::join_all;
 
 use super::life::quick;
+use super::relay::{look_on, watched_by};
 use super::scene::nothing_left;
 use crate::isolation::deeds::Stage;
 use crate::isolation::network::levels;
 use crate::support::client::Heard;
+use crate::support::http::PASSWORD;
 use crate::support::{Builder, Client, Webots, arm, demo_server};
 
 /// Seconds in which a viewer connects on a busy machine, too.
@@ -90,6 +92,22 @@ async fn a_simulation_with_a_viewer_goes_on_at_each_level() {
         drop(viewer);
     }))
     .await;
+}
+
+#[actix_rt::test]
+async fn a_simulation_that_only_an_administrator_watches_goes_on() {
+    for streaming in ["direct", "relay"] {
+        let builder = server(streaming, ARRIVAL).set("maxConnections", 2);
+        let server = builder.set("adminPassword", PASSWORD).start().await;
+        let mut watched = Client::start(&server, &arm()).await;
+        watched.until("webots:").await;
+        let path = watched_by(&server, &watched).await;
+        let _administrator = look_on(&server, &path).await;
+        let mut unseen = Client::start(&server, &arm()).await;
+        // It was ready later, so that the other's time is over, too.
+        ends(&mut unseen).await;
+        assert!(!hears_an_end(&mut watched, Duration::from_secs(1)).await, "{streaming}");
+    }
 }
 
 #[actix_rt::test]

@@ -55,7 +55,7 @@ async fn path_of(server: &Server, client: &mut Client) -> String {
         .to_owned()
 }
 
-async fn look_on(server: &Server, path: &str) -> Client {
+pub(super) async fn look_on(server: &Server, path: &str) -> Client {
     Client::connect(&server.websocket(path)).await
 }
 
@@ -767,7 +767,7 @@ async fn pages_of_other_origins_start_nothing_and_get_no_stream() {
 }
 
 /// Opens an administrator's watch page of a client's simulation, and returns the path of its stream.
-async fn watched_by(server: &Server, client: &Client) -> String {
+pub(super) async fn watched_by(server: &Server, client: &Client) -> String {
     let url = server.url(&format!("/watch?id={}", client.id()));
     let answer = get_as_administrator(&url).await;
     assert_eq!(

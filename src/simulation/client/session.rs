@@ -492,6 +492,8 @@ impl Handler<SlotEvent> for Session {
                     ready.is_watched = is_watched;
                 }
                 self.text(protocol::watched(is_watched));
+                // An administrator is a viewer, too.
+                self.settle_arrival(ctx);
             }
             SlotEvent::Viewed => self.settle_arrival(ctx),
             SlotEvent::Stopped(why) => {
