@@ -309,3 +309,56 @@ async fn a_list_is_read_again_and_worlds_are_kept_only_when_it_says_so() {
     nothing_left(&server, 3).await;
     assert!(http::get(&server.url("/health")).await.text().contains("ok"));
 }
+
+#[actix_rt::test]
+async fn while_a_remote_is_away_others_are_started_and_its_return_is_seen() {
+    let server = keeping(demo_server(3), 1).start().await;
+    until_ready(&server, 1).await;
+    let forge = server.forge().path();
+    let repository = forge.join("lab/arm");
+    let elsewhere = forge.join("elsewhere");
+    std::fs::rename(&repository, &elsewhere).unwrap();
+    let is_failing = async || kept(&server).await["problem"].is_string();
+    until("it is told", is_failing).await;
+    // A client takes it, and another one is started in its place.
+    let before = pids(&server);
+    let client = Client::ready(&server).await;
+    until("there is another one", async || {
+        kept(&server).await["ready"] == 1 && pids(&server) != before
+    })
+    .await;
+    std::fs::rename(&elsewhere, &repository).unwrap();
+    until("it is no problem any more", async || !is_failing().await).await;
+    assert_eq!(server.log().matches("can't be read").count(), 1);
+    client.leave().await;
+}
+
+#[actix_rt::test]
+async fn a_remote_is_asked_at_once_for_a_world_that_is_wanted_from_now_on() {
+    let builder = keeping(demo_server(4), 1).set("timing.branches", 3600);
+    builder.forge().commit("lab/arm", "main", &[("worlds/b.wbt", WORLD)]);
+    let server = builder.start().await;
+    until_ready(&server, 1).await;
+    let entry = |world: &str, count: u32| json!({"world": world, "count": count});
+    // Another world of the same repository.
+    let other = world("lab/arm", "main", "worlds/b.wbt");
+    server.reload(json!({"ready": [entry(&arm(), 1), entry(&other, 1)]}));
+    until("the other is ready", async || {
+        server.status().await["ready"][1]["ready"] == 1
+    })
+    .await;
+    // While none is wanted, the branch moves.
+    server.reload(json!({"ready": [entry(&arm(), 0)]}));
+    until("none is kept", async || {
+        server.status().await["instances"]["spare"] == 0
+    })
+    .await;
+    let changed = WORLD.replace("title \"Test\"", "title \"Changed\"");
+    server.forge().commit("lab/arm", "main", &[("worlds/a.wbt", &changed)]);
+    server.reload(json!({"ready": [entry(&arm(), 1)]}));
+    until_ready(&server, 1).await;
+    for folder in instance_folders_in(&server.cache()) {
+        let text = std::fs::read_to_string(folder.join("project/worlds/a.wbt")).unwrap();
+        assert!(text.contains("Changed"), "{text}");
+    }
+}

@@ -33,8 +33,10 @@ pub struct SpareKeeper {
 /// A repository of listed worlds.
 #[derive(Default)]
 struct Watched {
-    /// When its remote was asked last.
+    /// When its remote was asked last; `None` if it is to be asked at once.
     asked: Option<Instant>,
+    /// Whether that had no result.
+    is_failing: bool,
     /// What stays in the caches as long as it is listed.
     kept: Option<(KeptRepository, Option<Arc<RepositoryAssets>>)>,
 }
@@ -42,6 +44,8 @@ struct Watched {
 /// A listed world.
 #[derive(Default)]
 struct World {
+    /// Whether its remote is asked about it, at first or again.
+    is_asked: bool,
     /// The commit that its URL means, as the remote has said last.
     tip: Option<Tip>,
     failures: Option<Failures>,
@@ -105,6 +109,7 @@ impl SpareKeeper {
         let is_open = !self.server.takes_nobody() && readings.load.is_some_and(|load| load.percent() < limit);
         let starting = spares.values().flatten().filter(|one| !one.is_ready).count();
         let mut starts = STARTS.saturating_sub(starting);
+        let mut has_slot = self.server.slots.has_room_for_spare();
         for kind in self.worlds.keys() {
             spares.entry(kind.clone()).or_default();
         }
@@ -116,13 +121,14 @@ impl SpareKeeper {
                 .filter(|world| world.may_start())
                 .and_then(|world| world.tip.clone());
             let may_start = is_open && starts > 0 && tip.is_some();
-            let plan = plan(number, spares, may_start, self.server.slots.has_room_for_spare());
+            let plan = plan(number, spares, may_start, has_slot);
             for id in plan.end {
                 self.server.slots.end_spare(id);
             }
             if plan.start {
                 starts -= 1;
                 self.start_one(kind.clone(), tip, ctx);
+                has_slot = self.server.slots.has_room_for_spare();
             }
         }
         if memory(&readings) >= limit + SCARCE
@@ -132,17 +138,26 @@ impl SpareKeeper {
         }
     }
 
-    /// Forgets worlds that are no longer listed, and adds those that are.
+    /// Forgets worlds that are no longer listed, and adds those that are. The remote of one that is wanted from now on is to
+    /// be asked at once: a commit from before may be a day old.
     fn follow(&mut self, wanted: &BTreeMap<SpareKind, u32>) {
         self.worlds.retain(|kind, _| wanted.contains_key(kind));
-        for kind in wanted.keys() {
-            self.worlds.entry(kind.clone()).or_default();
+        let mut listed = BTreeSet::new();
+        for (kind, count) in wanted {
+            let world = self.worlds.entry(kind.clone()).or_default();
+            let repository = kind.world.repository();
+            let watched = self.repositories.entry(repository.clone()).or_default();
+            listed.insert(repository);
+            if *count == 0 {
+                if std::mem::take(world).is_asked {
+                    self.server.spare_wishes.set_problem(kind, None);
+                }
+            } else if !world.is_asked {
+                world.is_asked = true;
+                watched.asked = None;
+            }
         }
-        let listed: BTreeSet<String> = wanted.keys().map(|kind| kind.world.repository()).collect();
         self.repositories.retain(|repository, _| listed.contains(repository));
-        for repository in listed {
-            self.repositories.entry(repository).or_default();
-        }
         self.server
             .spare_wishes
             .retain_problems(|kind| wanted.contains_key(kind));
@@ -197,9 +212,14 @@ impl SpareKeeper {
         };
         if let Some(watched) = self.repositories.get_mut(repository) {
             watched.kept = Some((kept, assets));
+            watched.is_failing = false;
         }
         for (kind, world) in &mut self.worlds {
             let Some(tip) = tips.get(&kind.world) else { continue };
+            // The problem was the remote, or a load above `shareIdleTime`.
+            if world.failures.is_none() {
+                self.server.spare_wishes.set_problem(kind, None);
+            }
             match world.tip.replace(tip.clone()) {
                 Some(before) if before != *tip => {
                     log::info!(
@@ -214,16 +234,22 @@ impl SpareKeeper {
         }
     }
 
-    /// A remote could not be asked. What is ready stays.
+    /// A remote could not be asked. What is ready stays, and others are started with the commit that it has said before.
     fn not_asked(&mut self, repository: &str, failure: &Failure) {
-        let of_repository: Vec<SpareKind> = self
-            .worlds
-            .keys()
-            .filter(|kind| kind.world.repository() == repository)
-            .cloned()
-            .collect();
-        for kind in of_repository {
-            self.failed(&kind, failure);
+        let Some(watched) = self.repositories.get_mut(repository) else {
+            return;
+        };
+        if !std::mem::replace(&mut watched.is_failing, true) {
+            log::warn!(
+                "the branches of {repository}, of which worlds are kept ready, can't be read: {} ({}). That is tried again",
+                failure.in_full(),
+                failure.reason
+            );
+        }
+        for kind in self.worlds.keys().filter(|kind| kind.world.repository() == repository) {
+            self.server
+                .spare_wishes
+                .set_problem(kind, Some(failure.message.clone()));
         }
     }
 
