@@ -25,10 +25,8 @@ pub(super) struct SimulationRecord {
     pub listener: Recipient<SlotEvent>,
     /// The simulation, as pages show it. It has no port while it is in the queue.
     pub simulation: Simulation,
-    /// Its client, which counts for its address; `None` if it is kept ready for one.
-    pub client: Option<Peer>,
-    /// What it is kept ready for, as long as it has no client.
-    pub spare: Option<Spare>,
+    /// Whom it runs for.
+    pub runs_for: RunsFor,
     /// The address and the user of its client, if their slots are limited, each with its limit.
     pub parties: Vec<(Party, usize)>,
     /// Whether its Webots tells controllers if it has a world; known once it has a stream.
@@ -39,11 +37,21 @@ pub(super) struct SimulationRecord {
     pub ending: Arc<OnceLock<String>>,
     /// Since when its client is away, which may come back.
     pub away_since: Option<Instant>,
-    /// Whether it was told to make room for a client that waits, or was kept ready and ends.
+    /// Whether it was told to make room for a client that waits, and its own has not come back since; or it was kept ready
+    /// and ends.
     pub makes_room: bool,
     /// Its end, once that is reported. Only the first report counts.
     pub end: Option<End>,
     events: Vec<String>,
+}
+
+/// Whom a simulation runs for.
+#[derive(Debug)]
+pub(super) enum RunsFor {
+    /// This client, which counts for its address.
+    Client(Peer),
+    /// Nobody yet: it is kept ready for a client.
+    Spare(Spare),
 }
 
 /// What a simulation without a client is kept ready for: any client that asks for this can take it.
@@ -55,7 +63,7 @@ pub struct SpareKind {
     pub view: View,
 }
 
-/// What makes a simulation one without a client.
+/// A simulation without a client.
 #[derive(Debug)]
 pub(super) struct Spare {
     pub(super) kind: SpareKind,
@@ -146,35 +154,28 @@ const MAX_EVENT_LENGTH: usize = 500;
 
 impl SimulationRecord {
     /// A simulation that a client has just requested.
-    pub(super) fn new(simulation: Simulation, client: Peer, listener: Recipient<SlotEvent>) -> Self {
+    pub(super) fn for_client(simulation: Simulation, client: Peer, listener: Recipient<SlotEvent>) -> Self {
         let event = format!("its client asks for {}", simulation.world);
-        Self::with(simulation, Some(client), None, listener, &event)
+        Self::with(simulation, RunsFor::Client(client), listener, &event)
     }
 
     /// A simulation that is kept ready for clients.
-    pub(super) fn spare(simulation: Simulation, kind: SpareKind, listener: Recipient<SlotEvent>) -> Self {
+    pub(super) fn for_spare(simulation: Simulation, kind: SpareKind, listener: Recipient<SlotEvent>) -> Self {
         let event = format!("it is kept ready, with {}", simulation.world);
         let spare = Spare {
             kind,
             is_outdated: false,
         };
-        Self::with(simulation, None, Some(spare), listener, &event)
+        Self::with(simulation, RunsFor::Spare(spare), listener, &event)
     }
 
-    fn with(
-        simulation: Simulation,
-        client: Option<Peer>,
-        spare: Option<Spare>,
-        listener: Recipient<SlotEvent>,
-        event: &str,
-    ) -> Self {
+    fn with(simulation: Simulation, runs_for: RunsFor, listener: Recipient<SlotEvent>, event: &str) -> Self {
         let mut record = Self {
             since: Instant::now(),
             sent_position: None,
             listener,
             simulation,
-            client,
-            spare,
+            runs_for,
             parties: Vec::new(),
             answers_controllers: false,
             accesses: Vec::new(),
@@ -186,6 +187,27 @@ impl SimulationRecord {
         };
         record.note(event);
         record
+    }
+
+    /// Its client; `None` if it is kept ready for one.
+    pub(super) fn client(&self) -> Option<Peer> {
+        match self.runs_for {
+            RunsFor::Client(client) => Some(client),
+            RunsFor::Spare(_) => None,
+        }
+    }
+
+    /// The address that its client counts for.
+    pub(super) fn address(&self) -> Option<IpAddr> {
+        self.client().and_then(Peer::rate_limit_key)
+    }
+
+    /// What it is kept ready for; `None` if it has a client.
+    pub(super) fn spare(&self) -> Option<&Spare> {
+        match &self.runs_for {
+            RunsFor::Client(_) => None,
+            RunsFor::Spare(spare) => Some(spare),
+        }
     }
 
     /// Whether it has a slot and waits for its client, which has lost its connection.
@@ -217,8 +239,8 @@ impl SimulationRecord {
         self.events.truncate(MAX_EVENTS - 1);
         self.note(&format!("ended ({}): {}", end.failure.reason, end.failure));
         Ended {
+            client: self.client(),
             simulation: self.simulation,
-            client: self.client,
             at: seconds_since_1970(),
             events: self.events,
             end,

@@ -29,8 +29,8 @@ pub struct Slot {
 }
 
 impl SlotLease {
-    /// Joins the queue for a slot, or takes the one that is reserved for the client. `listener` receives the events, `world` is shown, and the client counts for its address and
-    /// its user.
+    /// Joins the queue for a slot, or takes the one that is reserved for the client. `listener` receives the events, `world`
+    /// is shown, and the client counts for its address and its user.
     ///
     /// # Errors
     /// Why it may not wait.
@@ -42,7 +42,7 @@ impl SlotLease {
         (client, identity): (Peer, ClientIdentity),
         reservation: Option<ReservationId>,
     ) -> Result<Self, Failure> {
-        let record = SimulationRecord::new(Simulation::new(id, world, identity), client, listener);
+        let record = SimulationRecord::for_client(Simulation::new(id, world, identity), client, listener);
         slots.acquire(record, reservation)?;
         Ok(Self {
             id,
@@ -59,7 +59,7 @@ impl SlotLease {
         kind: SpareKind,
     ) -> Option<Self> {
         let simulation = Simulation::new(id, &kind.world, ClientIdentity::default());
-        let record = SimulationRecord::spare(simulation, kind, listener);
+        let record = SimulationRecord::for_spare(simulation, kind, listener);
         slots.add_spare(record).then(|| Self {
             id,
             slots: Arc::clone(slots),

@@ -17,7 +17,6 @@ use super::port;
 use super::reservations::{Held, LinkId, Reservations, Reserved};
 use super::simulation_record::{Party, SimulationRecord, SlotEvent, SpareKind};
 use crate::shared::domain::{Failure, Instances, Reason, ReservationId, Stage, View, Wish, Wishes};
-use crate::shared::http::Peer;
 use crate::simulation::ends::Ends;
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::snapshot::{Simulation, Snapshot};
@@ -132,7 +131,7 @@ impl SlotPool {
         slots.arrivals += 1;
         let limits = (slots.per_address, slots.per_user);
         let user = record.simulation.identity.user.clone();
-        record.parties = parties(record.client.and_then(Peer::rate_limit_key), user, limits);
+        record.parties = parties(record.address(), user, limits);
         let id = record.simulation.id;
         if let Some(reservation) = reservation {
             record.since = reservation.since;
@@ -167,7 +166,7 @@ impl SlotPool {
         if let Some(record) = slots.records.remove(&id) {
             if let Some(port) = record.simulation.port {
                 slots.reservations.keep_port(id, port);
-                slots.freed += u64::from(record.spare.is_none());
+                slots.freed += u64::from(record.spare().is_none());
                 log::info!(target: "simulation", "{id}: the slot of port {port} is free");
             }
             slots.ends.record(record.ended());
@@ -192,6 +191,8 @@ impl SlotPool {
         self.change(id, |record| {
             record.simulation.away_until = until;
             record.away_since = until.map(|_| Instant::now());
+            // A client that is there again keeps its simulation, also one that was to make room.
+            record.makes_room &= until.is_some();
         });
     }
 
@@ -218,7 +219,8 @@ impl SlotPool {
     /// All simulations at this moment.
     pub fn snapshot(&self) -> Snapshot {
         let slots = self.0.lock();
-        let (spares, of_clients): (Vec<_>, Vec<_>) = slots.records.values().partition(|record| record.spare.is_some());
+        let (spares, of_clients): (Vec<_>, Vec<_>) =
+            slots.records.values().partition(|record| record.spare().is_some());
         let simulations = of_clients.into_iter().map(|record| record.simulation.clone()).collect();
         Snapshot {
             instances: slots.instances(),
@@ -262,9 +264,7 @@ impl Slots {
             .queue()
             .filter(|waiting| may_have(&lent, &waiting.parties))
             .map(|waiting| {
-                let is_behind = self
-                    .reservations
-                    .is_behind(waiting.client.and_then(Peer::rate_limit_key));
+                let is_behind = self.reservations.is_behind(waiting.address());
                 ((is_behind, waiting.since), waiting.simulation.id)
             })
             .min();
@@ -311,7 +311,7 @@ impl Slots {
         let of_clients = self
             .records
             .values()
-            .filter(|record| record.simulation.port.is_some() && record.spare.is_none());
+            .filter(|record| record.simulation.port.is_some() && record.spare().is_none());
         let used = of_clients.count() + self.reservations.reserved.len();
         let free = self.ports.len().saturating_sub(used);
         let lent = self.lent();
@@ -367,9 +367,9 @@ impl Slots {
     }
 
     /// While clients wait because all slots are taken, ends others: one for each, first those that are kept ready without
-    /// a client, then simulations that wait for their own clients: the longest
-    /// absent first, of those absent for `yield_after`, and of addresses for which more than a quarter of the slots waits. So
-    /// somebody who leaves one simulation after the other can't keep all slots.
+    /// a client, then simulations that wait for their own clients: the longest absent first, of those absent for
+    /// `yield_after`, and of addresses for which more than a quarter of the slots waits. So somebody who leaves one
+    /// simulation after the other can't keep all slots.
     fn make_room(&mut self) {
         let waiting = self.waiting();
         if waiting == 0 || self.free_port().is_some() {
@@ -378,7 +378,7 @@ impl Slots {
         let leaving = self
             .records
             .values()
-            .filter(|record| record.makes_room && (record.is_away() || record.spare.is_some()));
+            .filter(|record| record.makes_room && (record.is_away() || record.spare().is_some()));
         for _ in leaving.count()..waiting {
             if let Some(spare) = self.least_spare() {
                 self.end_least(spare);
@@ -397,12 +397,7 @@ impl Slots {
     fn longest_away(&mut self) -> Option<&mut SimulationRecord> {
         let share = (self.ports.len() / 4).max(1);
         let mut away: HashMap<IpAddr, usize> = HashMap::new();
-        let address = |record: &SimulationRecord| {
-            record
-                .client
-                .and_then(Peer::rate_limit_key)
-                .filter(|_| record.is_away() && !record.makes_room)
-        };
+        let address = |record: &SimulationRecord| record.address().filter(|_| record.is_away() && !record.makes_room);
         for address in self.records.values().filter_map(address) {
             *away.entry(address).or_default() += 1;
         }
@@ -441,7 +436,7 @@ impl Slots {
             let matching = self
                 .records
                 .values()
-                .filter(|record| record.spare.is_none() && stages.contains(&record.simulation.stage))
+                .filter(|record| record.spare().is_none() && stages.contains(&record.simulation.stage))
                 .count();
             u32::try_from(matching).unwrap_or(u32::MAX)
         };
@@ -454,7 +449,7 @@ impl Slots {
             arrivals: self.arrivals,
             reserved: u32::try_from(self.reservations.reserved.len()).unwrap_or(u32::MAX),
             freed: self.freed,
-            spare: u32::try_from(self.records.values().filter(|record| record.spare.is_some()).count())
+            spare: u32::try_from(self.records.values().filter(|record| record.spare().is_some()).count())
                 .unwrap_or(u32::MAX),
         }
     }
@@ -483,4 +478,71 @@ pub(super) fn parties(
 pub(super) fn may_have(lent: &HashMap<Party, usize>, parties: &[(Party, usize)]) -> bool {
     let is_left = |(party, most): &(Party, usize)| lent.get(party).is_none_or(|slots| slots < most);
     parties.iter().all(is_left)
+}
+
+#[cfg(test)]
+mod tests {
+    use actix::prelude::*;
+    use tokio::sync::mpsc::{UnboundedSender, unbounded_channel};
+
+    use super::*;
+    use crate::shared::domain::ProjectUrl;
+    use crate::shared::http::{Metrics, Peer};
+    use crate::simulation::client_identity::ClientIdentity;
+    use crate::simulation::slots::SlotLease;
+
+    /// Passes on that its simulation is to make room.
+    struct Listener(UnboundedSender<()>);
+
+    impl Actor for Listener {
+        type Context = Context<Self>;
+    }
+
+    impl Handler<SlotEvent> for Listener {
+        type Result = ();
+
+        fn handle(&mut self, event: SlotEvent, _: &mut Self::Context) {
+            if matches!(event, SlotEvent::MakeRoom) {
+                self.0.send(()).unwrap();
+            }
+        }
+    }
+
+    #[actix_rt::test]
+    async fn who_comes_back_before_it_makes_room_makes_room_the_next_time() {
+        let ends = Ends::start("/nonexistent".into(), String::new(), 12, &Metrics::default()).unwrap();
+        let free = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        let port = free.local_addr().unwrap().port();
+        drop(free);
+        let pool = SlotPool::new(
+            port..=port,
+            1,
+            None,
+            None,
+            Duration::ZERO,
+            Duration::from_secs(10),
+            ends,
+        );
+        let world = ProjectUrl::parse("https://github.com/lab/arm/blob/main/worlds/a.wbt").unwrap();
+        let (sender, mut told) = unbounded_channel();
+        let listener = Listener(sender).start();
+        let ids = [SimulationId::next(), SimulationId::next()];
+        let _leases = ids.map(|id| {
+            let client = (
+                Peer::Proxy(std::net::Ipv4Addr::LOCALHOST.into()),
+                ClientIdentity::default(),
+            );
+            let lease = SlotLease::acquire(&pool, id, listener.clone().recipient(), &world, client, None);
+            lease.ok().unwrap()
+        });
+        // The second client waits for the slot of the first.
+        for _ in 0..2 {
+            pool.mark_away(ids[0], Some(0));
+            pool.0.lock().serve();
+            let made = actix_rt::time::timeout(Duration::from_secs(10), told.recv()).await;
+            assert_eq!(made, Ok(Some(())));
+            // It does not hear that before it is back.
+            pool.mark_away(ids[0], None);
+        }
+    }
 }

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 
 use actix::Recipient;
 
-use super::simulation_record::{SimulationRecord, SlotEvent, SpareKind};
+use super::simulation_record::{RunsFor, SimulationRecord, SlotEvent, SpareKind};
 use super::slot_pool::{SlotPool, Slots, may_have, parties};
 use crate::shared::domain::ReservationId;
 use crate::shared::domain::Stage;
@@ -42,7 +42,7 @@ pub struct Taker {
 impl SimulationRecord {
     /// How far a simulation without a client has come; `None` if it has a client, or ends.
     fn progress(&self) -> Option<Progress> {
-        let is_left = self.spare.is_some() && !self.makes_room && self.end.is_none();
+        let is_left = self.spare().is_some() && !self.makes_room && self.end.is_none();
         match self.simulation.stage {
             Stage::Idle | Stage::Running if is_left => Some(Progress::Ready),
             Stage::Launching if is_left => Some(Progress::Launching),
@@ -52,7 +52,7 @@ impl SimulationRecord {
     }
 
     fn is_of(&self, kind: &SpareKind) -> bool {
-        self.spare.as_ref().is_some_and(|spare| spare.kind == *kind)
+        self.spare().is_some_and(|spare| spare.kind == *kind)
     }
 
     /// Ends a simulation without a client, which then nobody takes any more.
@@ -89,8 +89,7 @@ impl SlotPool {
         let reservation = reservation.map(|id| slots.reservations.redeem(id)).transpose().ok()?;
         slots.arrivals += 1;
         let record = slots.records.get_mut(&id)?;
-        record.spare = None;
-        record.client = Some(taker.peer);
+        record.runs_for = RunsFor::Client(taker.peer);
         record.parties = parties;
         record.since = reservation.map_or_else(std::time::Instant::now, |reservation| reservation.since);
         let now = seconds_since_1970();
@@ -129,7 +128,7 @@ impl SlotPool {
         let slots = self.0.lock();
         let mut spares: BTreeMap<SpareKind, Vec<SpareStatus>> = BTreeMap::new();
         for record in slots.records.values() {
-            let Some((spare, progress)) = record.spare.as_ref().zip(record.progress()) else {
+            let Some((spare, progress)) = record.spare().zip(record.progress()) else {
                 continue;
             };
             let id = record.simulation.id;
@@ -147,7 +146,9 @@ impl SlotPool {
     pub fn outdate_spares(&self, kind: &SpareKind) {
         let mut slots = self.0.lock();
         for record in slots.records.values_mut() {
-            if let Some(spare) = record.spare.as_mut().filter(|spare| spare.kind == *kind) {
+            if let RunsFor::Spare(spare) = &mut record.runs_for
+                && spare.kind == *kind
+            {
                 spare.is_outdated = true;
             }
         }
@@ -171,7 +172,7 @@ impl SlotPool {
         let Some(record) = slots.records.get_mut(&id) else {
             return true;
         };
-        record.makes_room = record.spare.is_some();
+        record.makes_room = record.spare().is_some();
         record.makes_room
     }
 }
@@ -210,5 +211,5 @@ impl Slots {
 }
 
 fn is_outdated(record: &SimulationRecord) -> bool {
-    record.spare.as_ref().is_some_and(|spare| spare.is_outdated)
+    record.spare().is_some_and(|spare| spare.is_outdated)
 }
