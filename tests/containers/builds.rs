@@ -7,7 +7,14 @@ use super::daemon::{
 };
 use super::image::NAME;
 use super::registry::Registry;
-use crate::support::{Client, WORLD, arm, arm_at, is_told, skip, until};
+use crate::support::{Client, Server, WORLD, arm, arm_at, is_told, skip, until};
+
+/// The ids of the images that a server has built.
+fn own_images(server: &Server) -> Vec<String> {
+    let name = format!("webots-fleet/{}", ResourceOwner::of(&server.cache()).0);
+    let ids = ask(&["image", "ls", "--quiet", "--no-trunc", &name]);
+    ids.lines().map(str::to_owned).collect()
+}
 
 #[actix_rt::test]
 async fn a_projects_dockerfile_is_built_once_for_all_clients() {
@@ -30,10 +37,7 @@ async fn a_projects_dockerfile_is_built_once_for_all_clients() {
         let heard = client.heard.join("\n");
         assert!(heard.contains("loading: Step 5/9 : COPY . $PROJECT_PATH"), "{heard}");
     }
-    let images = ask(&["image", "ls", "--format", "{{.Repository}}:{{.Tag}}"]);
-    let owner = ResourceOwner::of(&server.cache());
-    let mine = |name: &&str| name.starts_with(&format!("webots-fleet/{}:", owner.0));
-    assert_eq!(images.lines().filter(mine).count(), 1, "{images}");
+    assert_eq!(own_images(&server).len(), 1);
     for container in of_service(&server, "webots") {
         let built = ask(&[
             "exec",
@@ -202,23 +206,17 @@ async fn an_image_that_is_too_large_is_told_and_removed() {
             .commit("lab/arm", branch, &[("Dockerfile", &dockerfile(&line))]);
     }
     let server = server.start().await;
-    let owner = ResourceOwner::of(&server.cache());
-    let images = || {
-        ask(&["image", "ls", "--quiet", &format!("webots-fleet/{}", owner.0)])
-            .lines()
-            .count()
-    };
     // The second time too, although Docker has kept the layers.
     for _ in 0..2 {
         let (told, code) = refused(&server, &arm_at("large")).await;
         assert!(told.contains("container.imageSize"), "{told}");
-        assert_eq!((code, images()), (Some(1000), 0));
+        assert_eq!((code, own_images(&server).len()), (Some(1000), 0));
     }
     Client::start(&server, &arm_at("small"))
         .await
         .patiently("webots:")
         .await;
-    assert_eq!(images(), 1);
+    assert_eq!(own_images(&server).len(), 1);
 }
 
 #[actix_rt::test]
@@ -262,12 +260,7 @@ async fn above_their_size_images_are_removed_that_were_not_used_for_longest() {
             .commit("lab/arm", branch, &[("Dockerfile", &dockerfile(&line))]);
     }
     let server = server.start().await;
-    let owner = ResourceOwner::of(&server.cache());
-    let images = || {
-        let name = format!("webots-fleet/{}", owner.0);
-        let ids = ask(&["image", "ls", "--quiet", "--no-trunc", &name]);
-        ids.lines().map(str::to_owned).collect::<Vec<_>>()
-    };
+    let images = || own_images(&server);
     // Of the first two the first is used again, and a container uses the last.
     let mut seen = Vec::new();
     for branch in ["a", "b", "a"] {
@@ -288,7 +281,8 @@ async fn above_their_size_images_are_removed_that_were_not_used_for_longest() {
 async fn an_image_that_a_build_has_pulled_is_removed_too() {
     let Some(_docker) = docker().await else { return };
     let registry = Registry::start();
-    let base = format!("127.0.0.1:{}/base:1", registry.port);
+    // Its tag is `latest`.
+    let base = format!("127.0.0.1:{}/base", registry.port);
     let folder = tempfile::tempdir().unwrap();
     let line = format!("FROM {base}\nRUN true\n");
     let builder = server_with(&[("Dockerfile", &line)]).folder(folder.path());

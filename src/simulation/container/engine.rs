@@ -39,11 +39,16 @@ async fn status_of_pull(image: &str) -> std::io::Result<Option<u16>> {
     Ok(line.split(' ').nth(1).and_then(|status| status.parse().ok()))
 }
 
-fn request(image: &str) -> String {
-    // Without a tag the daemon would fetch all.
+/// The name of an image with the tag that it means, if it has neither a tag nor a digest.
+pub fn with_tag(image: &str) -> String {
     let name = image.rsplit('/').next().unwrap_or_default();
     let tag = if name.contains([':', '@']) { "" } else { ":latest" };
-    let image = format!("{image}{tag}");
+    format!("{image}{tag}")
+}
+
+fn request(image: &str) -> String {
+    // Without a tag the daemon would fetch all.
+    let image = with_tag(image);
     let image = utf8_percent_encode(&image, NON_ALPHANUMERIC);
     format!("POST /images/create?fromImage={image} HTTP/1.0\r\nHost: docker\r\nContent-Length: 0\r\n\r\n")
 }

@@ -16,6 +16,7 @@ use tokio::sync::Notify;
 
 use super::docker::{Docker, DockerError, SHORT_TIMEOUT, docker_disk_fault};
 use super::dockerfile::LABEL;
+use super::engine::with_tag;
 use super::owned_resources::ResourceOwner;
 use crate::shared::run::seconds_since_1970;
 use crate::simulation::config::SimulationConfig;
@@ -105,7 +106,9 @@ impl Image {
     /// Whether it begins with another image.
     fn contains(&self, other: &Self) -> bool {
         let is_after = (self.layers.len(), &self.id) > (other.layers.len(), &other.id);
-        is_after && self.layers.starts_with(&other.layers)
+        let begin = self.layers.get(..other.layers.len());
+        // Images of different projects often begin with the same layers: the last one tells soonest.
+        is_after && begin.is_some_and(|begin| begin.iter().rev().eq(other.layers.iter().rev()))
     }
 }
 
@@ -125,6 +128,12 @@ fn room(all: &[Image], is_own: impl Fn(&Image) -> bool) -> u64 {
         image.size.saturating_sub(below.max().unwrap_or_default())
     };
     all.iter().filter(counts).map(besides_below).sum()
+}
+
+/// The name by which Docker lists an image that a configuration or a Dockerfile names so.
+fn listed_name(name: &str) -> String {
+    let name = name.strip_prefix("docker.io/").unwrap_or(name);
+    with_tag(name.strip_prefix("library/").unwrap_or(name))
 }
 
 /// A time in JSON, in seconds since 1970; `None` for the year 1, which an image without a name has.
@@ -153,16 +162,17 @@ impl ImageStore {
 
     /// Keeps an image until the returned value is dropped.
     pub fn keep(&self, name: &str) -> ImageUse {
-        self.uses.lock().entry(name.to_owned()).or_default().now += 1;
+        let name = listed_name(name);
+        self.uses.lock().entry(name.clone()).or_default().now += 1;
         ImageUse {
-            name: name.to_owned(),
+            name,
             uses: Arc::clone(&self.uses),
         }
     }
 
     /// Notes that an image is not there, and will be pulled.
     pub fn expect(&self, name: &str) {
-        self.expected.lock().insert(name.to_owned());
+        self.expected.lock().insert(listed_name(name));
     }
 
     /// Notes that this server has built or pulled an image.
@@ -233,6 +243,9 @@ impl ImageStore {
         let oldest = seconds_since_1970().saturating_sub(self.config.container.images_age * 24 * 60 * 60);
         let is_old = |image: &Image| image.is_named(&self.mark()) && self.last_use(image) < oldest;
         let mut all = self.all().await?;
+        let names: HashSet<&String> = all.iter().flat_map(|image| &image.names).collect();
+        let is_there = |name: &String, of_image: &mut Use| of_image.now > 0 || names.contains(name);
+        self.uses.lock().retain(is_there);
         let mut stays: Vec<String> = Vec::new();
         loop {
             let is_own = |image: &Image| image.is_named(&self.prefix());
@@ -285,8 +298,8 @@ impl ImageStore {
 
     /// Whether the administrator wants to keep it.
     fn is_permanent(&self, image: &Image) -> bool {
-        let permanent = &self.config.persistant_docker_images;
-        image.names.iter().any(|name| permanent.contains(name))
+        let mut permanent = self.config.persistant_docker_images.iter();
+        permanent.any(|name| image.names.contains(&listed_name(name)))
     }
 
     /// When an image was last used or got its name, in seconds since 1970.
@@ -342,6 +355,20 @@ mod tests {
         assert_eq!(read.names, ["webots-fleet/o:a"]);
         assert_eq!(read.layers, ["x", "y"]);
         assert_eq!(seconds("\"0001-01-01T00:00:00Z\""), None);
+    }
+
+    #[test]
+    fn a_name_is_as_docker_lists_it() {
+        for (name, listed) in [
+            ("debian", "debian:latest"),
+            ("docker.io/library/debian:12", "debian:12"),
+            ("docker.io/lab/arm", "lab/arm:latest"),
+            ("127.0.0.1:5000/lab/arm", "127.0.0.1:5000/lab/arm:latest"),
+            ("lab/arm@sha256:0123", "lab/arm@sha256:0123"),
+            ("webots-fleet/o:a", "webots-fleet/o:a"),
+        ] {
+            assert_eq!(listed_name(name), listed);
+        }
     }
 
     #[test]
