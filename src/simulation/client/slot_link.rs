@@ -130,9 +130,6 @@ impl SlotLink {
         }
         self.roster.get_or_insert_default().has_figures = follow.figures;
         self.tell_changes(ctx);
-        if follow.figures {
-            self.measure(ctx);
-        }
     }
 
     fn tell_changes(&mut self, ctx: &mut Context) {

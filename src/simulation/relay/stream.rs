@@ -1,6 +1,6 @@
 //! One stream between a client and its Webots. The bytes are copied as they are: frames, their kinds and close codes are not
-//! parsed, except for the last frame of a simulation that the server ends; once a second the time of an update is looked for. Each direction is read only as fast as the
-//! other end takes it.
+//! parsed, except for the last frame of a simulation that the server ends; once a second the time of an update is looked
+//! for. Each direction is read only as fast as the other end takes it.
 
 use std::io::{self, ErrorKind, Read, Write};
 use std::net::{Shutdown, TcpStream};
