@@ -3,6 +3,7 @@
 
 import './announce.js';
 import { find, make, setText } from './dom.js';
+import { follow } from './server_events.js';
 import { makeSortable, sort as sortTable } from './table.js';
 import { timeOfDay } from './times.js';
 
@@ -11,7 +12,7 @@ import { timeOfDay } from './times.js';
  *   awayUntil?: number, cpu?: number, realTime?: number }} Entry
  */
 /** A simulation server. @typedef {{ address: string, page: string, state: string, note: string, simulations?: number }} Server */
-/** An event. @typedef {{ version?: string, all?: boolean, changed?: Entry[], gone?: [string | null, string][],
+/** An event. @typedef {{ all?: boolean, changed?: Entry[], gone?: [string | null, string][],
  *   servers?: Server[], announcement?: string }} Update
  */
 
@@ -20,7 +21,6 @@ import { timeOfDay } from './times.js';
 const body = find('class', HTMLTableSectionElement);
 const field = find('filter', HTMLInputElement);
 const all = find('stop-all', HTMLButtonElement);
-const lamp = find('live', HTMLElement);
 const dialog = find('stop', HTMLDialogElement);
 const problem = find('stop-problem', HTMLElement);
 const reason = find('stop-reason', HTMLInputElement);
@@ -30,11 +30,6 @@ const rows = new Map();
 const names = new Map();
 /** The ids of the simulations that the dialog is about. @type {string[]} */
 let chosen = [];
-/** @type {EventSource | undefined} */
-let source;
-let heard = Date.now();
-/** The server sends something every 15 seconds. */
-const SILENCE = 40_000;
 /** Most ids in one order. */
 const BATCH = 200;
 
@@ -247,15 +242,8 @@ function showServers(servers) {
   find('servers', HTMLElement).replaceChildren(...items);
 }
 
-/** @param {MessageEvent} event */
-function take(event) {
-  heard = Date.now();
-  /** @type {Update} */
-  const { version, all: isAll, changed, gone, servers, announcement } = JSON.parse(event.data);
-  if (version && version !== document.documentElement.dataset.version) {
-    location.reload();
-    return;
-  }
+/** @param {Update} update */
+function take({ all: isAll, changed, gone, servers, announcement }) {
   if (isAll) {
     const there = new Set((changed ?? []).map((entry) => keyOf(entry.server, entry.id)));
     [...rows.keys()].filter((key) => !there.has(key)).forEach(drop);
@@ -327,48 +315,6 @@ async function stopNow(event) {
   }
 }
 
-/**
- * @param {string} text
- * @param {boolean} lost
- */
-function say(text, lost) {
-  setText(lamp, text);
-  lamp.classList.toggle('lost', lost);
-}
-
-function lose() {
-  if (!lamp.classList.contains('lost')) {
-    say(`No connection since ${timeOfDay(heard / 1000)}: what you see is old. Trying again …`, true);
-  }
-}
-
-function rest() {
-  source?.close();
-  source = undefined;
-}
-
-/** A hidden tab does not listen: browsers allow few connections to one server. */
-function listen() {
-  if (document.hidden || source) {
-    return;
-  }
-  heard = Date.now();
-  source = new EventSource('class/events');
-  source.addEventListener('open', () => {
-    heard = Date.now();
-    say('Live', false);
-  });
-  source.addEventListener('message', take);
-  source.addEventListener('error', () => {
-    lose();
-    if (source?.readyState === EventSource.CLOSED) {
-      rest();
-      signInAgain();
-      setTimeout(listen, 3000);
-    }
-  });
-}
-
 /** Leads to the form if the sign-in has ended. */
 async function signInAgain() {
   const answer = await fetch('simulations', { method: 'HEAD', headers: { 'X-Requested-With': 'page' } }).catch(
@@ -378,15 +324,6 @@ async function signInAgain() {
     location.assign('sign-in?to=class');
   }
 }
-
-/** A server that hangs, or a network that drops everything, does not close the connection. */
-setInterval(() => {
-  if (source && Date.now() - heard > SILENCE) {
-    lose();
-    rest();
-    listen();
-  }
-}, 5000);
 
 /* The records of a lesson: by default, of the last two hours. */
 
@@ -425,7 +362,4 @@ all.addEventListener('click', () => {
 });
 find('stop-form', HTMLFormElement).addEventListener('submit', stopNow);
 find('stop-cancel', HTMLButtonElement).addEventListener('click', () => dialog.close());
-document.addEventListener('visibilitychange', () => (document.hidden ? rest() : listen()));
-addEventListener('pagehide', rest);
-addEventListener('pageshow', listen);
-listen();
+follow('class/events', take, { closed: signInAgain });

@@ -2,31 +2,26 @@
 // contents of elements) and tables (their rows), as HTML that the server renders from the same templates as the page.
 
 import { find, setText } from './dom.js';
+import { follow } from './server_events.js';
 import { makeSortable, sort } from './table.js';
 import { showTimes } from './times.js';
 
 /** Gets the numbers of an event, and whether events may have been missed before. @typedef {(sample: number[], fresh: boolean) => void} Listener */
 /** A row of a table, as the server renders it. @typedef {{ key: string, html: string }} Row */
 /** An event: parts by the ids of elements, tables by those of their bodies.
- * @typedef {{ version?: string, parts?: Record<string, string>, tables?: Record<string, Row[]>, sample?: number[] }} Update
+ * @typedef {{ parts?: Record<string, string>, tables?: Record<string, Row[]>, sample?: number[] }} Update
  */
 
 /** @type {Listener[]} */
 const listeners = [];
-const lamp = find('live', HTMLElement);
 /** The HTML that each part and each row of a table was last filled with. @type {WeakMap<Element, string>} */
 const known = new WeakMap();
 /** The HTML of the cells of rows. @type {WeakMap<Element, string[]>} */
 const cells = new WeakMap();
-/** @type {EventSource | undefined} */
-let source;
-/** Time of the last message from the server; it sends one every 15 seconds. */
-let heard = Date.now();
 /** Whether events may have been missed before the next one. */
 let fresh = false;
 /** @type {string | undefined} */
 let lastSample;
-const SILENCE = 40_000;
 
 /**
  * Calls a function with the numbers of each event that has some.
@@ -34,15 +29,6 @@ const SILENCE = 40_000;
  */
 export function onSample(listener) {
   listeners.push(listener);
-}
-
-/**
- * @param {string} text
- * @param {boolean} lost
- */
-function say(text, lost) {
-  lamp.textContent = text;
-  lamp.classList.toggle('lost', lost);
 }
 
 /**
@@ -161,15 +147,8 @@ function noteRows(body) {
   });
 }
 
-/** @param {MessageEvent} event */
-function take(event) {
-  heard = Date.now();
-  /** @type {Update} */
-  const { version, parts = {}, tables = {}, sample = [] } = JSON.parse(event.data);
-  if (version && version !== document.documentElement.dataset.version) {
-    location.reload();
-    return;
-  }
+/** @param {Update} update */
+function take({ parts = {}, tables = {}, sample = [] }) {
   for (const [id, html] of Object.entries(parts)) {
     fillPart(find(id, HTMLElement), html);
   }
@@ -181,49 +160,6 @@ function take(event) {
     listeners.forEach((listener) => listener(sample, fresh));
     fresh = false;
   }
-}
-
-/** A hidden tab does not listen: browsers allow few connections to one server. */
-function listen() {
-  if (document.hidden || source) {
-    return;
-  }
-  heard = Date.now();
-  source = new EventSource('events');
-  source.addEventListener('open', () => {
-    heard = Date.now();
-    fresh = true;
-    say('Live', false);
-  });
-  source.addEventListener('message', take);
-  source.addEventListener('error', () => {
-    lose();
-    if (source?.readyState === EventSource.CLOSED) {
-      rest();
-      setTimeout(listen, 3000);
-    }
-  });
-}
-
-function lose() {
-  const since = new Date(heard).toLocaleTimeString();
-  if (!lamp.classList.contains('lost')) {
-    say(`No connection since ${since}: what you see is old. Trying again …`, true);
-  }
-}
-
-/** A server that hangs, or a network that drops everything, does not close the connection. */
-setInterval(() => {
-  if (source && Date.now() - heard > SILENCE) {
-    lose();
-    rest();
-    listen();
-  }
-}, 5000);
-
-function rest() {
-  source?.close();
-  source = undefined;
 }
 
 for (const table of document.querySelectorAll('table')) {
@@ -244,7 +180,8 @@ for (const field of document.querySelectorAll('[data-filter]')) {
   });
 }
 showTimes(document);
-document.addEventListener('visibilitychange', () => (document.hidden ? rest() : listen()));
-addEventListener('pagehide', rest);
-addEventListener('pageshow', listen);
-listen();
+follow('events', take, {
+  opened: () => {
+    fresh = true;
+  },
+});

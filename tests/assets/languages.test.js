@@ -101,6 +101,7 @@ test('modules have no words of their own', () => {
     'chart.js',
     'live.js',
     'class.js',
+    'server_events.js',
     'announce.js',
     'simulation_monitor.js',
     'times.js',

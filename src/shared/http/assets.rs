@@ -20,6 +20,7 @@ pub const COMMON: &[Asset] = &[
     asset!("style.css"),
     asset!("icon.svg"),
     asset!("live.js"),
+    asset!("server_events.js"),
     asset!("table.js"),
     asset!("times.js"),
     asset!("dom.js"),
