@@ -65,7 +65,13 @@ test('each language has a text for each code and name, without one of English', 
 test('the pages and the element have the English words that they name, and no others', () => {
   /** @type {Set<string>} */
   const used = new Set();
-  for (const path of ['page.html', 'session/viewer.html', 'simulation/watch.html', 'simulation/who.html']) {
+  for (const path of [
+    'page.html',
+    'session/viewer.html',
+    'session/embedded.html',
+    'simulation/watch.html',
+    'simulation/who.html',
+  ]) {
     const html = read(path)
       .replace(/<noscript>.*?<\/noscript>/gs, '')
       .replace(
