@@ -23,6 +23,7 @@ use crate::session::class::{Changes, ClassEntry, Key, Matching, Watching};
 use crate::session::fleet::{FleetStatus, GetMonitors, GetRecords, ServerStatus, StateName};
 use crate::session::state::AppState;
 use crate::shared::domain::PublicAddress;
+use crate::shared::http::assets::accepts_gzip;
 use crate::shared::http::routing::{GET, POST, READ, json_body, path};
 use crate::shared::http::time_span::{TimeSpan, csv_file};
 use crate::shared::http::{ConnectionKind, ConnectionPermit, OWN_FILES, html, sign_in};
@@ -305,9 +306,11 @@ async fn events(request: HttpRequest, server: web::Data<AppState>) -> Result<Htt
         .connections
         .admit(ConnectionKind::Page, server.config.trusted_proxies.peer(&request))?;
     server.admin_auth.reader(&request)?;
-    let header = |name| request.headers().get(name).and_then(|value| value.to_str().ok());
-    let known = header(header::HeaderName::from_static("last-event-id"));
-    let is_compressed = header(header::ACCEPT_ENCODING).is_some_and(|codings| codings.contains("gzip"));
+    let known = request
+        .headers()
+        .get("last-event-id")
+        .and_then(|value| value.to_str().ok());
+    let is_compressed = accepts_gzip(&request);
     let mut feed = Feed {
         known: known.and_then(|id| id.strip_prefix(&format!("{}-", server.run))?.parse().ok()),
         servers: String::new(),

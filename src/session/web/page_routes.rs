@@ -17,7 +17,7 @@ use crate::shared::http::{ConnectionKind, FOREIGN_SCRIPTS, OWN_FILES, PageView, 
 use crate::shared::run::timestamp;
 
 /// Assets of this server's pages, besides those that both servers share.
-const ASSETS: &[Asset] = &[
+static ASSETS: [Asset; 17] = [
     asset!("viewer.js"),
     asset!("viewer.css"),
     asset!("embed.js"),
@@ -130,5 +130,5 @@ async fn embed_types() -> HttpResponse {
 }
 
 async fn asset(request: HttpRequest) -> HttpResponse {
-    assets::answer(&request, ASSETS)
+    assets::answer(&request, &ASSETS)
 }

@@ -1,21 +1,64 @@
 //! Style sheets, scripts and images of the pages, which are embedded in the program.
 
-use actix_files::file_extension_to_mime;
-use actix_web::{HttpRequest, HttpResponse};
+use std::io::Write;
+use std::sync::LazyLock;
 
-/// A file that pages refer to as `assets/NAME`: its name and its content. The extension determines the type.
-pub type Asset = (&'static str, &'static str);
+use actix_files::file_extension_to_mime;
+use actix_web::http::header::{self, AcceptEncoding, Encoding};
+use actix_web::web::Bytes;
+use actix_web::{HttpMessage, HttpRequest, HttpResponse};
+use flate2::Compression;
+use flate2::write::GzEncoder;
+
+/// A file that pages refer to as `assets/NAME`. The extension determines the type.
+pub struct Asset {
+    name: &'static str,
+    content: LazyLock<Content>,
+}
+
+impl Asset {
+    /// An asset whose content is made at its first request.
+    pub const fn new(name: &'static str, content: fn() -> Content) -> Self {
+        Self {
+            name,
+            content: LazyLock::new(content),
+        }
+    }
+}
+
+/// What is sent: the same for all requests.
+pub struct Content {
+    plain: Bytes,
+    gzip: Bytes,
+}
+
+impl Content {
+    /// The content of a file. Scripts and style sheets are sent without their comments.
+    pub fn new(name: &str, text: &'static str) -> Self {
+        let plain = match extension(name) {
+            "js" | "css" => without_comments(text).into(),
+            _ => Bytes::from_static(text.as_bytes()),
+        };
+        let gzip = compressed(&plain);
+        Self { plain, gzip }
+    }
+}
 
 /// Embeds a file of `templates/assets` at build time.
 #[macro_export]
 macro_rules! asset {
     ($name:literal) => {
-        ($name, include_str!(concat!("../../../templates/assets/", $name)))
+        $crate::shared::http::assets::Asset::new($name, || {
+            $crate::shared::http::assets::Content::new(
+                $name,
+                include_str!(concat!("../../../templates/assets/", $name)),
+            )
+        })
     };
 }
 
 /// Assets that pages of both servers use: of each page, of live pages, and of the viewers.
-pub const COMMON: &[Asset] = &[
+static COMMON: [Asset; 26] = [
     asset!("theme.css"),
     asset!("style.css"),
     asset!("icon.svg"),
@@ -47,21 +90,42 @@ pub const COMMON: &[Asset] = &[
 /// Answers a request for one of these files. Browsers fetch it again for each page.
 pub fn answer(request: &HttpRequest, assets: &[Asset]) -> HttpResponse {
     let name = request.match_info().get("name").unwrap_or_default();
-    let Some((_, text)) = assets.iter().chain(COMMON).find(|(known, _)| *known == name) else {
+    let Some(asset) = assets.iter().chain(&COMMON).find(|asset| asset.name == name) else {
         return HttpResponse::NotFound().body("Error: there is no such file.");
     };
-    let extension = name.rsplit('.').next().unwrap_or_default();
-    let content = match extension {
-        "js" | "css" => without_comments(text),
-        _ => (*text).to_owned(),
-    };
-    HttpResponse::Ok()
-        .content_type(file_extension_to_mime(extension))
-        .body(content)
+    let mut response = HttpResponse::Ok();
+    response
+        .content_type(file_extension_to_mime(extension(name)))
+        .insert_header((header::VARY, "Accept-Encoding"));
+    if accepts_gzip(request) {
+        response
+            .insert_header((header::CONTENT_ENCODING, "gzip"))
+            .body(asset.content.gzip.clone())
+    } else {
+        response.body(asset.content.plain.clone())
+    }
 }
 
-/// A script or style sheet without the comments that have lines of their own: these are a third of it, also once it is
-/// compressed.
+/// Whether the client of a request can read an answer that is compressed by gzip.
+pub fn accepts_gzip(request: &HttpRequest) -> bool {
+    let known = [Encoding::gzip(), Encoding::identity()];
+    let accepted = request.get_header::<AcceptEncoding>();
+    accepted.and_then(|accepted| accepted.negotiate(known.iter())) == Some(Encoding::gzip())
+}
+
+fn extension(name: &str) -> &str {
+    name.rsplit('.').next().unwrap_or_default()
+}
+
+/// Compresses by gzip. Writing to memory does not fail; otherwise it would be empty.
+fn compressed(text: &[u8]) -> Bytes {
+    let mut encoder = GzEncoder::new(Vec::new(), Compression::best());
+    let written = encoder.write_all(text).and_then(|()| encoder.finish());
+    written.unwrap_or_default().into()
+}
+
+/// A script or style sheet without the comments that have lines of their own, and without empty lines: these are a third
+/// of it, also once it is compressed. It reads no strings: a test checks that no text has several lines.
 fn without_comments(text: &str) -> String {
     let mut code = String::with_capacity(text.len());
     let mut is_comment = false;
@@ -87,6 +151,8 @@ fn without_comments(text: &str) -> String {
 
 #[cfg(test)]
 mod tests {
+    use actix_web::test::TestRequest;
+
     use super::*;
 
     #[test]
@@ -94,5 +160,48 @@ mod tests {
         let text = "// One.\nlet a = 1; // stays\n\n/** Two,\n * more */\nlet b = '/* no */';\n  /** @type {X} */ (a).b();\n/* three\n*/ c();\n";
         let code = "let a = 1; // stays\nlet b = '/* no */';\n (a).b();\n c();\n";
         assert_eq!(without_comments(text), code);
+    }
+
+    /// The first line with what could be damaged: a comment that begins after code and goes on in the next line, or a
+    /// template literal over several lines, which may have lines that are empty or look like comments.
+    fn damaged(script: &str) -> Option<String> {
+        let code = without_comments(script);
+        let could_be = |line: &&str| line.rfind("/*") > line.rfind("*/") || line.matches('`').count() % 2 == 1;
+        code.lines().find(could_be).map(str::to_owned)
+    }
+
+    #[test]
+    fn no_script_is_damaged_when_its_comments_are_left_out() {
+        assert!(damaged("a = 1; /* one\n// two */ b = 2;").is_some());
+        assert!(damaged("a = `one\n\n// two`;").is_some());
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/templates/assets");
+        let paths = std::fs::read_dir(folder).unwrap().map(|file| file.unwrap().path());
+        // In the shaders of draw.js, these lines are comments too.
+        for path in paths.filter(|path| !path.ends_with("draw.js")) {
+            let text = std::fs::read_to_string(&path).unwrap();
+            assert_eq!(damaged(&text), None, "{}", path.display());
+        }
+    }
+
+    #[test]
+    fn who_can_read_it_gets_it_compressed() {
+        let text = "let a = 1;\n".repeat(100);
+        let mut unpacked = Vec::new();
+        flate2::write::GzDecoder::new(&mut unpacked)
+            .write_all(&compressed(text.as_bytes()))
+            .unwrap();
+        assert_eq!(unpacked, text.as_bytes());
+        for (accepted, is_read) in [
+            (Some("gzip, deflate, br"), true),
+            (Some("gzip;q=0, br"), false),
+            (Some("identity"), false),
+            (None, false),
+        ] {
+            let mut request = TestRequest::default();
+            if let Some(accepted) = accepted {
+                request = request.insert_header((header::ACCEPT_ENCODING, accepted));
+            }
+            assert_eq!(accepts_gzip(&request.to_http_request()), is_read, "{accepted:?}");
+        }
     }
 }

@@ -20,7 +20,7 @@ use crate::simulation::snapshot::Simulation;
 use crate::simulation::state::AppState;
 
 /// Assets of this server's page, besides those of all pages.
-const ASSETS: &[Asset] = &[
+static ASSETS: [Asset; 5] = [
     asset!("charts.css"),
     asset!("charts.js"),
     asset!("chart.js"),
@@ -110,7 +110,7 @@ async fn history(server: web::Data<AppState>) -> HttpResponse {
 }
 
 async fn asset(request: HttpRequest) -> HttpResponse {
-    assets::answer(&request, ASSETS)
+    assets::answer(&request, &ASSETS)
 }
 
 /// Which simulation, and by which viewer.
