@@ -20,6 +20,8 @@ import { VisitRunner } from './visit_runner.js';
 const BASE = new URL('..', import.meta.url).href;
 const STYLES = ['theme.css', 'simulation.css'];
 const NAME = 'webots-simulation';
+/** The names of the stores of the elements that are in this page. @type {Set<string>} */
+const storeNames = new Set();
 
 export class WebotsSimulation extends HTMLElement {
   static observedAttributes = ['name'];
@@ -28,6 +30,8 @@ export class WebotsSimulation extends HTMLElement {
   #panel;
   /** @type {VisitRunner | undefined} */
   #runner;
+  /** The name of its store. */
+  #storeName = '';
   /** What is called before the element is ready. @type {(() => void)[]} */
   #calls = [];
   #isOpening = false;
@@ -96,6 +100,7 @@ export class WebotsSimulation extends HTMLElement {
   connectedCallback() {
     if (!this.#runner && !this.#isOpening) {
       this.#isOpening = true;
+      this.#storeName = this.#nameStore();
       this.#open();
     }
   }
@@ -135,6 +140,7 @@ export class WebotsSimulation extends HTMLElement {
     this.#isOpening = false;
     // It may be gone again.
     if (!this.isConnected) {
+      storeNames.delete(this.#storeName);
       return;
     }
     const take = (/** @type {VisitEvent} */ event) => this.#runner?.take(event);
@@ -146,15 +152,26 @@ export class WebotsSimulation extends HTMLElement {
     panel.nameVisitor(this.#name);
     root.append(panel.element);
     this.#panel = panel;
-    const store = new Store(`${NAME} ${location.pathname} ${this.id || this.#number()}`);
-    this.#runner = new VisitRunner(BASE, store, panel, () => this.#choices(), this.#changed.bind(this));
+    this.#runner = new VisitRunner(
+      BASE,
+      new Store(this.#storeName),
+      panel,
+      () => this.#choices(),
+      this.#changed.bind(this),
+    );
     this.#listen();
     this.#begin();
   }
 
-  /** The number of this element among those without an id. */
-  #number() {
-    return [...document.querySelectorAll(`${NAME}:not([id])`)].indexOf(this);
+  /** A name that no other element of the page has: elements with the same id, or without one, are numbered. */
+  #nameStore() {
+    const name = `${NAME} ${location.pathname} ${this.id}`;
+    let free = name;
+    for (let number = 2; storeNames.has(free); number += 1) {
+      free = `${name} ${number}`;
+    }
+    storeNames.add(free);
+    return free;
   }
 
   #choices() {
@@ -193,7 +210,10 @@ export class WebotsSimulation extends HTMLElement {
 
   #close() {
     this.#listening?.abort();
-    this.#runner?.close();
+    if (this.#runner) {
+      this.#runner.close();
+      storeNames.delete(this.#storeName);
+    }
     this.#runner = undefined;
     this.#panel = undefined;
     this.#calls = [];

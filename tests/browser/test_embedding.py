@@ -103,6 +103,37 @@ class PrintedPages(Embedding):
         tab.evaluate("document.getElementById('left').stop()")
         until("the other has ended", lambda: not self.simulations())
 
+    def test_elements_without_an_id_keep_apart_when_one_is_removed_and_another_added(self):
+        page = self.visit("race", re.sub(' id="(left|right)"', "", printed("Two simulations")))
+        tab = page.tab
+        modes = tab.locator("webots-simulation #mode")
+        expect(modes).to_have_text(["real time"] * 2)
+        before = {one["id"] for one in self.simulations()}
+        tab.evaluate("""() => {
+          const [first] = document.querySelectorAll('webots-simulation');
+          const another = first.cloneNode();
+          first.remove();
+          document.querySelector('main').append(another);
+        }""")
+        until("one is replaced", lambda: len({one["id"] for one in self.simulations()} - before) == 1)
+        expect(modes).to_have_text(["real time"] * 2)
+        self.assertEqual(len({one["id"] for one in self.simulations()} & before), 1)
+        # Those of a component, in a shadow root of its own, too.
+        tab.evaluate("""() => {
+          const [one] = document.querySelectorAll('webots-simulation');
+          const component = document.createElement('div');
+          component.attachShadow({ mode: 'open' }).append(one.cloneNode(), one.cloneNode());
+          document.body.append(component);
+        }""")
+        expect(modes).to_have_text(["real time"] * 4)
+        self.assertEqual(len(self.simulations()), 4)
+        tab.evaluate("""() => {
+          const component = document.body.lastElementChild;
+          for (const root of [document, component.shadowRoot])
+            root.querySelectorAll('webots-simulation').forEach((one) => one.remove());
+        }""")
+        until("all have ended", lambda: not self.simulations())
+
     def test_the_element_is_in_order_in_all_languages_and_both_schemes_narrow_and_enlarged(self):
         languages = ["en", "de", "fr", "es", "zh", "ja"]
         for number, (language, scheme) in enumerate(itertools.product(languages, ["light", "dark"])):
