@@ -1,5 +1,6 @@
 //! The files of `deploy/`, checked by programs that read such files.
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -67,5 +68,48 @@ fn the_autostart_entries_run_the_programs_of_the_units() {
         );
         let validated = Command::new("desktop-file-validate").arg(&file).output().unwrap();
         assert!(validated.status.success(), "{validated:?}");
+    }
+}
+
+/// The paths of the session server's routes, as the rules of web servers name them.
+fn session_paths() -> BTreeSet<String> {
+    let source = concat!(env!("CARGO_MANIFEST_DIR"), "/src");
+    let folders =
+        ["session/web", "shared/http"].map(|folder| std::fs::read_dir(Path::new(source).join(folder)).unwrap());
+    let files = folders
+        .into_iter()
+        .flatten()
+        .map(|file| std::fs::read_to_string(file.unwrap().path()).unwrap());
+    let mut paths = BTreeSet::new();
+    for text in files {
+        let routes = text.split("path(\"/").skip(1).filter_map(|rest| rest.split_once('"'));
+        paths.extend(routes.map(|(path, _)| {
+            path.replace('.', "\\.")
+                .replace("simulations/{id}", "simulations/[0-9T-]+")
+                .replace("{name}", "[^/]+")
+        }));
+    }
+    paths
+}
+
+#[test]
+fn web_servers_lead_to_all_paths_of_the_session_server_and_to_no_others() {
+    let all = session_paths();
+    assert!(all.len() > 20, "{all:?}");
+    for file in [
+        "apache.conf",
+        "nginx.conf",
+        "nginx-door.conf",
+        "swarm/door.conf",
+        "kubernetes/base/config/fleet.conf",
+    ] {
+        let text = std::fs::read_to_string(deploy(file)).unwrap();
+        let (_, rest) = text.split_once("session|request|").unwrap();
+        let (names, _) = rest.split_once(")$").unwrap();
+        let names = format!("session|request|{names}");
+        let mut named: BTreeSet<_> = names.split('|').map(str::to_owned).collect();
+        // Swarm and Kubernetes show the metrics only inside.
+        named.insert("metrics".to_owned());
+        assert_eq!(named, all, "{file}");
     }
 }
