@@ -1,10 +1,13 @@
 """The base of all browser tests: one fleet per class, one browser per file; logs are printed if a test fails."""
 
+import pathlib
+import shutil
 import sys
+import tempfile
 import unittest
 
 from browser import Browser
-from fleet import SOON, Fleet, until
+from fleet import BIN, SOON, Fleet, until
 from playwright.sync_api import expect
 
 expect.set_options(timeout=1000 * SOON)
@@ -49,6 +52,16 @@ class BrowserTest(unittest.TestCase):
     @classmethod
     def make_fleet(cls):
         return Fleet(cls.session, cls.simulation, cls.strangers)
+
+    @classmethod
+    def fleet_of_script(cls, script):
+        """A fleet whose Webots, `cls.webots`, is a shell script, which has its `$folder` and the demo `$simulator`."""
+        folder = pathlib.Path(tempfile.mkdtemp(prefix="fleet-webots-"))
+        cls.addClassCleanup(shutil.rmtree, folder)
+        cls.webots = folder / "webots"
+        cls.webots.write_text(f'#!/bin/sh\nfolder="{folder}" simulator="{BIN}/demo-simulator"\n{script}\n')
+        cls.webots.chmod(0o755)
+        return Fleet(simulation={"webots": str(cls.webots), "isolation": "none"})
 
     def run(self, result=None):
         before = len(result.failures) + len(result.errors)

@@ -2,14 +2,11 @@
 
 import itertools
 import json
-import pathlib
 import re
-import shutil
-import tempfile
 import unittest
 
 from case import KEPT, Running, kept, seconds
-from fleet import BIN, ROOT, WORLD, Fleet, free_ports, until
+from fleet import ROOT, WORLD, free_ports, until
 from playwright.sync_api import expect
 
 
@@ -144,13 +141,9 @@ class Starting(Running):
 
     @classmethod
     def make_fleet(cls):
-        folder = pathlib.Path(tempfile.mkdtemp(prefix="fleet-webots-"))
-        cls.addClassCleanup(shutil.rmtree, folder)
-        cls.gate = folder / "gate"
-        webots = folder / "webots"
-        webots.write_text(f'#!/bin/sh\nuntil [ -e {cls.gate} ]; do sleep 0.1; done\nexec {BIN}/demo-simulator "$@"\n')
-        webots.chmod(0o755)
-        return Fleet(simulation={"webots": str(webots), "isolation": "none"})
+        fleet = cls.fleet_of_script('until [ -e "$folder/gate" ]; do sleep 0.1; done\nexec "$simulator" "$@"')
+        cls.gate = cls.webots.with_name("gate")
+        return fleet
 
     def test_a_link_starts_it_and_a_reload_at_any_time_goes_on(self):
         page = self.open(self.fleet.session.url(f"viewer?url={WORLD.format('playground')}&start=1&play=1"))

@@ -1,21 +1,18 @@
 """What a simulator prints is shown as its own words and decides nothing, whatever server's sentence it resembles."""
 
-import pathlib
-import shutil
-import tempfile
 import unittest
 
 from case import BrowserTest
-from fleet import BIN, Fleet, until
+from fleet import until
 from playwright.sync_api import expect
 
 # Runs the demo simulator until there is a file with last words, which it prints.
-WEBOTS = """#!/bin/sh
-"{simulator}" "$@" &
-until [ -s "{words}" ]; do sleep 0.1; done
+WEBOTS = """
+"$simulator" "$@" &
+until [ -s "$folder/words" ]; do sleep 0.1; done
 kill $!
 wait
-cat "{words}"
+cat "$folder/words"
 exit 3
 """
 # As a crash of Webots, but before it listens.
@@ -29,13 +26,9 @@ exit 3
 class HostileWords(BrowserTest):
     @classmethod
     def make_fleet(cls):
-        folder = pathlib.Path(tempfile.mkdtemp(prefix="fleet-webots-"))
-        cls.addClassCleanup(shutil.rmtree, folder)
-        cls.words = folder / "words"
-        cls.webots = folder / "webots"
-        cls.webots.write_text(WEBOTS.format(simulator=BIN / "demo-simulator", words=cls.words))
-        cls.webots.chmod(0o755)
-        return Fleet(simulation={"webots": str(cls.webots), "isolation": "none"})
+        fleet = cls.fleet_of_script(WEBOTS)
+        cls.words = cls.webots.with_name("words")
+        return fleet
 
     def starts(self):
         """Number of simulations that were asked for."""

@@ -1,13 +1,10 @@
 """The viewer requests another simulation server if the one it was sent to drains, is gone, or can't start anything."""
 
-import pathlib
-import shutil
 import signal
-import tempfile
 import unittest
 
 from case import BrowserTest
-from fleet import BIN, Fleet, until
+from fleet import until
 from playwright.sync_api import expect
 
 
@@ -66,13 +63,9 @@ class Failing(LeavingServers):
 
     @classmethod
     def make_fleet(cls):
-        folder = pathlib.Path(tempfile.mkdtemp(prefix="fleet-webots-"))
-        cls.addClassCleanup(shutil.rmtree, folder)
-        cls.repaired = folder / "repaired"
-        webots = folder / "webots"
-        webots.write_text(f'#!/bin/sh\n[ -e {cls.repaired} ] || exit 3\nexec "{BIN / "demo-simulator"}" "$@"\n')
-        webots.chmod(0o755)
-        return Fleet(simulation={"webots": str(webots), "isolation": "none"})
+        fleet = cls.fleet_of_script('[ -e "$folder/repaired" ] || exit 3\nexec "$simulator" "$@"')
+        cls.repaired = cls.webots.with_name("repaired")
+        return fleet
 
     def failures(self):
         servers = (self.fleet.simulation, self.fleet.other)
