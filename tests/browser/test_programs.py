@@ -20,7 +20,7 @@ from students import START
 
 TOKEN = "0123456789abcdef0123456789abcdef"
 KEY = "a key of a whole fleet"
-# What docs/programs.md shows, but for a class that is there already.
+# More than docs/programs.md shows.
 CLIENT = """
 import json, sys
 from fleet_client import AuthenticatedClient
@@ -52,8 +52,12 @@ class Programs(BrowserTest):
         for name in names:
             self.students.tab.evaluate(START, [WORLD.format("carousel"), name])
         self.students.tab.evaluate("Promise.all(simulations)")
-        labels = lambda: Counter(one["label"] for one in json.loads(self.ask(self.fleet.session, "simulations")))
-        until("all are listed", lambda: not Counter(names) - labels())
+
+        def started():
+            everybody = json.loads(self.ask(self.fleet.session, "simulations"))
+            return Counter(one["label"] for one in everybody if one["state"] in ("idle", "running"))
+
+        until("all are listed as started", lambda: not Counter(names) - started())
 
     def ask(self, server, path, body=None):
         headers = {"Authorization": f"Bearer {TOKEN}"}
@@ -148,6 +152,11 @@ class Programs(BrowserTest):
                 sys.executable, "-c", CLIENT, self.fleet.session.url("").rstrip("/"), TOKEN, cwd=folder
             )
             self.assertEqual(said, "['Anna', 'Ben', 'Ben']\nTrue\n2\nTrue\n")
+            self.start("Chloe")
+            (example,) = re.findall(r"```py\n(.*?)```", (ROOT / "docs/programs.md").read_text(), re.DOTALL)
+            names = "import os\nFLEET, TOKEN = os.environ['FLEET'], os.environ['TOKEN']\n"
+            self.run_example(sys.executable, "-c", names + example, cwd=folder)
+            until("it stops all", lambda: not json.loads(self.ask(self.fleet.session, "simulations")))
 
 
 if __name__ == "__main__":

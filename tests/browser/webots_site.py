@@ -25,15 +25,15 @@ PHP = "/usr/lib/apache2/modules/libphp*.so"
 def missing():
     """What this machine lacks; empty if the site can run."""
     if not (SOURCES / "httpdocs/ajax/server/session.php").exists():
-        return "WEBOTS_CLOUD_SITE names no folder with the sources of webots.cloud, see tests/browser/site.py"
+        return "WEBOTS_CLOUD_SITE names no folder with the sources of webots.cloud, see tests/browser/webots_site.py"
     if INSTALL is None or not glob.glob(PHP):
         return "apt install libapache2-mod-php php-mysql mariadb-server"
     return "" if os.geteuid() == 0 else "the site's database and web server need root"
 
 
 class Site:
-    """The site, on port 443: its pages ask for its name alone. `door` is the URL
-    of the fleet's session server, whose certificate `authority` has issued."""
+    """The site, on port 443: its pages ask for its name alone. `door` is the URL of the fleet's session server, whose
+    certificate `authority` has issued."""
 
     def __init__(self, door, authority):
         self.exits = contextlib.ExitStack()
