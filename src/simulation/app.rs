@@ -229,7 +229,7 @@ fn assemble(config: Arc<SimulationConfig>) -> Result<AppState, AppError> {
     let checkouts = checkouts.map_err(cache_fault)?;
     let metrics = Metrics::default();
     let logs = config.log_dir.0.join("simulation");
-    let ends = Ends::start(logs, launcher.level.to_string(), config.record_months, &metrics)?;
+    let ends = Ends::start(logs, launcher.level().to_string(), config.record_months, &metrics)?;
     let slots = SlotPool::new(
         config.streaming_ports(),
         config.waiting_line,

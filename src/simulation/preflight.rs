@@ -2,10 +2,10 @@
 
 use std::process::Command;
 
-use super::config::{IsolationSetting, SandboxNetwork, SimulationConfig};
+use super::config::SimulationConfig;
 use super::container::{self, packet_filter};
 use super::readiness;
-use crate::simulation::isolation::Launcher;
+use crate::simulation::isolation::{IsolationLevel, Launcher, Network};
 use crate::simulation::machine::display;
 
 /// Checks everything, and returns a line for each finding: what was found; or the problem, and what to do about it. It
@@ -32,19 +32,19 @@ pub fn check(config: &SimulationConfig) -> Vec<String> {
 
 /// The findings on what worlds' programs can access.
 fn isolation(config: &SimulationConfig, launcher: &Launcher) -> Vec<(&'static str, Result<String, String>)> {
-    let mut findings = vec![match &launcher.shortcoming {
+    let mut findings = vec![match launcher.shortcoming() {
         Some(why) => (
             "isolation",
             Err(format!("none, worlds' programs may do whatever this user may: {why}")),
         ),
-        None => ("isolation", Ok(launcher.level.to_string())),
+        None => ("isolation", Ok(launcher.level().to_string())),
     }];
     let words = launcher
         .network_in_words()
-        .filter(|_| launcher.level == IsolationSetting::Sandbox);
+        .filter(|_| launcher.level() == IsolationLevel::Sandbox);
     findings.extend(words.map(|words| ("network", Ok(words))));
     findings.extend(launcher.exposed_files(config).map(|words| ("streams", Err(words))));
-    let is_shared = launcher.network() == Some(SandboxNetwork::Shared);
+    let is_shared = launcher.network() == Some(Network::Shared);
     if is_shared && !config.ports_are_public() {
         findings.push(("streams", streams(config)));
     }

@@ -3,12 +3,14 @@
 //! It turns a program into a command that runs it at that level ([`SpawnSpec`]).
 
 use std::ffi::OsString;
+use std::fmt;
 use std::io;
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use nix::sys::resource::{Resource, getrlimit};
+use serde::Serialize;
 use which::which;
 
 use super::assets::{AssetCache, RepositoryAssets};
@@ -29,14 +31,8 @@ const NEEDED: &str = "PATH HOME USER LOGNAME SHELL TERM TZ LANG LANGUAGE LC_* TM
 
 /// Launches simulations at one level.
 pub struct Launcher {
-    /// The isolation level of all simulations, never `Auto`. At level `container` they are not started here.
-    pub level: IsolationSetting,
-    /// Their sandbox at level `sandbox`.
-    sandbox: Option<Sandbox>,
-    /// Why they run at level `none` although the configuration does not say so, if they do.
-    pub shortcoming: Option<String>,
-    /// Why sandboxes have no networks of their own, if the configuration leaves that to the machine.
-    why_shared: Option<String>,
+    /// How all simulations are isolated.
+    isolation: Isolation,
     /// What Webots has downloaded, for the next simulations.
     assets: Option<AssetCache>,
     cgroups: Option<Cgroups>,
@@ -45,6 +41,53 @@ pub struct Launcher {
     prlimit: PathBuf,
     variables: Vec<VariableName>,
     limits: ResourceLimits,
+}
+
+/// How simulations are isolated on this machine.
+enum Isolation {
+    /// Not at all.
+    None {
+        /// Why, if the configuration leaves that to the machine.
+        shortcoming: Option<String>,
+    },
+    /// By bubblewrap.
+    Sandbox {
+        sandbox: Sandbox,
+        /// Why sandboxes have no networks of their own, if the configuration leaves that to the machine.
+        why_shared: Option<String>,
+    },
+    /// By Docker: they are not started here.
+    Container,
+}
+
+/// The isolation level of all simulations of a server.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum IsolationLevel {
+    /// As the server's own user, in a process group.
+    None,
+    /// With bubblewrap.
+    Sandbox,
+    /// With Docker.
+    Container,
+}
+
+impl fmt::Display for IsolationLevel {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.serialize(out)
+    }
+}
+
+/// The network of worlds' programs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Network {
+    /// One of each simulation's own.
+    Own,
+    /// One of each simulation's own, without the internet.
+    Closed,
+    /// The machine's.
+    Shared,
 }
 
 impl Launcher {
@@ -59,36 +102,24 @@ impl Launcher {
         }
         // Before a sandbox is tried, because its processes may still be in this server's group afterwards.
         let controllers = Cgroups::controllers();
-        let wants_sandbox = matches!(config.isolation, IsolationSetting::Sandbox | IsolationSetting::Auto);
-        let (level, mut sandbox, shortcoming) = match (
-            config.isolation,
-            wants_sandbox.then(|| Sandbox::new(config)).transpose(),
-        ) {
-            (IsolationSetting::Sandbox, Err(why)) => {
-                return Err(format!(
-                    "isolation is \"sandbox\", but {why}; \"none\" runs worlds without it"
-                ));
-            }
-            (_, Err(why)) => (IsolationSetting::None, None, Some(why)),
-            (_, Ok(Some(sandbox))) => (IsolationSetting::Sandbox, Some(sandbox), None),
-            (level, Ok(None)) => (level, None, None),
+        let isolation = match config.isolation {
+            IsolationSetting::None => Isolation::None { shortcoming: None },
+            IsolationSetting::Container => Isolation::Container,
+            IsolationSetting::Sandbox => sandboxed(
+                config,
+                Sandbox::new(config)
+                    .map_err(|why| format!("isolation is \"sandbox\", but {why}; \"none\" runs worlds without it"))?,
+            )?,
+            IsolationSetting::Auto => match Sandbox::new(config) {
+                Ok(sandbox) => sandboxed(config, sandbox)?,
+                Err(why) => {
+                    demand_no_network(config, &why)?;
+                    Isolation::None { shortcoming: Some(why) }
+                }
+            },
         };
-        let wanted = config.sandbox.network;
-        let why_shared = match &mut sandbox {
-            Some(_) if wanted == SandboxNetwork::Shared => None,
-            Some(sandbox) => OwnNetwork::new(config).and_then(|network| sandbox.join(network)).err(),
-            None => shortcoming.clone(),
-        };
-        if let Some(why) = why_shared.as_ref().filter(|_| wanted.is_demanded()) {
-            return Err(format!(
-                "sandbox.network is \"own\" or \"closed\", but {why}; \"shared\" runs worlds in the machine's network"
-            ));
-        }
         Ok(Self {
-            level,
-            why_shared: why_shared.filter(|_| sandbox.is_some()),
-            sandbox,
-            shortcoming,
+            isolation,
             assets: None,
             cgroups: None,
             controllers,
@@ -108,12 +139,12 @@ impl Launcher {
             .then(Cgroups::delegated)
             .flatten();
         let mut launcher = Self::new(config)?;
-        match &launcher.shortcoming {
+        match launcher.shortcoming() {
             Some(why) => log::warn!("worlds' programs may do whatever this user may (isolation: none): {why}"),
-            None => log::info!("isolation: {}", launcher.level),
+            None => log::info!("isolation: {}", launcher.level()),
         }
         if let Some(network) = launcher.network_in_words() {
-            let level = if launcher.why_shared.is_some() {
+            let level = if launcher.why_shared().is_some() {
                 log::Level::Warn
             } else {
                 log::Level::Info
@@ -129,17 +160,48 @@ impl Launcher {
         }
         launcher.cgroups = cgroups;
         // With any commit, anybody can run a world in the name of a repository.
-        let keeps_assets = launcher.sandbox.is_some() && config.assets_size > 0 && !config.any_commit;
+        let keeps_assets = launcher.sandbox().is_some() && config.assets_size > 0 && !config.any_commit;
         let cache = config.cache_dir.0.canonicalize().ok().filter(|_| keeps_assets);
         launcher.assets = cache.map(|cache| AssetCache::new(&cache, config.assets_size, config.disk_reserve));
         Ok(launcher)
+    }
+
+    /// The isolation level of all simulations.
+    pub fn level(&self) -> IsolationLevel {
+        match self.isolation {
+            Isolation::None { .. } => IsolationLevel::None,
+            Isolation::Sandbox { .. } => IsolationLevel::Sandbox,
+            Isolation::Container => IsolationLevel::Container,
+        }
+    }
+
+    /// Why they run at level `none` although the configuration does not say so, if they do.
+    pub fn shortcoming(&self) -> Option<&str> {
+        match &self.isolation {
+            Isolation::None { shortcoming } => shortcoming.as_deref(),
+            _ => None,
+        }
+    }
+
+    fn sandbox(&self) -> Option<&Sandbox> {
+        match &self.isolation {
+            Isolation::Sandbox { sandbox, .. } => Some(sandbox),
+            _ => None,
+        }
+    }
+
+    fn why_shared(&self) -> Option<&str> {
+        match &self.isolation {
+            Isolation::Sandbox { why_shared, .. } => why_shared.as_deref(),
+            _ => None,
+        }
     }
 
     /// Why visitors may read files of the server's user, if they may: Webots serves any file that it can read to whoever
     /// reaches its port.
     pub fn exposed_files(&self, config: &SimulationConfig) -> Option<String> {
         let (first, last) = config.streaming_ports().into_inner();
-        (config.ports_are_public() && self.level == IsolationSetting::None).then(|| {
+        (config.ports_are_public() && self.level() == IsolationLevel::None).then(|| {
             format!(
                 "any file that this user may read, such as this server's configuration, can be read by anybody who \
                  reaches ports {first} to {last}, because Webots serves it there (streaming: \"direct\", isolation: \
@@ -151,7 +213,7 @@ impl Launcher {
     /// The limits that this machine can't enforce, one line each.
     pub fn unenforced_limits(&self) -> Vec<String> {
         let mut lines = Vec::new();
-        if self.sandbox.as_ref().is_some_and(|sandbox| !sandbox.ends_namespaces) {
+        if self.sandbox().is_some_and(|sandbox| !sandbox.ends_namespaces) {
             lines.push(
                 "worlds' programs can make user namespaces, which brings more of the kernel within their reach: only \
                  bubblewrap from 0.8 on forbids it"
@@ -165,7 +227,7 @@ impl Launcher {
             ("limits.cores", "cpu", limits.cores.is_some()),
         ] {
             // Docker enforces them for containers.
-            if is_set && self.level != IsolationSetting::Container && !controllers.contains(&controller) {
+            if is_set && self.level() != IsolationLevel::Container && !controllers.contains(&controller) {
                 lines.push(format!(
                     "{key} does not hold: systemd has not delegated control groups with the controller {controller} to \
                      this program (Delegate={controller} in its unit)"
@@ -177,27 +239,24 @@ impl Launcher {
 
     /// The network of each simulation's own, if it has one.
     fn own_network(&self) -> Option<&OwnNetwork> {
-        self.sandbox.as_ref()?.network.as_ref()
+        self.sandbox()?.network.as_ref()
     }
 
-    /// The network of worlds' programs, never `Auto`; `None` at level `container`, where it is Docker's.
-    pub fn network(&self) -> Option<SandboxNetwork> {
+    /// The network of worlds' programs; `None` at level `container`, where it is Docker's.
+    pub fn network(&self) -> Option<Network> {
         match self.own_network() {
-            None => (self.level != IsolationSetting::Container).then_some(SandboxNetwork::Shared),
-            Some(network) => Some(if network.is_closed() {
-                SandboxNetwork::Closed
-            } else {
-                SandboxNetwork::Own
-            }),
+            None => (self.level() != IsolationLevel::Container).then_some(Network::Shared),
+            Some(network) if network.is_closed() => Some(Network::Closed),
+            Some(_) => Some(Network::Own),
         }
     }
 
     /// The same as text for an administrator: what programs can reach, and why the network is shared.
     pub fn network_in_words(&self) -> Option<String> {
-        Some(match (self.network()?, &self.why_shared) {
-            (SandboxNetwork::Shared, None) => "shared with this machine".to_owned(),
-            (SandboxNetwork::Shared, Some(why)) => format!("shared with this machine: {why}"),
-            (SandboxNetwork::Closed, _) => "closed, nothing can be reached".to_owned(),
+        Some(match (self.network()?, self.why_shared()) {
+            (Network::Shared, None) => "shared with this machine".to_owned(),
+            (Network::Shared, Some(why)) => format!("shared with this machine: {why}"),
+            (Network::Closed, _) => "closed, nothing can be reached".to_owned(),
             _ if self.own_network().is_some_and(|network| network.nft.is_none()) => {
                 "own, with the internet, private addresses and UDP ports of this machine, for nft can't be used; the \
                  package nftables has it"
@@ -214,13 +273,13 @@ impl Launcher {
 
     /// A remark on the level for the client of a program that did not become ready.
     pub fn remark(&self) -> &'static str {
-        match self.level {
-            IsolationSetting::None | IsolationSetting::Auto => "",
-            IsolationSetting::Container => {
+        match self.level() {
+            IsolationLevel::None => "",
+            IsolationLevel::Container => {
                 " It ran in a container, which has its image and its project only; the server's administrator can give it \
                  more (container, limits)."
             }
-            IsolationSetting::Sandbox => {
+            IsolationLevel::Sandbox => {
                 " It ran in a sandbox, which shows it the system and Webots only; the server's administrator can show it \
                  more (sandbox.readable, sandbox.writable), or run worlds without (isolation)."
             }
@@ -243,7 +302,7 @@ impl Launcher {
         let mut environment = self.inherited();
         environment.push(display.variable());
         environment.append(&mut spec.environment);
-        if let Some(sandbox) = &self.sandbox {
+        if let Some(sandbox) = self.sandbox() {
             // In a sandbox, a symlink may point to a path that does not exist there.
             if let Some(file) = spec.command.first_mut()
                 && let Ok(real) = Path::new(&*file).canonicalize()
@@ -255,7 +314,7 @@ impl Launcher {
             spec.wrappers = 1 + usize::from(sandbox.network.is_some());
         }
         command.extend(self.limited());
-        command.extend(display.launcher(self.sandbox.is_some()));
+        command.extend(display.launcher(self.sandbox().is_some()));
         command.append(&mut spec.command);
         Ok((
             SpawnSpec {
@@ -304,7 +363,7 @@ impl Launcher {
         words.extend([format!("--fsize={size}"), "--core=0".to_owned()]);
         // The kernel counts all processes of a user, but in a user namespace only those inside, one of which is
         // bubblewrap.
-        if self.sandbox.is_some() && !nix::unistd::getuid().is_root() && counts_by_namespace() {
+        if self.sandbox().is_some() && !nix::unistd::getuid().is_root() && counts_by_namespace() {
             words.push(format!(
                 "--nproc={}",
                 at_most(Resource::RLIMIT_NPROC, self.limits.processes + 1)
@@ -315,6 +374,28 @@ impl Launcher {
             .chain(words.into_iter().map(OsString::from))
             .collect()
     }
+}
+
+/// Simulations in this sandbox, with the network that the configuration says.
+fn sandboxed(config: &SimulationConfig, mut sandbox: Sandbox) -> Result<Isolation, String> {
+    let why_shared = match config.sandbox.network {
+        SandboxNetwork::Shared => None,
+        _ => OwnNetwork::new(config).and_then(|network| sandbox.join(network)).err(),
+    };
+    if let Some(why) = &why_shared {
+        demand_no_network(config, why)?;
+    }
+    Ok(Isolation::Sandbox { sandbox, why_shared })
+}
+
+/// Refuses a configuration that demands a network of each simulation's own, which can't be had for this reason.
+fn demand_no_network(config: &SimulationConfig, why: &str) -> Result<(), String> {
+    if config.sandbox.network.is_demanded() {
+        return Err(format!(
+            "sandbox.network is \"own\" or \"closed\", but {why}; \"shared\" runs worlds in the machine's network"
+        ));
+    }
+    Ok(())
 }
 
 /// A limit, capped at this server's own hard limit, which its child processes can't exceed.

@@ -17,4 +17,4 @@ pub use cgroup::Cgroup;
 pub use disk::DiskUse;
 pub use disk_monitor::DiskMonitor;
 pub use display::Display;
-pub use launcher::Launcher;
+pub use launcher::{IsolationLevel, Launcher, Network};

@@ -154,8 +154,7 @@ impl Monitor<'_> {
         let launcher = &self.server.launcher;
         let containers = self.server.containers.as_ref();
         let of_level = launcher
-            .shortcoming
-            .as_deref()
+            .shortcoming()
             .map(|why| ("worlds' programs may do whatever this server may.", why));
         let of_containers = containers.and_then(|containers| containers.shortcoming.as_deref());
         of_level.or_else(|| of_containers.map(|why| ("", why)))

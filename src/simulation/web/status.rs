@@ -40,7 +40,7 @@ pub fn status_page(server: &AppState, snapshot: &Snapshot, names_machine: bool) 
         ready: server.ready(),
     };
     let more = json!({
-        "isolation": server.launcher.level,
+        "isolation": server.launcher.level(),
         // The network of worlds' programs; null at level `container`, where it is Docker's.
         "network": server.launcher.network(),
         // Seconds since the start.
