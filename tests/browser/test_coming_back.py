@@ -269,7 +269,7 @@ class InLine(Running):
         positions = [found[0] for found in map(re.compile("you are next|[0-9]+ client").search, heard) if found]
         # With another estimate a position is told again.
         positions = [position for position, _ in itertools.groupby(positions)]
-        # While a page ahead reloads, it is not in the line: if that takes long, the others hear it, and that it is back.
+        # While a page ahead reloads, it is not in the line: if that takes long, others hear it, and that it is back.
         moved = positions[-3:]
         self.assertEqual(moved, ["2 client", "1 client", "you are next"], positions)
         self.assertLessEqual(set(positions[:-3]), {"2 client", "3 client"}, positions)
