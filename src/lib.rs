@@ -37,7 +37,7 @@
 //! Each server also has a directory `config` (every key: `session_config`, `simulation_config`; time limits: `timing`;
 //! `docs/configuration.md` lists all), its `app` (start and end) and its `state` (what its routes share). Files of
 //! `simulation` are the [`protocol`](simulation::protocol) with the texts of messages to clients (except the reason in
-//! an error and the progress of a start, which their causes define: a checkout's is in `checkout/steps`), the
+//! an error and the [`progress`](simulation::progress) of a start, which their causes define: a checkout's is in `checkout/steps`), the
 //! `snapshot` of all simulations, the `simulation_id`, the `client_identity`, the `announcer` (key `notify`),
 //! `preflight` (`--check`) and `readiness` (`/health`). The programs are in `src/bin`. Modules import only from layers
 //! below them, in the order that `tests/project/layering.rs` lists. `session` and `simulation` never see each other. A

@@ -13,6 +13,7 @@ mod isolation;
 pub mod machine;
 pub mod preflight;
 pub mod process;
+pub(crate) mod progress;
 pub mod protocol;
 pub(crate) mod readiness;
 mod relay;

@@ -14,6 +14,7 @@
 //! | `queue: N` | N clients are ahead in the queue |
 //! | `ide: enable` | the project has an editor, on Webots' port + 500 |
 //! | `type:TYPE` | the project's type in its `webots.yml` |
+//! | `progress: {"step": STEP, "percent": N, "text": TEXT}` | the same for programs, before the next |
 //! | `loading: TEXT` | progress |
 //! | `reason: {"code": CODE, "blame": WHO, "retry": WHERE, "message": TEXT, "output": TEXT}` | the same for programs, before the next |
 //! | `loading: Error: TEXT` | why the simulation failed; the connection is closed, except after `reset controller` |
@@ -37,6 +38,7 @@ use serde_json::Value;
 use crate::shared::domain::{Blame, Failure, Reason, Retry, View};
 use crate::shared::text::{client_text, without_paths};
 use crate::simulation::attachment::Token;
+use crate::simulation::progress::{Progress, Step};
 use crate::simulation::snapshot::SceneKind;
 
 /// The requests in a message, of which only one takes effect; unknown fields are ignored.
@@ -140,6 +142,15 @@ struct ReasonText {
     output: Option<String>,
 }
 
+/// The content of `progress:`.
+#[derive(Serialize)]
+struct ProgressText<'a> {
+    step: Step,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    percent: Option<u8>,
+    text: &'a str,
+}
+
 /// The heartbeat of Webots.
 pub const HEARTBEAT: &str = ".";
 
@@ -149,9 +160,26 @@ pub fn of_project(text: &str) -> String {
     client_text(text.trim_end()) + end
 }
 
-/// Progress, as text.
-pub fn loading(text: &str) -> String {
+/// A text that Webots' page shows.
+fn loading(text: &str) -> String {
     format!("loading: {}", client_text(&without_paths(text)))
+}
+
+/// Progress: once for programs, and once as text for Webots' page, which reads the number of a step in it.
+pub fn progress(progress: &Progress) -> [String; 2] {
+    let text = &client_text(&without_paths(&progress.text));
+    let in_json = ProgressText {
+        step: progress.step,
+        percent: progress.percent,
+        text,
+    };
+    // It has texts and numbers only: no error is possible.
+    let json = serde_json::to_string(&in_json).unwrap_or_default();
+    let number = progress.of_all.map(|(number, of)| format!("Step {number}/{of} : "));
+    [
+        format!("progress: {json}"),
+        format!("loading: {}{text}", number.unwrap_or_default()),
+    ]
 }
 
 /// A refusal, a failed start or an end: its reason for programs, then a sentence.

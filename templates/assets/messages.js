@@ -16,12 +16,15 @@
  * @typedef {{ token: string, absence: number }} Resumption
  */
 
-/** A step of a start that a server tells, by its number or name. @typedef {'search' | 'fetch' | 'write' | 'done' | 'launch'} StepCode */
+/** What a start does. @typedef {'search' | 'fetch' | 'write' | 'done' | 'image' | 'launch' | 'load'} StepCode */
+
+/** How far a start is; a server in Python tells it only as text. @typedef {{ text: string, step?: StepCode, percent?: number }} Progress
+ */
 
 /**
  * A message of a simulation server.
  * @typedef {{ is: 'queued', ahead: number }
- *   | { is: 'progress', text: string, step: StepCode | undefined, percent: number | undefined }
+ *   | { is: 'progress', progress: Progress }
  *   | { is: 'launched', closesIn: number }
  *   | { is: 'ready', address: string, kind: string | undefined }
  *   | { is: 'resumable', resumption: Resumption }
@@ -55,6 +58,23 @@ function parseReason(json) {
     const text = (/** @type {unknown} */ value) => (typeof value === 'string' && value !== '' ? value : undefined);
     const printed = text(output);
     return { reason: { code, blame, retry, ...(printed && { output: printed }) }, message: text(message) };
+  } catch {
+    return undefined;
+  }
+}
+
+/**
+ * Reads progress. Malformed progress counts as none: the text that follows is shown.
+ * @param {string} json
+ * @returns {Progress | undefined}
+ */
+function parseProgress(json) {
+  try {
+    const { step, percent, text } = JSON.parse(json);
+    if (typeof step !== 'string' || typeof text !== 'string') {
+      return undefined;
+    }
+    return { text, step: /** @type {StepCode} */ (step), ...(typeof percent === 'number' && { percent }) };
   } catch {
     return undefined;
   }
@@ -100,7 +120,8 @@ export class SimulationReader {
   #absence = 0;
   /** @type {string | undefined} */
   #kind;
-  #wasQueue = false;
+  /** Whether the next text says the same for Webots' page, which shows only texts that begin with `loading:`. */
+  #isRepeated = false;
 
   /**
    * Reads a text; `undefined` if it belongs to the next one.
@@ -118,14 +139,13 @@ export class SimulationReader {
     if (sentence !== undefined) {
       return { is: 'failed', failure: this.#reasons.failure(sentence) };
     }
-    const wasQueue = this.#wasQueue;
-    this.#wasQueue = text.startsWith('queue:');
-    const progress = after(text, 'loading:');
-    if (progress === undefined) {
+    const isRepetition = this.#isRepeated;
+    this.#isRepeated = false;
+    const loading = after(text, 'loading:');
+    if (loading === undefined) {
       return this.#readValue(text);
     }
-    // The text after `queue:` says the same, for Webots' page.
-    return wasQueue ? { is: 'alive' } : readProgress(progress);
+    return isRepetition ? { is: 'alive' } : { is: 'progress', progress: { text: loading } };
   }
 
   /**
@@ -140,7 +160,13 @@ export class SimulationReader {
     const value = text.slice(colon + 1).trim();
     switch (text.slice(0, colon)) {
       case 'queue':
+        this.#isRepeated = true;
         return { is: 'queued', ahead: Number(value) };
+      case 'progress': {
+        const progress = parseProgress(value);
+        this.#isRepeated = progress !== undefined;
+        return progress ? { is: 'progress', progress } : { is: 'alive' };
+      }
       case 'shutdownTimeout':
         return { is: 'launched', closesIn: Number(value) };
       case 'kind':
@@ -160,42 +186,6 @@ export class SimulationReader {
       default:
         return { is: 'alive' };
     }
-  }
-}
-
-/**
- * Reads progress. A checkout has nine steps, `Step 1/9 : TEXT`: the second to the seventh are the fetch.
- * @param {string} progress
- * @returns {Message}
- */
-function readProgress(progress) {
-  const [, number, rest] = /^Step ([1-9])\/9 : (.*)$/s.exec(progress) ?? [];
-  const text = rest ?? progress;
-  const found = /(\d{1,3})\s?%/.exec(text)?.[1];
-  return {
-    is: 'progress',
-    text,
-    step: stepCode(number, text),
-    percent: found === undefined ? undefined : Number(found),
-  };
-}
-
-/**
- * @param {string | undefined} number
- * @param {string} text
- * @returns {StepCode | undefined}
- */
-function stepCode(number, text) {
-  switch (number) {
-    case undefined:
-      return text === 'checkout done' ? 'done' : text === 'webots is starting' ? 'launch' : undefined;
-    case '1':
-      return 'search';
-    case '8':
-    case '9':
-      return 'write';
-    default:
-      return 'fetch';
   }
 }
 

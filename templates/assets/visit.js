@@ -59,7 +59,7 @@ import { helpsToWait } from './reasons.js';
 
 /** The states on the way to a simulation; one that was accepted may have a token to return with. */
 /** @typedef {Target & { is: 'connecting', resumption?: Resumption | undefined, place: { is: 'opening' } | { is: 'asked' } | { is: 'queued', ahead: number } }} Connecting */
-/** @typedef {Target & { is: 'starting', resumption?: Resumption | undefined, phase: 'checkout' | 'launch', progress?: Extract<Message, { is: 'progress' }> | undefined, facts: Facts }} Starting */
+/** @typedef {Target & { is: 'starting', resumption?: Resumption | undefined, phase: 'checkout' | 'launch', progress?: import('./messages.js').Progress | undefined, facts: Facts }} Starting */
 /** `heardAt`: the last sign of life of the server or the simulator; `tickedAt`: the last tick.
  * @typedef {Target & { is: 'running', address: string, scene: Scene, facts: Facts, heardAt: number, tickedAt: number,
  *   resumption?: Resumption | undefined }} Running
@@ -441,8 +441,8 @@ function startGoesOn(state, message, now) {
       return {
         ...target,
         is: 'starting',
-        phase: message.step === 'launch' ? 'launch' : phase,
-        progress: message,
+        phase: message.progress.step === 'launch' ? 'launch' : phase,
+        progress: message.progress,
         facts,
       };
     case 'launched':

@@ -75,27 +75,52 @@ test('no text of a project is taken for a message of the server', () => {
   const reason = { ...DRAINING, output };
   const [, failed] = read(`reason: ${JSON.stringify(reason)}`, 'loading: Error: it stops');
   assert.deepEqual(failed, { is: 'failed', failure: { sentence: 'it stops', reason } });
-  assert.deepEqual(read('loading: reason: {}')[0], {
-    is: 'progress',
-    text: 'reason: {}',
-    step: undefined,
-    percent: undefined,
-  });
-  assert.deepEqual(read('loading: Step by step')[0], {
-    is: 'progress',
-    text: 'Step by step',
-    step: undefined,
-    percent: undefined,
-  });
+  for (const words of [
+    'reason: {}',
+    'progress: {"step":"launch","text":"x"}',
+    'Step 8/9 : 40 %',
+    'checkout done',
+    'webots is starting',
+  ]) {
+    const progress = { text: words };
+    assert.deepEqual(read(`loading: ${words}`), [{ is: 'progress', progress }], words);
+    const shown = { step: 'image', text: words };
+    assert.deepEqual(read(`progress: ${JSON.stringify(shown)}`, `loading: Step 1/2 : ${words}`), [
+      { is: 'progress', progress: shown },
+      { is: 'alive' },
+    ]);
+  }
 });
 
 test('the text after a position in the queue is for other pages', () => {
-  const texts = ['queue: 2', 'loading: waiting for a place, 2 clients are ahead', 'loading: Step 1/9 : begins'];
+  const texts = ['queue: 2', 'loading: waiting for a place, 2 clients are ahead', 'loading: begins'];
   assert.deepEqual(read(...texts), [
     { is: 'queued', ahead: 2 },
     { is: 'alive' },
-    { is: 'progress', text: 'begins', step: 'search', percent: undefined },
+    { is: 'progress', progress: { text: 'begins' } },
   ]);
+});
+
+test('progress is told once, with its step and its percentage', () => {
+  const progress = { step: 'fetch', percent: 40, text: 'fetching x: Receiving objects: 40%' };
+  const told = { is: 'progress', progress };
+  const [json, text] = [`progress: ${JSON.stringify(progress)}`, `loading: Step 4/9 : ${progress.text}`];
+  assert.deepEqual(read(json, text, json, '.', text), [
+    told,
+    { is: 'alive' },
+    told,
+    { is: 'alive' },
+    { is: 'progress', progress: { text: `Step 4/9 : ${progress.text}` } },
+  ]);
+});
+
+test('without well-formed progress the text is shown', () => {
+  for (const json of ['', 'fetch', 'null', '7', '{}', '{"step": 1, "text": "x"}', '{"step": "fetch"}']) {
+    const [, shown] = read(`progress: ${json}`, 'loading: fetching');
+    assert.deepEqual(shown, { is: 'progress', progress: { text: 'fetching' } }, json);
+  }
+  const [odd] = read('progress: {"step": "fetch", "percent": "40", "text": "x"}');
+  assert.deepEqual(odd, { is: 'progress', progress: { step: 'fetch', text: 'x' } });
 });
 
 test('the kind of the stream belongs to its address, and the absence to the token', () => {

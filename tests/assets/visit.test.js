@@ -37,6 +37,8 @@ const running = () =>
       `resume: ${TOKEN}`,
     )
     .take(SHOWN);
+/** A step of a start, for programs and for Webots' page. @type {(code: string, text: string) => string[]} */
+const step = (code, text) => [`progress: ${JSON.stringify({ step: code, text })}`, `loading: ${text}`];
 /** A sentence of a server behind its reason. @type {(sentence: string, why?: Reason) => string[]} */
 const error = (sentence, why) => [...(why ? [`reason: ${JSON.stringify(why)}`] : []), `loading: Error: ${sentence}`];
 
@@ -85,9 +87,11 @@ test('a visit from the start to the end', () => {
     [visit.view.progress?.at, visit.view.progress?.notes.place],
     ['place', '2 clients are ahead of you'],
   );
-  visit.receive('loading: Step 3/9 : fetching 40 %');
+  visit.receive(...step('fetch', 'fetching 40 %'));
   assert.deepEqual([visit.view.progress?.at, visit.view.progress?.notes.checkout], ['checkout', 'fetching 40 %']);
-  visit.receive('loading: webots is starting', 'shutdownTimeout: 7200');
+  visit.receive(...step('launch', 'webots is starting'));
+  assert.equal(visit.view.progress?.at, 'launch');
+  visit.receive('shutdownTimeout: 7200');
   assert.deepEqual([visit.view.progress?.at, visit.view.closes], ['launch', 'It will be closed in 2 hours.']);
   visit.receive('kind: w3d', 'webots:ws://one:2001');
   assert.deepEqual(visit.effects.at(-1), {

@@ -13,7 +13,7 @@ const ROOMS: [(&str, &str); 3] = [
     ("session", "placement line config mail class fleet state web app"),
     (
         "simulation",
-        "client_identity simulated_time simulation_id snapshot ends attachment slots spare_wishes relay protocol process machine config checkout \
+        "client_identity simulated_time simulation_id snapshot ends attachment slots spare_wishes relay progress protocol process machine config checkout \
          isolation container readiness preflight announcer webots state client web app",
     ),
 ];

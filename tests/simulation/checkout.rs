@@ -345,14 +345,22 @@ async fn progress_moves_in_percent() {
     let server = server_of(reader(), 1).env("PATH", &wrapper.path()).start().await;
     let mut client = Client::start(&server, &arm()).await;
     // Webots' page reads only one digit before and one after the slash of a step.
+    let told = r#"progress: {"step":"search","text":"looking for https://github.com/lab/arm"}"#;
+    client.until(told).await;
     client.until("loading: Step 1/9 : looking for").await;
     for (step, percent) in [(2, 10), (3, 35), (5, 60), (6, 85)] {
-        let words =
-            format!("loading: Step {step}/9 : fetching https://github.com/lab/arm: Receiving objects: {percent}%");
-        client.until(&words).await;
+        let words = format!("fetching https://github.com/lab/arm: Receiving objects: {percent}%");
+        let told = format!(r#"progress: {{"step":"fetch","percent":{percent},"text":"{words}"#);
+        client.until(&told).await;
+        client.until(&format!("loading: Step {step}/9 : {words}")).await;
     }
+    client.until(r#"progress: {"step":"write","#).await;
     client.until("loading: Step 8/9 : checking main out").await;
-    client.until("loading: checkout done").await;
+    client
+        .until(r#"progress: {"step":"done","text":"checkout done"}"#)
+        .await;
+    assert_eq!(client.until("").await, "loading: checkout done");
+    client.until(r#"progress: {"step":"launch","#).await;
     client.until("loading: webots").await;
 }
 

@@ -14,6 +14,13 @@ use crate::support::{Client, DEMO, Forge, Server, Webots, sentences, simulation_
 const SENT: (usize, usize) = (20, 900);
 /// What is printed instead of a sentence.
 const NEUTRAL: &str = "a line that means nothing";
+/// The progress of a fetch.
+const FETCH: [&str; 4] = [
+    "loading: Step",
+    r#"progress: {"step":"search""#,
+    r#"progress: {"step":"fetch""#,
+    r#"progress: {"step":"write""#,
+];
 /// How a Webots ends whose project prints something before that: the world, and the code of the reason.
 const ENDS: [(&str, &str); 5] = [
     ("launch", "launch-failed"),
@@ -73,15 +80,16 @@ struct Transcript {
 impl Transcript {
     /// Without the signs of life and the progress of the fetch, whose number differs between two runs.
     fn to_replay(&self) -> Vec<String> {
-        let is_the_same = |text: &&String| *text != "." && !text.starts_with("loading: Step");
+        let varies = |text: &str| text == "." || FETCH.iter().any(|begin| text.starts_with(begin));
+        let is_the_same = |text: &&String| !varies(text);
         self.texts.iter().filter(is_the_same).cloned().collect()
     }
 
     /// Without what differs between two runs, and without what is printed by the project.
     fn meaning(&self) -> (Vec<String>, Option<u16>) {
         let is_the_same = |text: &&String| {
-            let varies = ["session:", "loading: Step", "webots:", ".", "shutdownTimeout:"];
-            !varies.iter().any(|begin| text.starts_with(begin))
+            let varies = ["session:", "webots:", ".", "shutdownTimeout:"];
+            !varies.iter().chain(&FETCH).any(|begin| text.starts_with(begin))
         };
         let meaning = |text: &String| match text.strip_prefix("reason: ") {
             Some(fields) => {

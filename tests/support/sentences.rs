@@ -79,6 +79,7 @@ pub fn all() -> Vec<String> {
     texts.extend(
         [
             "queue: 0",
+            "progress: {\"step\": \"launch\", \"text\": \"x\"}",
             "kind: w3d",
             "webots:ws://localhost:1",
             "resume: f00d",

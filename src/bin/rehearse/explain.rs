@@ -21,9 +21,10 @@ const BUFFERED: Duration = Duration::from_millis(100);
 const WATCH: Duration = Duration::from_secs(3);
 /// Timeout of Webots' end once its client has left.
 const GONE: Duration = Duration::from_secs(15);
-/// Prefixes of the texts that Webots' page knows on the connection to the simulation server.
-const KNOWN: [&str; 11] = [
+/// Prefixes of the texts that Webots' page knows or ignores on the connection to the simulation server.
+const KNOWN: [&str; 12] = [
     "session:",
+    "progress:",
     "loading:",
     "queue:",
     "shutdownTimeout:",

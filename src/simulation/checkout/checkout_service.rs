@@ -18,11 +18,14 @@ use super::project::Project;
 use super::repository::{CheckoutError, Repository, Unreadable, failed};
 use super::repository_cache::{CacheDir, RepositoryCache};
 use super::revision::Tip;
-use super::single_flight::SharedProgress;
 use super::{file_restore, redirect, steps, work_tree};
 use crate::shared::domain::{AdmissionRules, Failure, ProjectUrl, Reason};
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::process::{InstanceDir, on_own_thread};
+use crate::simulation::progress::Progress;
+
+/// Receives the progress of a checkout, on its thread.
+pub type SharedProgress = Arc<dyn Fn(Progress) + Send + Sync>;
 
 /// Checks worlds out; one for the whole server.
 pub struct CheckoutService {
@@ -115,8 +118,7 @@ impl CheckoutService {
         })
     }
 
-    /// Starts to check a world out into a client's directory, at this tip if it is known. `progress` receives each step as
-    /// text.
+    /// Starts to check a world out into a client's directory, at this tip if it is known. `progress` receives each step.
     pub fn start(
         self: &Arc<Self>,
         world: ProjectUrl,
@@ -158,7 +160,7 @@ impl CheckoutService {
                 done => break done?,
             }
         };
-        progress("checkout done".to_owned());
+        progress(steps::done());
         Ok(project)
     }
 

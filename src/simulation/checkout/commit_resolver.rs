@@ -4,16 +4,16 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use parking_lot::Mutex;
-use tokio::sync::watch;
 
 use super::git::GitError;
 use super::repository::{CheckoutError, Repository, failed};
 use super::repository_cache::{COMMITS, HISTORY, RepositoryCache};
 use super::revision::{self, Revision, Tip, TrustSource};
-use super::single_flight::{OnProgress, SingleFlight};
+use super::single_flight::{SingleFlight, Steps};
 use super::{redirect, steps};
 use crate::shared::domain::{AdmissionRules, Failure, ProjectUrl, Reason};
 use crate::simulation::config::{Remote, SimulationConfig};
+use crate::simulation::progress::OnProgress;
 
 /// Resolves commits; one for the whole server.
 pub struct CommitResolver {
@@ -45,7 +45,7 @@ struct Search<'job> {
     world: &'job ProjectUrl,
     /// The cached repository of its commits.
     repository: &'job Arc<Repository>,
-    /// Receives each step as text.
+    /// Receives each step.
     progress: OnProgress<'job>,
 }
 
@@ -75,7 +75,7 @@ impl CommitResolver {
         let this = Arc::clone(self);
         let key = (world.clone(), tip);
         let (world, tip) = key.clone();
-        let search = |sender| async move { this.search(&world, tip, &sender).await.map(Arc::new) };
+        let search = |steps| async move { this.search(&world, tip, &steps).await.map(Arc::new) };
         self.searches.join(key, progress, search).await
     }
 
@@ -123,9 +123,9 @@ impl CommitResolver {
         &self,
         world: &ProjectUrl,
         tip: Option<Tip>,
-        sender: &watch::Sender<String>,
+        sent: &Steps,
     ) -> Result<ResolvedCommit, CheckoutError> {
-        let progress = |step| drop(sender.send_replace(step));
+        let progress = |step| sent.send(step);
         progress(steps::looking_for(&world.repository()));
         let repository = self.repository(world, COMMITS).await?;
         let revisions = match (revision::commit_of(world, self.config.any_commit), tip) {

@@ -22,4 +22,4 @@ pub use disk::outgrown;
 pub use project::Project;
 pub use repository_cache::CacheDir;
 pub use revision::Tip;
-pub use single_flight::{OnProgress, SingleFlight};
+pub use single_flight::{SingleFlight, Steps};

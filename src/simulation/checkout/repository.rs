@@ -11,12 +11,12 @@ use std::sync::{Arc, mpsc};
 
 use parking_lot::Mutex;
 use rustix::process::Resource;
-use tokio::sync::{Semaphore, watch};
+use tokio::sync::Semaphore;
 
 use super::disk::{has_unfinished_pack, remove_leftovers, spawn_blocking_io};
 use super::git::{Git, GitError, GitExit, LITTLE_MEMORY, stall_timeout};
 use super::http_trace::{HttpTrace, TRACE};
-use super::single_flight::{OnProgress, SingleFlight};
+use super::single_flight::{SingleFlight, Steps};
 use crate::shared::domain::{Failure, ProjectUrl, Reason};
 use crate::simulation::config::Remote;
 use crate::simulation::process::{Run, own_call_failed, remove_tree};
@@ -40,7 +40,7 @@ pub struct Repository {
     /// Limits concurrent queries of the remote: a class may request many worlds of one repository at once.
     queries: Semaphore,
     /// The fetches in progress, by the arguments of git.
-    fetches: SingleFlight<Vec<String>, Result<(), CheckoutError>>,
+    fetches: SingleFlight<Vec<String>, Result<(), CheckoutError>, String>,
 }
 
 /// Why a checkout failed.
@@ -144,21 +144,21 @@ impl Repository {
     pub async fn fetch(
         self: &Arc<Self>,
         arguments: Vec<String>,
-        progress: OnProgress<'_>,
+        progress: &(dyn Fn(String) + Send + Sync),
     ) -> Result<(), CheckoutError> {
         let this = Arc::clone(self);
         let key = arguments.clone();
-        let fetch = |sender: watch::Sender<String>| async move {
+        let fetch = |lines: Steps<String>| async move {
             let guard = if let Ok(guard) = Arc::clone(&this.lock).try_lock_owned() {
                 guard
             } else {
-                sender.send_replace("waiting for another fetch".to_owned());
+                lines.send("waiting for another fetch".to_owned());
                 Arc::clone(&this.lock).lock_owned().await
             };
             this.has_grown.store(true, Relaxed);
             let on_line = |line: &str| {
                 if line.contains('%') {
-                    sender.send_replace(line.trim_start_matches("remote: ").to_owned());
+                    lines.send(line.trim_start_matches("remote: ").to_owned());
                 }
             };
             this.fetch_now(&arguments, on_line).await?;

@@ -6,7 +6,6 @@
 use std::collections::HashMap;
 use std::future::Future;
 use std::hash::Hash;
-use std::sync::Arc;
 use std::time::Duration;
 
 use futures_util::FutureExt;
@@ -14,26 +13,33 @@ use futures_util::future::{BoxFuture, WeakShared, pending};
 use parking_lot::Mutex;
 use tokio::sync::watch;
 
-/// The jobs of one kind that are in progress, by key.
-pub struct SingleFlight<K, T: Clone>(Mutex<HashMap<K, Job<T>>>);
+use crate::simulation::progress::Progress;
 
-struct Job<T: Clone> {
-    progress: watch::Receiver<String>,
+/// The jobs of one kind that are in progress, by key.
+pub struct SingleFlight<K, T: Clone, P = Progress>(Mutex<HashMap<K, Job<T, P>>>);
+
+struct Job<T: Clone, P> {
+    progress: watch::Receiver<Option<P>>,
     result: WeakShared<BoxFuture<'static, T>>,
 }
 
-/// Receives each step of a job as text.
-pub type OnProgress<'job> = &'job (dyn Fn(String) + Send + Sync);
-/// The same, for a job on another thread.
-pub type SharedProgress = Arc<dyn Fn(String) + Send + Sync>;
+/// Sends the steps of a job to all who wait for it.
+pub struct Steps<P = Progress>(watch::Sender<Option<P>>);
+
+impl<P> Steps<P> {
+    /// Sends a step.
+    pub fn send(&self, step: P) {
+        self.0.send_replace(Some(step));
+    }
+}
 
 /// Shortest interval between two steps that are sent to a waiter.
 const STEP_INTERVAL: Duration = Duration::from_millis(100);
 
-impl<K: Eq + Hash, T: Clone + Send + Sync + 'static> SingleFlight<K, T> {
-    /// Joins the job with this key, or starts it. `progress` receives each step as text, also if another caller has
-    /// started the job.
-    pub async fn join<F>(&self, key: K, progress: OnProgress<'_>, start: impl FnOnce(watch::Sender<String>) -> F) -> T
+impl<K: Eq + Hash, T: Clone + Send + Sync + 'static, P: Clone> SingleFlight<K, T, P> {
+    /// Joins the job with this key, or starts it. `progress` receives each step, also if another caller has started the
+    /// job.
+    pub async fn join<F>(&self, key: K, progress: &(dyn Fn(P) + Send + Sync), start: impl FnOnce(Steps<P>) -> F) -> T
     where
         F: Future<Output = T> + Send + 'static,
     {
@@ -44,9 +50,9 @@ impl<K: Eq + Hash, T: Clone + Send + Sync + 'static> SingleFlight<K, T> {
                 .get(&key)
                 .and_then(|job| Some((job.result.upgrade()?, job.progress.clone())));
             known.unwrap_or_else(|| {
-                let (sender, progress) = watch::channel(String::new());
+                let (sender, progress) = watch::channel(None);
                 // Each waiter has a timeout of its own; the job ends with the last of them.
-                let result = start(sender).boxed().shared();
+                let result = start(Steps(sender)).boxed().shared();
                 let job = result.downgrade().map(|result| Job {
                     progress: progress.clone(),
                     result,
@@ -57,7 +63,8 @@ impl<K: Eq + Hash, T: Clone + Send + Sync + 'static> SingleFlight<K, T> {
         };
         let send_steps = async {
             while steps.changed().await.is_ok() {
-                progress(steps.borrow_and_update().clone());
+                let step = steps.borrow_and_update().clone();
+                step.into_iter().for_each(progress);
                 // Within this time only the newest step is sent.
                 actix_rt::time::sleep(STEP_INTERVAL).await;
             }
@@ -70,7 +77,7 @@ impl<K: Eq + Hash, T: Clone + Send + Sync + 'static> SingleFlight<K, T> {
     }
 }
 
-impl<K, T: Clone> Default for SingleFlight<K, T> {
+impl<K, T: Clone, P> Default for SingleFlight<K, T, P> {
     fn default() -> Self {
         Self(Mutex::default())
     }

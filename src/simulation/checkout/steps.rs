@@ -1,36 +1,55 @@
-//! The steps of a checkout, as text for its client. Pure.
+//! The steps of a checkout, for its client. Pure.
 //!
-//! Webots' page moves its progress bar by texts such as `Step 3/9 : ...`, in which each number has one digit, and by
-//! one that ends in `done`. The fetch takes most of the time, so it has several steps, by the percentage that git
-//! reports.
+//! The fetch takes most of the time, so the progress bar of Webots' page gets several of nine steps for it, by the
+//! percentage that git reports.
 
-/// Number of steps.
-const STEPS: u64 = 9;
+use crate::simulation::progress::{MAX_STEPS, Progress, Step};
+
 /// The first and the last step of a fetch; the steps between them follow the received objects.
 const FETCH: (u64, u64) = (2, 7);
 
-fn step(number: u64, what: &str) -> String {
-    format!("Step {number}/{STEPS} : {what}")
+fn step(step: Step, number: u64, percent: Option<u8>, text: String) -> Progress {
+    Progress {
+        step,
+        percent,
+        text,
+        of_all: Some((number, MAX_STEPS)),
+    }
+}
+
+/// The phase and the percentage of a line of git, as `Receiving objects:  40% (2/5)`.
+fn phase(line: &str) -> Option<(&str, u8)> {
+    let (phase, rest) = line.split_once(':')?;
+    let percent: u8 = rest.split_once('%')?.0.trim().parse().ok()?;
+    Some((phase, percent.min(100)))
 }
 
 /// The remote is queried.
-pub fn looking_for(repository: &str) -> String {
-    step(1, &format!("looking for {repository}"))
+pub fn looking_for(repository: &str) -> Progress {
+    step(Step::Search, 1, None, format!("looking for {repository}"))
 }
 
 /// git fetches, and prints this line.
-pub fn fetching(what: &str, line: &str) -> String {
+pub fn fetching(what: &str, line: &str) -> Progress {
     let (first, last) = FETCH;
-    let percent = |text: &str| text.split_once('%')?.0.trim().parse::<u64>().ok();
-    let number = match line.split_once(':') {
-        Some(("Receiving objects", rest)) => first + (last - first) * percent(rest).unwrap_or(0).min(100) / 100,
+    let phase = phase(line);
+    let number = match phase {
+        Some(("Receiving objects", percent)) => first + (last - first) * u64::from(percent) / 100,
         Some(("Resolving deltas", _)) => last,
         _ => first,
     };
-    step(number, &format!("fetching {what}: {line}"))
+    let percent = phase.map(|(_, percent)| percent);
+    step(Step::Fetch, number, percent, format!("fetching {what}: {line}"))
 }
 
 /// git writes the files of a branch, tag or commit, and prints this line.
-pub fn checking_out(name: &str, line: &str) -> String {
-    step(8, format!("checking {name} out {line}").trim_end())
+pub fn checking_out(name: &str, line: &str) -> Progress {
+    let percent = phase(line).map(|(_, percent)| percent);
+    let text = format!("checking {name} out {line}").trim_end().to_owned();
+    step(Step::Write, 8, percent, text)
+}
+
+/// The files are there. Webots' page takes a text that ends in `done` for the end of a step.
+pub fn done() -> Progress {
+    Progress::new(Step::Done, "checkout done")
 }

@@ -84,12 +84,12 @@ impl Session {
             }
             State::CheckingOut(_) => {
                 self.offer_comeback();
-                self.texts(self.progress.clone());
+                self.texts(self.progress.iter().flatten().cloned());
             }
             State::Launching(launched) => {
                 self.offer_comeback();
                 self.tell_launched(launched);
-                self.texts(self.progress.clone());
+                self.texts(self.progress.iter().flatten().cloned());
             }
             State::Ready(ready) => {
                 self.tell_launched(&ready.launched);

@@ -19,6 +19,7 @@ use crate::simulation::attachment::{ClientAction, Connection, NewClient, ToClien
 use crate::simulation::checkout::{Project, Tip};
 use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::ends::{StopReason, lost};
+use crate::simulation::progress::Progress;
 use crate::simulation::protocol;
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::slots::{Slot, SlotEvent, SlotLease, SpareKind, Taker};
@@ -39,7 +40,7 @@ pub struct Session {
     pub(super) view: View,
     pub(super) comeback: Comeback,
     /// The last progress of the start, as it was sent, for a client that comes back.
-    pub(super) progress: Option<String>,
+    pub(super) progress: Option<[String; 2]>,
     /// Whether a controller is being reset.
     pub(super) is_resetting: bool,
 }
@@ -423,10 +424,12 @@ impl Session {
     }
 
     /// Sends the client a step of its start.
-    pub(super) fn show_progress(&mut self, text: &str) {
-        let text = protocol::loading(text);
-        self.hint(text.clone());
-        self.progress = Some(text);
+    pub(super) fn show_progress(&mut self, progress: &Progress) {
+        let texts = protocol::progress(progress);
+        for text in &texts {
+            self.hint(text.clone());
+        }
+        self.progress = Some(texts);
     }
 
     fn exited(&mut self, failure: Failure, ctx: &mut Context<Self>) {
@@ -520,7 +523,7 @@ impl Handler<WebotsEvent> for Session {
 
     fn handle(&mut self, event: WebotsEvent, ctx: &mut Self::Context) {
         match event {
-            WebotsEvent::Progress(text) => self.show_progress(&text),
+            WebotsEvent::Progress(progress) => self.show_progress(&progress),
             WebotsEvent::Text(text) => {
                 let text = protocol::of_project(&text);
                 if let State::Launching(launched) = &mut self.state {

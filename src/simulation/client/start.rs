@@ -11,6 +11,7 @@ use crate::shared::domain::{Blame, Failure, ProjectUrl, Reason, ReservationId, V
 use crate::shared::http::Peer;
 use crate::simulation::checkout::{Project, Tip};
 use crate::simulation::machine::sensors::Gpu;
+use crate::simulation::progress::{Progress, Step};
 use crate::simulation::protocol::{self, Start};
 use crate::simulation::readiness;
 use crate::simulation::slots::{Slot, SlotLease};
@@ -74,7 +75,7 @@ impl Session {
         };
         let me = ctx.address();
         // A full mailbox drops this line of progress.
-        let progress = move |text: String| drop(me.try_send(WebotsEvent::Progress(text)));
+        let progress = move |progress| drop(me.try_send(WebotsEvent::Progress(progress)));
         let job = self.server.checkouts.start(world, tip, instance, Arc::new(progress));
         job.into_actor(self)
             .map(|result, this, ctx| match result {
@@ -111,9 +112,9 @@ impl Session {
             simulation.version = Some(version);
             simulation.scene = scene;
         });
-        let text = protocol::loading("webots is starting");
-        self.text(text.clone());
-        self.progress = Some(text);
+        let texts = protocol::progress(&Progress::new(Step::Launch, "webots is starting"));
+        self.texts(texts.clone());
+        self.progress = Some(texts);
         let gpu = self.take_gpu(&slot.lease);
         let project = Arc::new(project);
         let project_of_webots = Arc::downgrade(&project);

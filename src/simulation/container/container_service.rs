@@ -20,9 +20,9 @@ use super::packet_filter;
 use super::simulation_containers::SimulationContainers;
 use super::webots_yml::ProjectKind;
 use crate::shared::domain::Failure;
-use crate::simulation::checkout::OnProgress;
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::process::process_tree::is_connected;
+use crate::simulation::progress::{OnProgress, Progress, Step};
 
 /// Creates the containers of simulations.
 pub struct ContainerService {
@@ -71,7 +71,7 @@ impl ContainerService {
         })
     }
 
-    /// Creates the containers of a simulation, but starts none. `progress` receives each step as text.
+    /// Creates the containers of a simulation, but starts none. `progress` receives each step.
     ///
     /// Dropping the future discards everything that was created.
     ///
@@ -132,7 +132,7 @@ impl ContainerService {
         let ((options, services), yml) = written;
         // More concurrent runs would only be slower. The semaphore is never closed.
         let turn = self.turns.acquire().await.ok();
-        progress("Creating network and containers".to_owned());
+        progress(Progress::new(Step::Launch, "Creating network and containers"));
         let up = ["up", "--no-start", "--no-build"].map(str::to_owned);
         let words = self
             .docker

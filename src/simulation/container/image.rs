@@ -9,7 +9,6 @@ use std::time::{Duration, Instant};
 
 use actix_rt::task::spawn_blocking;
 use parking_lot::Mutex;
-use tokio::sync::watch;
 
 use super::build_plan::{self, ImageBuild};
 use super::builders::{Builder, Builders};
@@ -23,9 +22,10 @@ use super::growth::{self, BuildMark};
 use super::image_store::{ImageStore, ImageUse};
 use super::owned_resources::ResourceOwner;
 use crate::shared::domain::{Failure, Reason};
-use crate::simulation::checkout::{OnProgress, Project, SingleFlight};
+use crate::simulation::checkout::{Project, SingleFlight, Steps};
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::process::{DiskRoom, own_call_failed};
+use crate::simulation::progress::{MAX_STEPS, OnProgress, Progress, Step};
 
 /// The images of this server.
 pub struct Images {
@@ -64,8 +64,6 @@ const SIZE: &str = "{{.Size}}";
 const CONFIG: &str = "{{json .Config}}";
 /// The longest version of a world that has an image.
 const MAX_VERSION: usize = 50;
-/// The largest number of steps that Webots' page understands: each number has one digit.
-const STEPS: u64 = 9;
 /// Interval between two looks at the disk of Docker during a build.
 const LOOK_INTERVAL: Duration = Duration::from_secs(1);
 /// Time in which Docker removes the files of a build that was ended.
@@ -101,9 +99,9 @@ impl Images {
     ) -> Result<String, Failure> {
         let this = Arc::clone(self);
         let name = image.to_owned();
-        let pull = move |sender: watch::Sender<String>| async move {
-            let _builder = this.builder(address, &sender).await?;
-            let on_line = |line: &str| drop(sender.send(format!("Step 1/{STEPS} : fetching {name}: {line}")));
+        let pull = move |steps: Steps| async move {
+            let _builder = this.builder(address, &steps).await?;
+            let on_line = |line: &str| steps.send(numbered(1, MAX_STEPS, format!("fetching {name}: {line}")));
             this.store.expect(&name);
             let command = ["docker", "pull", &name].map(OsString::from).to_vec();
             let pulled = this.docker.follow(command, this.config.timing.build, on_line).await;
@@ -163,13 +161,13 @@ impl Images {
         let this = Arc::clone(self);
         let project = Arc::clone(project);
         let tag = name.clone();
-        let job = move |sender: watch::Sender<String>| async move {
+        let job = move |steps: Steps| async move {
             // A build without steps of a project takes seconds, and is as large as the image of Webots.
             if build.folder.is_none() {
-                return this.build_now(&tag, &project, build, sender).await;
+                return this.build_now(&tag, &project, build, &steps).await;
             }
-            let _builder = this.builder(address, &sender).await?;
-            let done = this.build_now(&tag, &project, build, sender).await;
+            let _builder = this.builder(address, &steps).await?;
+            let done = this.build_now(&tag, &project, build, &steps).await;
             this.store.added();
             done?;
             this.check_size(&tag).await
@@ -185,7 +183,7 @@ impl Images {
         name: &str,
         format: &str,
         progress: OnProgress<'_>,
-        job: impl FnOnce(watch::Sender<String>) -> F,
+        job: impl FnOnce(Steps) -> F,
     ) -> Result<String, Failure> {
         if let Some(found) = self.inspect(name, format).await? {
             return Ok(found);
@@ -196,13 +194,7 @@ impl Images {
         self.inspect(name, format).await?.ok_or_else(unreadable)
     }
 
-    async fn build_now(
-        &self,
-        name: &str,
-        project: &Project,
-        build: ImageBuild,
-        sender: watch::Sender<String>,
-    ) -> Result<(), Failure> {
+    async fn build_now(&self, name: &str, project: &Project, build: ImageBuild, steps: &Steps) -> Result<(), Failure> {
         let ImageBuild {
             dockerfile,
             folder,
@@ -247,9 +239,9 @@ impl Images {
         let words = words.chain(arguments).chain([context.into()]);
         let mut step = String::new();
         let on_line = |line: &str| {
-            if let Some(text) = scaled(line) {
+            if let Some(progress) = scaled(line) {
                 line.clone_into(&mut step);
-                sender.send(text).ok();
+                steps.send(progress);
             }
         };
         let follow = self.docker.follow(words.collect(), self.config.timing.build, on_line);
@@ -382,9 +374,9 @@ impl Images {
     }
 
     /// Waits until another image may be built or pulled for this address.
-    async fn builder(&self, address: Option<IpAddr>, sender: &watch::Sender<String>) -> Result<Builder<'_>, Failure> {
+    async fn builder(&self, address: Option<IpAddr>, steps: &Steps) -> Result<Builder<'_>, Failure> {
         let limit = self.config.timing.build;
-        let on_wait = || drop(sender.send("waiting for other images to be built".to_owned()));
+        let on_wait = || steps.send(Progress::new(Step::Image, "waiting for other images to be built"));
         let builder = self.builders.take(address, limit, on_wait).await;
         builder.ok_or_else(|| {
             let limit = limit.as_secs();
@@ -408,16 +400,23 @@ impl Images {
 }
 
 /// The step of a build, from Docker's line about it, in at most nine steps; `None` for any other line.
-fn scaled(line: &str) -> Option<String> {
+fn scaled(line: &str) -> Option<Progress> {
     let (numbers, instruction) = line.strip_prefix("Step ")?.split_once(" : ")?;
     let (step, of) = numbers.split_once('/')?;
     let (step, of): (u64, u64) = (step.parse().ok()?, of.parse().ok()?);
-    let step = if of > STEPS {
-        (step.saturating_mul(STEPS) / of).max(1)
+    let step = if of > MAX_STEPS {
+        (step.saturating_mul(MAX_STEPS) / of).max(1)
     } else {
         step
     };
-    Some(format!("Step {step}/{} : {instruction}", of.min(STEPS)))
+    Some(numbered(step, of.min(MAX_STEPS), instruction.to_owned()))
+}
+
+fn numbered(number: u64, of: u64, text: String) -> Progress {
+    Progress {
+        of_all: Some((number, of)),
+        ..Progress::new(Step::Image, text)
+    }
 }
 
 /// The failure of a build that has filled the disk of Docker.
@@ -465,13 +464,16 @@ mod tests {
     #[test]
     fn steps_have_one_digit() {
         for (said, told) in [
-            ("Step 2/4 : RUN make", Some("Step 2/4 : RUN make")),
-            ("Step 10/20 : COPY . /x", Some("Step 4/9 : COPY . /x")),
-            ("Step 1/20 : FROM a", Some("Step 1/9 : FROM a")),
+            ("Step 2/4 : RUN make", Some((2, 4, "RUN make"))),
+            ("Step 10/20 : COPY . /x", Some((4, 9, "COPY . /x"))),
+            ("Step 1/20 : FROM a", Some((1, 9, "FROM a"))),
             ("Step into the light", None),
             (" ---> Running in 0123", None),
         ] {
-            assert_eq!(scaled(said).as_deref(), told);
+            assert_eq!(
+                scaled(said),
+                told.map(|(number, of, text)| numbered(number, of, text.to_owned()))
+            );
         }
     }
 }

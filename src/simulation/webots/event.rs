@@ -6,13 +6,14 @@ use actix::prelude::*;
 
 use crate::shared::domain::Failure;
 use crate::simulation::attachment::Token;
+use crate::simulation::progress::Progress;
 
 /// An event of a running Webots.
 #[derive(Message, Debug, Clone, PartialEq, Eq)]
 #[rtype(result = "()")]
 pub enum WebotsEvent {
-    /// A step of its preparation or of the checkout before it, as text.
-    Progress(String),
+    /// A step of its preparation or of the checkout before it.
+    Progress(Progress),
     /// A text of the protocol that its project requests, unchanged.
     Text(String),
     /// Its process was started at this time: the time limit counts from then.

@@ -22,6 +22,7 @@ use tokio_tungstenite::connect_async;
 use tokio_tungstenite::tungstenite::Message as Frame;
 
 use crate::simulation::process::process_tree;
+use crate::simulation::progress::{Progress, Step};
 use crate::simulation::relay::has_world;
 
 /// An event of the start of a Webots.
@@ -30,8 +31,8 @@ use crate::simulation::relay::has_world;
 pub enum StartupEvent {
     /// It listens.
     Listening,
-    /// The progress of its download or load, as text.
-    Loading(String),
+    /// The progress of its download or load.
+    Loading(Progress),
     /// The world is ready: viewers may connect.
     Ready,
 }
@@ -167,7 +168,7 @@ impl Startup {
                 let Frame::Text(text) = frame else { continue };
                 if let Some(progress) = text.strip_prefix("loading:") {
                     // A full mailbox drops this line.
-                    self.events.try_send(StartupEvent::Loading(in_words(progress))).ok();
+                    self.events.try_send(StartupEvent::Loading(parsed(progress))).ok();
                 } else if text.starts_with("world:") {
                     self.loaded.notify_one();
                     break;
@@ -177,11 +178,15 @@ impl Startup {
     }
 }
 
-/// The progress `STATUS:PERCENT`, as text. Whatever the status is, clients can't take the text for an error.
-fn in_words(progress: &str) -> String {
+/// The progress `STATUS:PERCENT`. Whatever the status is, clients can't take its text for an error.
+fn parsed(progress: &str) -> Progress {
+    let of_webots = |text: &str| Progress::new(Step::Load, format!("Webots: {text}"));
     match progress.rsplit_once(':') {
-        Some((status, percent)) => format!("Webots: {}: {percent} %", status.trim()),
-        None => format!("Webots: {progress}"),
+        Some((status, percent)) => Progress {
+            percent: percent.trim().parse().ok().filter(|percent| *percent <= 100),
+            ..of_webots(&format!("{}: {percent} %", status.trim()))
+        },
+        None => of_webots(progress),
     }
 }
 
@@ -272,8 +277,11 @@ mod tests {
             stream.write_all(b"PROCESSING").await.unwrap();
         };
         socket.send(Frame::text("loading:Downloading assets:40")).await.unwrap();
-        let progress = StartupEvent::Loading("Webots: Downloading assets: 40 %".to_owned());
-        assert_eq!(events.recv().await, Some(progress));
+        let progress = Progress {
+            percent: Some(40),
+            ..Progress::new(Step::Load, "Webots: Downloading assets: 40 %")
+        };
+        assert_eq!(events.recv().await, Some(StartupEvent::Loading(progress)));
         socket
             .send(Frame::text("world:worlds/a.wbt:worlds/a.wbt"))
             .await

@@ -22,6 +22,7 @@ use crate::shared::run::seconds_since_1970;
 use crate::simulation::container::SimulationContainers;
 use crate::simulation::ends::{End, StopReason, lost};
 use crate::simulation::process::ProcessGroup;
+use crate::simulation::progress::{Progress, Step};
 use crate::simulation::slots::port;
 
 /// Requests Webots' end.
@@ -130,7 +131,7 @@ impl Webots {
         let prepared = async move {
             let Some(containers) = containers else { return Ok(None) };
             // A full mailbox drops this line.
-            let progress = move |text| drop(session.try_send(WebotsEvent::Progress(text)));
+            let progress = move |progress| drop(session.try_send(WebotsEvent::Progress(progress)));
             let mut prepared = containers.prepare(request, &progress).await?;
             prepared.start_others().await.map(|()| Some(prepared))
         };
@@ -148,7 +149,7 @@ impl Webots {
         let restart = containers.as_ref().and_then(SimulationContainers::restart);
         if let Some(SimulationContainers { warnings, texts, .. }) = &containers {
             for warning in warnings {
-                self.send(WebotsEvent::Progress(warning.clone()));
+                self.send(WebotsEvent::Progress(Progress::new(Step::Image, warning.clone())));
             }
             for text in texts {
                 self.send(WebotsEvent::Text(text.clone()));
