@@ -379,20 +379,38 @@ async fn a_lesson_is_one_list_of_all_servers() {
         lines[0].ends_with(",waited (s),duration (s),real time (%),server"),
         "{text}"
     );
-    for ((line, id), (server, name)) in
-        lines[1..]
-            .iter()
-            .zip(&ids)
-            .zip([(&first, "Anna"), (&second, "'=1+1"), (&first, "Ben")])
-    {
-        assert!(
-            line.starts_with(id.as_str()) && line.ends_with(&format!(",{server}")),
-            "{text}"
-        );
+    // By their beginnings, in seconds.
+    assert!(lines[1..].is_sorted_by_key(|line| line.split(',').nth(1)), "{text}");
+    for (id, (server, name)) in ids.iter().zip([(&first, "Anna"), (&second, "'=1+1"), (&first, "Ben")]) {
+        let line = lines.iter().find(|line| line.starts_with(id.as_str())).unwrap();
+        assert!(line.ends_with(&format!(",{server}")), "{text}");
         assert!(line.contains(&format!("\"{name}\"")), "{line}");
         let duration = line.rsplit(',').nth(2).unwrap();
         assert!(duration.parse::<u64>().is_ok(), "{line}");
     }
+    // A server without the key has seen the token with which its records were requested. It reads, and does nothing else.
+    let token = python.token().unwrap();
+    let bearer = format!("Bearer {token}");
+    let get = async |path: &str| {
+        let client = awc::Client::builder().disable_redirects().finish();
+        let request = client
+            .get(servers[0].url(path))
+            .insert_header(("Authorization", bearer.as_str()));
+        request.send().await.unwrap()
+    };
+    assert_eq!(get("/simulations.csv").await.status(), 200);
+    let entered = get(&format!("/sign-in?entry={token}")).await;
+    let headers = entered.headers();
+    assert_eq!(headers.get("location").map(|to| to.to_str().unwrap()), Some("sign-in"));
+    assert!(headers.get("set-cookie").is_none(), "{headers:?}");
+    let (status, text) = send(
+        &servers[0],
+        &format!("/simulations/{}/stop", ids[0]),
+        &token,
+        &json!({}),
+    )
+    .await;
+    assert_eq!((status, text.as_str()), (403, "Error: this token may only read."));
     let past = get_as_administrator(&session.url("/simulations.csv?from=0&to=1000")).await;
     assert_eq!(past.text().lines().count(), 1, "{}", past.text());
     // Of one server, for session servers only while it has no password.

@@ -65,6 +65,8 @@ struct Shared {
     manner: Mutex<Manner>,
     connections: AtomicUsize,
     requests: AtomicUsize,
+    /// The token of the last request that had one.
+    token: Mutex<Option<String>>,
 }
 
 impl StandIn {
@@ -91,6 +93,7 @@ impl StandIn {
             manner: Mutex::new(manner),
             connections: AtomicUsize::new(0),
             requests: AtomicUsize::new(0),
+            token: Mutex::default(),
         });
         let end = CancellationToken::new();
         let serving = serve(listener, Arc::clone(&shared), end.clone());
@@ -116,6 +119,11 @@ impl StandIn {
     /// The number of connections accepted so far.
     pub fn connections(&self) -> usize {
         self.shared.connections.load(Ordering::SeqCst)
+    }
+
+    /// The token (RFC 6750) of the last request that had one.
+    pub fn token(&self) -> Option<String> {
+        self.shared.token.lock().unwrap().clone()
     }
 
     /// The number of requests received so far.
@@ -144,7 +152,11 @@ async fn serve(listener: TcpListener, shared: Arc<Shared>, end: CancellationToke
 /// Answers requests on one connection until it ends.
 async fn converse(mut stream: TcpStream, shared: &Shared) -> std::io::Result<()> {
     stream.set_nodelay(true)?;
-    while let Some(path) = next_request(&mut stream).await? {
+    while let Some(head) = next_request(&mut stream).await? {
+        let path = head.split(' ').nth(1).unwrap_or_default().to_owned();
+        if let Some((_, rest)) = head.split_once("Bearer ") {
+            *shared.token.lock().unwrap() = rest.lines().next().map(str::to_owned);
+        }
         shared.requests.fetch_add(1, Ordering::SeqCst);
         let manner = shared.manner.lock().unwrap().clone();
         if !answer(&mut stream, &path, manner).await? {
@@ -154,7 +166,7 @@ async fn converse(mut stream: TcpStream, shared: &Shared) -> std::io::Result<()>
     Ok(())
 }
 
-/// The path of the next request; `None` at the end of the connection.
+/// The head of the next request; `None` at the end of the connection.
 async fn next_request(stream: &mut TcpStream) -> std::io::Result<Option<String>> {
     let mut head = Vec::new();
     while !head.ends_with(b"\r\n\r\n") {
@@ -162,8 +174,7 @@ async fn next_request(stream: &mut TcpStream) -> std::io::Result<Option<String>>
             return Ok(None);
         }
     }
-    let text = String::from_utf8_lossy(&head).into_owned();
-    Ok(text.split(' ').nth(1).map(str::to_owned))
+    Ok(Some(String::from_utf8_lossy(&head).into_owned()))
 }
 
 /// Answers one request; returns whether the connection stays open.

@@ -78,12 +78,12 @@ async fn records(
     span: web::Query<TimeSpan>,
     server: web::Data<AppState>,
 ) -> Result<HttpResponse> {
-    server.admin_auth.reader(&request)?;
+    let administrator = server.admin_auth.reader(&request)?;
     let monitors = server.registry.send(GetMonitors).await;
     let monitors = monitors.map_err(|_| ErrorServiceUnavailable("Error: the server stops."))?;
     let order = GetRecords {
         query: span.query(),
-        token: sign_in::entry_token(&server.admin_auth, &request),
+        token: sign_in::reading_token(&server.admin_auth, administrator),
     };
     let fetch = |(address, monitor): (PublicAddress, Recipient<GetRecords>)| {
         let answer = monitor.send(order.clone());
@@ -197,9 +197,10 @@ struct Visit {
 /// Leads the browser of an administrator to a simulation, or to the monitor of a simulation server, where it is signed in
 /// then, too.
 async fn visit(request: HttpRequest, which: web::Query<Visit>, server: web::Data<AppState>) -> Result<HttpResponse> {
-    if let Err(error) = server.admin_auth.owner(&request) {
-        return Ok(sign_in::refuse(error, &request, "class"));
-    }
+    let administrator = match server.admin_auth.owner(&request) {
+        Ok(administrator) => administrator,
+        Err(error) => return Ok(sign_in::refuse(error, &request, "class")),
+    };
     let nothing = || ErrorNotFound("Error: there is no such simulation or server; it may have ended.");
     let (address, to) = if let Some(id) = &which.id {
         let address = server.roster.server_of(id).ok_or_else(nothing)?;
@@ -211,7 +212,7 @@ async fn visit(request: HttpRequest, which: web::Query<Visit>, server: web::Data
         (known.find(is_it).ok_or_else(nothing)?.clone(), "monitor".to_owned())
     };
     let page = if server.roster.is_linked(&address) {
-        format!("sign-in?{}", sign_in::entry(&server.admin_auth, &request, &to))
+        format!("sign-in?{}", sign_in::entry(&server.admin_auth, administrator, &to))
     } else {
         to
     };

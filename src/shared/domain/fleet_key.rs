@@ -21,6 +21,8 @@ pub enum Purpose {
     SignIn,
     /// An administrator's way from the session server to the page of a simulation server.
     Entry,
+    /// What a session server reads from a simulation server for an administrator.
+    Reading,
 }
 
 /// Length of a signature, in bytes.

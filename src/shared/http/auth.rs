@@ -114,8 +114,8 @@ impl AdminAuth {
         if let Some(sign_in) = self.signed_in(request).filter(|one| one.holds(seconds_since_1970())) {
             return Ok(self.administrator(request, &sign_in.name, Way::SignIn, Permission::Act));
         }
-        let is_entry = self.settings.has_fleet && matches!(credentials(request), Some(Credentials::Token(_)));
-        if !self.is_on() && !is_entry {
+        let is_of_fleet = self.settings.has_fleet && matches!(credentials(request), Some(Credentials::Token(_)));
+        if !self.is_on() && !is_of_fleet {
             return Err(AuthError::Off);
         }
         let unknown = AuthError::Unknown {
@@ -123,7 +123,7 @@ impl AdminAuth {
         };
         match credentials(request).ok_or(unknown)? {
             Credentials::Token(token) => {
-                if let Some(name) = self.entered(&token) {
+                if let Some(name) = self.reads_for(&token) {
                     return Ok(self.administrator(request, &name, Way::SignIn, Permission::Read));
                 }
                 let is_same = |one: &&ApiToken| one.token.reveal().as_bytes().ct_eq(token.as_bytes()).into();
@@ -192,10 +192,10 @@ impl AdminAuth {
     }
 
     /// The administrator for whom a session server of the fleet reads something here.
-    fn entered(&self, token: &str) -> Option<String> {
-        let read = || SignIn::read(token, &self.settings.key, Use::Entry);
-        let entry = self.settings.has_fleet.then(read)??;
-        entry.holds(seconds_since_1970()).then_some(entry.name)
+    fn reads_for(&self, token: &str) -> Option<String> {
+        let read = || SignIn::read(token, &self.settings.key, Use::Reading);
+        let reading = self.settings.has_fleet.then(read)??;
+        reading.holds(seconds_since_1970()).then_some(reading.name)
     }
 
     /// The client of a request.

@@ -25,8 +25,10 @@ pub struct SignIn {
 pub enum Use<'password> {
     /// A cookie of a server with this password. It is not valid any more after the password has changed.
     Cookie(&'password str),
-    /// A way to another server of the fleet.
+    /// A way for a browser to another server of the fleet.
     Entry,
+    /// To read something from another server of the fleet. It signs no browser in.
+    Reading,
 }
 
 /// Length of a number, in bytes.
@@ -71,6 +73,7 @@ impl Use<'_> {
         match self {
             Self::Cookie(password) => key.sign(Purpose::SignIn, &[content, password.as_bytes()]),
             Self::Entry => key.sign(Purpose::Entry, &[content]),
+            Self::Reading => key.sign(Purpose::Reading, &[content]),
         }
     }
 
@@ -78,6 +81,7 @@ impl Use<'_> {
         match self {
             Self::Cookie(password) => key.verifies(Purpose::SignIn, &[content, password.as_bytes()], signature),
             Self::Entry => key.verifies(Purpose::Entry, &[content], signature),
+            Self::Reading => key.verifies(Purpose::Reading, &[content], signature),
         }
     }
 }
@@ -123,6 +127,7 @@ mod tests {
         let entry = anna().write(&key, Use::Entry);
         assert_eq!(SignIn::read(&entry, &key, Use::Entry), Some(anna()));
         assert_eq!(SignIn::read(&entry, &key, Use::Cookie("")), None);
+        assert_eq!(SignIn::read(&entry, &key, Use::Reading), None);
     }
 
     proptest! {

@@ -5,7 +5,7 @@ use actix_web::{HttpRequest, HttpResponse, web};
 use askama::Template;
 use url::form_urlencoded;
 
-use super::auth::{AdminAuth, AuthError, is_cross_site, opens_page};
+use super::auth::{AdminAuth, Administrator, AuthError, is_cross_site, opens_page};
 use super::cookie::{SignIn, Use};
 use super::page::{OWN_FILES, html};
 use super::routing::{POST, body, path};
@@ -13,7 +13,7 @@ use crate::shared::run::seconds_since_1970;
 
 /// How long a sign-in holds, in seconds.
 const VALIDITY: u64 = 8 * 3600;
-/// How long an entry to another server of the fleet holds, in seconds.
+/// How long an entry to another server of the fleet, or a token to read there, holds, in seconds.
 const ENTRY: u64 = 60;
 /// How long a browser keeps the cookie, in seconds: by it, the browser is known after the end of its sign-in.
 const KEPT: u64 = 365 * 24 * 3600;
@@ -54,23 +54,27 @@ pub fn refuse(error: AuthError, request: &HttpRequest, to: &str) -> HttpResponse
 
 /// The query of a URL that leads the browser of an administrator to a page of another server of the fleet, without
 /// signing in there.
-pub fn entry(auth: &AdminAuth, request: &HttpRequest, to: &str) -> String {
-    let entry = entry_token(auth, request);
+pub fn entry(auth: &AdminAuth, administrator: Administrator, to: &str) -> String {
+    let entry = signed(auth, administrator, Use::Entry);
     form_urlencoded::Serializer::new(String::new())
         .append_pair("entry", &entry)
         .append_pair("to", to)
         .finish()
 }
 
-/// What lets an administrator in at another server of the fleet: in a URL, or to read something as a token.
-pub fn entry_token(auth: &AdminAuth, request: &HttpRequest) -> String {
-    let name = auth.reader(request).map(|one| one.name).unwrap_or_default();
-    let entry = SignIn {
+/// A token to read something from other servers for an administrator. All of them see it, also one without the key of the
+/// fleet, so it signs no browser in.
+pub fn reading_token(auth: &AdminAuth, administrator: Administrator) -> String {
+    signed(auth, administrator, Use::Reading)
+}
+
+fn signed(auth: &AdminAuth, Administrator { name, .. }: Administrator, purpose: Use) -> String {
+    let sign_in = SignIn {
         name,
         browser: rand::random(),
         until: seconds_since_1970() + ENTRY,
     };
-    entry.write(&auth.settings.key, Use::Entry)
+    sign_in.write(&auth.settings.key, purpose)
 }
 
 async fn sign_in(request: HttpRequest, payload: web::Payload, auth: web::Data<AdminAuth>) -> HttpResponse {
