@@ -28,7 +28,7 @@ const reason = find('stop-reason', HTMLInputElement);
 const rows = new Map();
 /** How many have each name. @type {Map<string, number>} */
 const names = new Map();
-/** The ids of the simulations that the dialog is about. @type {string[]} */
+/** The simulations that the dialog is about. @type {Entry[]} */
 let chosen = [];
 /** Most ids in one order. */
 const BATCH = 200;
@@ -128,7 +128,7 @@ function actions(entry) {
   const whose = make('span', { className: 'spoken' }, ` ${nameOf(entry)} ${worldOf(entry)}`);
   const watch = cell('Watch', '');
   if (entry.state === 'idle' || entry.state === 'running') {
-    const href = `visit?id=${encodeURIComponent(entry.id)}`;
+    const href = `visit?${new URLSearchParams({ id: entry.id, server: entry.server ?? '' })}`;
     watch.append(make('a', { href, target: '_blank', rel: 'noopener' }, 'Watch', whose.cloneNode(true)));
   } else {
     watch.append(none());
@@ -266,7 +266,7 @@ function take({ all: isAll, changed, gone, servers, announcement }) {
 
 /** @param {Entry[]} entries the simulations to stop */
 function ask(entries) {
-  chosen = entries.map((entry) => entry.id);
+  chosen = entries;
   const [first] = entries;
   const isOne = entries.length === 1 && first;
   find('stop-title', HTMLElement).textContent = isOne
@@ -282,12 +282,12 @@ function ask(entries) {
   reason.focus();
 }
 
-/** @param {string[]} ids */
-async function stop(ids) {
+/** Ids are unique on their server only. @param {string} server @param {string[]} ids */
+async function stop(server, ids) {
   const order = {
     method: 'POST',
     headers: { 'Content-Type': 'application/json' },
-    body: JSON.stringify({ ids, reason: reason.value }),
+    body: JSON.stringify({ server, ids, reason: reason.value }),
   };
   const answer = await fetch('simulations/stop', order);
   if (!answer.ok) {
@@ -301,8 +301,11 @@ async function stopNow(event) {
   event.preventDefault();
   let failed = 0;
   try {
-    for (let begin = 0; begin < chosen.length; begin += BATCH) {
-      failed += await stop(chosen.slice(begin, begin + BATCH));
+    for (const server of new Set(chosen.map((entry) => entry.server ?? ''))) {
+      const ids = chosen.filter((entry) => entry.server === server).map((entry) => entry.id);
+      for (let begin = 0; begin < ids.length; begin += BATCH) {
+        failed += await stop(server, ids.slice(begin, begin + BATCH));
+      }
     }
   } catch (error) {
     problem.textContent = error instanceof Error ? error.message : 'The server does not answer.';

@@ -1,11 +1,14 @@
 //! The WebSocket `/slots` to simulation servers that lie or send too much: others, and the line, are not disturbed.
 
+use std::time::{Duration, Instant};
+
 use serde_json::json;
 use webots_fleet::shared::domain::{Offer, Offers, ReservationId};
 
 use super::until_states;
 use crate::support::client::Client;
 use crate::support::git::arm;
+use crate::support::http::{PASSWORD, get_as_administrator};
 use crate::support::program::{Server, demo_server, session_server};
 use crate::support::reserving::ReservingServer;
 
@@ -29,6 +32,7 @@ async fn a_server_that_lies_and_floods_disturbs_no_other_and_no_turn() {
     let session = session_server(&[honest.address(), liar.address.clone()])
         .set("fleetKey", SECRET)
         .set("loadThreshold", 1000)
+        .set("adminPassword", PASSWORD)
         .start()
         .await;
     until_states(&session, &["full", "full"]).await;
@@ -60,7 +64,27 @@ async fn a_server_that_lies_and_floods_disturbs_no_other_and_no_turn() {
     link.say("x".repeat(1 << 20)).await;
     let mut link = liar.link().await;
     link.say("[]".to_owned()).await;
-    liar.link().await;
+    let mut link = liar.link().await;
+    // So does a list of more simulations than memory should hold.
+    let simulation =
+        |id: usize| json!({"id": id.to_string(), "world": "x".repeat(100_000), "state": "running", "since": 1});
+    for part in 0..100 {
+        let simulations: Vec<_> = (10 * part..10 * (part + 1)).map(simulation).collect();
+        link.say(json!({"roster": {"all": false, "simulations": simulations, "ended": []}}).to_string())
+            .await;
+    }
+    let mut link = liar.link().await;
+    let list = get_as_administrator(&session.url("/simulations")).await.json();
+    let of_liar = list
+        .as_array()
+        .unwrap()
+        .iter()
+        .filter(|one| one["server"] == liar.address);
+    assert_eq!(of_liar.count(), 0);
+    // Pings are answered, but no faster than other messages.
+    let begin = Instant::now();
+    link.ping(300).await;
+    assert!(begin.elapsed() >= Duration::from_millis(300), "{:?}", begin.elapsed());
     inside.leave().await;
     second.until("pass: ").await;
     assert_eq!(second.until("ws://").await, format!("ws://{}", honest.address()));

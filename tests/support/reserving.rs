@@ -10,7 +10,7 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::{WebSocketStream, accept_async};
-use webots_fleet::shared::domain::{Hello, Offer, Offers, ReservationId, ServerRun, Wishes};
+use webots_fleet::shared::domain::{Hello, Offer, Offers, ReservationId, ServerRun, ToSimulationServer, Wishes};
 
 use super::SOON;
 
@@ -69,7 +69,11 @@ impl SlotSocket {
     pub async fn wishes_if_any(&mut self) -> Option<Wishes> {
         loop {
             match self.0.next().await? {
-                Ok(Message::Text(text)) => return serde_json::from_str(&text).ok(),
+                Ok(Message::Text(text)) => {
+                    if let ToSimulationServer::Wishes(wishes) = serde_json::from_str(&text).ok()? {
+                        return Some(wishes);
+                    }
+                }
                 Ok(_) => {}
                 Err(_) => return None,
             }
@@ -84,6 +88,21 @@ impl SlotSocket {
     /// Sends any text; returns whether the session server is still there.
     pub async fn say(&mut self, text: String) -> bool {
         self.0.send(Message::text(text)).await.is_ok()
+    }
+
+    /// Sends so many pings, and waits until all are answered.
+    pub async fn ping(&mut self, count: usize) {
+        for _ in 0..count {
+            self.0.send(Message::Ping(Default::default())).await.unwrap();
+        }
+        let mut answered = 0;
+        let answers = async {
+            while answered < count {
+                answered += usize::from(self.0.next().await.unwrap().unwrap().is_pong());
+            }
+        };
+        let waited = actix_rt::time::timeout(SOON, answers).await;
+        waited.expect("each ping is answered");
     }
 
     /// Answers these wishes with a slot for each of these tickets.
@@ -127,7 +146,7 @@ async fn answer(
         server: ServerRun(2),
         pass,
         keeps_ready: false,
-        roster: false,
+        roster: true,
     };
     link.say(serde_json::to_string(&hello).unwrap()).await;
     // Its proof.

@@ -2,4 +2,4 @@
 
 mod roster;
 
-pub use roster::{Changes, ClassEntry, ClassState, Key, Matching, Roster, StopRequest, Watching};
+pub use roster::{Changes, ClassEntry, ClassState, Key, Matching, Roster, RosterTooLarge, StopRequest, Watching};

@@ -3,7 +3,7 @@
 //!
 //! The links to simulation servers write it from the thread of the monitors, and the routes read it, so a mutex guards it.
 
-use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -130,6 +130,13 @@ struct List {
 #[derive(Debug)]
 pub struct Watching(watch::Sender<usize>);
 
+/// A simulation server tells of more simulations than it can have, or its texts are too long.
+#[derive(Debug, PartialEq, Eq, thiserror::Error)]
+#[error("its list of simulations exceeds {} MiB", MAX_OF_SERVER >> 20)]
+pub struct RosterTooLarge;
+
+/// Most bytes that the entries of one server take; those of a simulation for each port take less.
+const MAX_OF_SERVER: usize = 64 << 20;
 /// Number of entries that are gone and known as such.
 const GONE: usize = 10_000;
 /// Most ids in one order.
@@ -161,15 +168,18 @@ impl Roster {
     }
 
     /// Adds what a simulation server has told.
-    pub fn update(&self, server: &PublicAddress, update: RosterUpdate) {
+    ///
+    /// # Errors
+    /// When it has told too much. Its link must end then, with which its entries go.
+    pub fn update(&self, server: &PublicAddress, update: RosterUpdate) -> Result<(), RosterTooLarge> {
         let mut list = self.list.lock();
         // Of a link that has ended.
         if !list.links.contains_key(server) {
-            return;
+            return Ok(());
         }
         if update.all {
-            let is_there = |id: &String| update.simulations.iter().any(|one| one.id == *id);
-            list.retain(Some(server), is_there);
+            let told: HashSet<&String> = update.simulations.iter().map(|one| &one.id).collect();
+            list.retain(Some(server), |id| told.contains(id));
         }
         for id in update.ended {
             list.remove((Some(server.clone()), id));
@@ -177,12 +187,17 @@ impl Roster {
         for simulation in update.simulations {
             list.put(entry(server, simulation));
         }
+        let sizes = list.entries_of(Some(server)).map(|(_, (_, entry))| entry.size());
+        if sizes.sum::<usize>() > MAX_OF_SERVER {
+            return Err(RosterTooLarge);
+        }
+        Ok(())
     }
 
     /// These clients wait in the line, and no others.
     pub fn set_waiting(&self, waiting: Vec<ClassEntry>) {
         let mut list = self.list.lock();
-        let ids: std::collections::HashSet<&String> = waiting.iter().map(|one| &one.id).collect();
+        let ids: HashSet<&String> = waiting.iter().map(|one| &one.id).collect();
         list.retain(None, |id| ids.contains(id));
         for one in waiting {
             list.put(one);
@@ -218,10 +233,13 @@ impl Roster {
         }
     }
 
-    /// The server of the simulation with this id.
-    pub fn server_of(&self, id: &str) -> Option<PublicAddress> {
+    /// The server of the simulation with this id; `server` tells it from those of others with the same id.
+    pub fn server_of(&self, id: &str, server: Option<&str>) -> Option<PublicAddress> {
         let list = self.list.lock();
-        list.entries.keys().find(|(_, one)| one == id)?.0.clone()
+        let with_id = list.entries.keys().filter(|(_, one)| one == id);
+        let mut servers = with_id.filter_map(|(of, _)| of.as_ref());
+        let is_it = |of: &&PublicAddress| server.is_none_or(|server| of.to_string() == server);
+        servers.find(is_it).cloned()
     }
 
     /// A page shows the list from now on.
@@ -251,7 +269,8 @@ impl Roster {
         });
         let orders = orders.collect::<Vec<_>>();
         let stopped: Vec<String> = join_all(orders).await.into_iter().flatten().collect();
-        let failed = wanted.into_iter().filter(|id| !stopped.contains(id)).collect();
+        let done: HashSet<&String> = stopped.iter().collect();
+        let failed = wanted.into_iter().filter(|id| !done.contains(id)).collect();
         (stopped, failed)
     }
 
@@ -312,10 +331,17 @@ impl List {
         self.retain(server, |_| false);
     }
 
+    /// The entries of a server, or of the line.
+    fn entries_of(&self, server: Option<&PublicAddress>) -> impl Iterator<Item = (&Key, &(u64, ClassEntry))> {
+        let first = (server.cloned(), String::new());
+        let is_of = move |((of, _), _): &(&Key, _)| of.as_ref() == server;
+        self.entries.range(first..).take_while(is_of)
+    }
+
     /// Removes the entries of a server, or of the line, whose ids don't stay.
     fn retain(&mut self, server: Option<&PublicAddress>, stays: impl Fn(&String) -> bool) {
-        let is_gone = |(of, id): &&Key| of.as_ref() == server && !stays(id);
-        let gone: Vec<Key> = self.entries.keys().filter(is_gone).cloned().collect();
+        let known = self.entries_of(server).map(|(key, _)| key);
+        let gone: Vec<Key> = known.filter(|(_, id)| !stays(id)).cloned().collect();
         for key in gone {
             self.remove(key);
         }
@@ -330,6 +356,15 @@ impl List {
             }
         }
         chosen
+    }
+}
+
+impl ClassEntry {
+    /// The bytes that it takes.
+    fn size(&self) -> usize {
+        let optional = [&self.user, &self.label].into_iter().flatten();
+        let texts = [&self.id, &self.world].into_iter().chain(optional);
+        size_of::<Self>() + texts.map(String::len).sum::<usize>()
     }
 }
 
@@ -419,17 +454,19 @@ mod tests {
         roster.unlink(&other);
         assert!(roster.is_linked(&other), "another link has begun");
         let three = ["1", "2", "3"].map(|id| simulation(id, Stage::Launching)).to_vec();
-        roster.update(&server, update(true, three.clone(), &[]));
-        roster.update(&other, update(true, three.clone(), &[]));
+        roster.update(&server, update(true, three.clone(), &[])).unwrap();
+        roster.update(&other, update(true, three.clone(), &[])).unwrap();
         let first = roster.since(None);
         assert_eq!((first.all, first.changed.len(), first.gone.len()), (true, 6, 0));
         // What has not changed costs nothing.
-        roster.update(&server, update(true, three, &[]));
+        roster.update(&server, update(true, three, &[])).unwrap();
         assert_eq!(roster.since(Some(first.version)).version, first.version);
-        roster.update(&server, update(false, vec![simulation("2", Stage::Running)], &[]));
+        roster
+            .update(&server, update(false, vec![simulation("2", Stage::Running)], &[]))
+            .unwrap();
         let second = roster.since(Some(first.version));
         assert_eq!((second.all, second.changed.len(), second.gone.len()), (false, 1, 0));
-        roster.update(&server, update(false, vec![], &["2", "9"]));
+        roster.update(&server, update(false, vec![], &["2", "9"])).unwrap();
         let third = roster.since(Some(second.version));
         assert_eq!(third.changed, []);
         assert_eq!(third.gone, [(Some(server.clone()), "2".to_owned())]);
@@ -438,7 +475,9 @@ mod tests {
         roster.unlink(&other);
         assert_eq!(roster.since(Some(third.version)).gone.len(), 3);
         assert_eq!(roster.all().len(), 2);
-        roster.update(&other, update(true, vec![simulation("1", Stage::Running)], &[]));
+        roster
+            .update(&other, update(true, vec![simulation("1", Stage::Running)], &[]))
+            .unwrap();
         assert_eq!(roster.all().len(), 2, "a message that is late");
         // One who knows an old version, or that of another run.
         assert!(roster.since(Some(10_000)).all);
@@ -451,12 +490,56 @@ mod tests {
         let _link = roster.link(server.clone());
         for number in 0..GONE + 10 {
             let id = number.to_string();
-            roster.update(&server, update(false, vec![simulation(&id, Stage::Running)], &[]));
-            roster.update(&server, update(false, vec![], &[&id]));
+            roster
+                .update(&server, update(false, vec![simulation(&id, Stage::Running)], &[]))
+                .unwrap();
+            roster.update(&server, update(false, vec![], &[&id])).unwrap();
         }
         assert!(roster.since(Some(1)).all, "it can't be told what is gone");
         let last = roster.since(Some(roster.version() - 2));
         assert_eq!((last.all, last.gone.len()), (false, 1));
+    }
+
+    #[test]
+    fn a_server_that_tells_of_too_many_fills_no_memory() {
+        let roster = Roster::default();
+        let server: PublicAddress = "host:2000".parse().unwrap();
+        let other: PublicAddress = "host:2001".parse().unwrap();
+        let links = [&server, &other].map(|server| roster.link(server.clone()));
+        let one = |id: usize, world: usize| SimulationReport {
+            world: "x".repeat(world),
+            ..simulation(&id.to_string(), Stage::Running)
+        };
+        let every_port = (0..usize::from(u16::MAX)).map(|id| one(id, 100)).collect();
+        assert_eq!(roster.update(&other, update(true, every_port, &[])), Ok(()));
+        let mut told = 0;
+        while roster
+            .update(&server, update(false, vec![one(told, 500_000)], &[]))
+            .is_ok()
+        {
+            told += 1;
+            assert!(told < 1000);
+        }
+        drop(links);
+        roster.unlink(&server);
+        assert_eq!(roster.all().len(), usize::from(u16::MAX));
+    }
+
+    #[test]
+    fn a_simulation_is_told_from_one_with_its_id_at_another_server() {
+        let roster = Roster::default();
+        let servers: [PublicAddress; 2] = ["host:2000", "host:2001"].map(|server| server.parse().unwrap());
+        let _links = servers.each_ref().map(|server| roster.link(server.clone()));
+        for server in &servers {
+            let list = vec![simulation("1", Stage::Running)];
+            roster.update(server, update(true, list, &[])).unwrap();
+        }
+        for server in &servers {
+            let found = roster.server_of("1", Some(&server.to_string()));
+            assert_eq!(found.as_ref(), Some(server));
+        }
+        assert!(roster.server_of("1", None).is_some());
+        assert_eq!(roster.server_of("1", Some("host:2002")), None);
     }
 
     #[test]

@@ -24,7 +24,8 @@ use tokio::time::{sleep, timeout};
 
 use crate::session::class::{Roster, StopRequest};
 use crate::shared::domain::{
-    FleetKey, Follow, Hello, Offers, PublicAddress, StopOrder, Stopped, ToSessionServer, ToSimulationServer,
+    FleetKey, Follow, Hello, MAX_LINK_MESSAGE, Offers, PublicAddress, RosterUpdate, StopOrder, Stopped,
+    ToSessionServer, ToSimulationServer,
 };
 
 /// What happens to a link.
@@ -99,7 +100,7 @@ const CONNECT: Duration = Duration::from_secs(5);
 const SILENCE: Duration = Duration::from_mins(2);
 /// Pause after a connection has broken.
 const PAUSE: Duration = Duration::from_millis(500);
-/// Pause after each message of a server, so that none can keep this one busy with them.
+/// Pause after each message and ping of a server, so that none can keep this one busy with them.
 const BETWEEN_MESSAGES: Duration = Duration::from_millis(1);
 /// Pause if the server has no `/slots`, or another key.
 const LONG_PAUSE: Duration = Duration::from_secs(30);
@@ -166,7 +167,7 @@ impl SlotLink {
                 message = receive(&mut socket, SILENCE) => {
                     match message? {
                         ToSessionServer::Offers(offers) => self.tell(LinkChange::Offers(offers)).await,
-                        ToSessionServer::Roster(update) => self.roster.update(&self.server, update),
+                        ToSessionServer::Roster(update) => self.follow(update)?,
                         ToSessionServer::Stopped(stopped) => {
                             if let Some(followed) = &mut followed {
                                 followed.answer(stopped);
@@ -189,6 +190,14 @@ impl SlotLink {
                 }
             }
         }
+    }
+
+    fn follow(&self, update: RosterUpdate) -> Result<(), LinkError> {
+        let updated = self.roster.update(&self.server, update);
+        updated.map_err(|error| {
+            log::warn!("{}: {error}", self.server);
+            LinkError::Broken(error.to_string())
+        })
     }
 
     /// Tells what has happened, once the receiver has handled what came before. A receiver that has ended needs nothing.
@@ -270,9 +279,10 @@ async fn receive<M: DeserializeOwned>(socket: &mut Socket, limit: Duration) -> R
                 let answered = socket.send(Text::Pong(content)).await;
                 answered.map_err(|error| broken(&error.to_string()))?;
             }
-            Some(Ok(Frame::Pong(_))) => {}
+            Some(Ok(Frame::Pong(_))) => sleep(BETWEEN_MESSAGES).await,
             Some(Ok(_)) | None => return Err(broken("it has ended")),
             Some(Err(error)) => return Err(broken(&error.to_string())),
         }
     }
 }
+                sleep(BETWEEN_MESSAGES).await;

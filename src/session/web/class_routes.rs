@@ -203,7 +203,8 @@ async fn visit(request: HttpRequest, which: web::Query<Visit>, server: web::Data
     };
     let nothing = || ErrorNotFound("Error: there is no such simulation or server; it may have ended.");
     let (address, to) = if let Some(id) = &which.id {
-        let address = server.roster.server_of(id).ok_or_else(nothing)?;
+        let found = server.roster.server_of(id, which.server.as_deref());
+        let address = found.ok_or_else(nothing)?;
         (address, format!("watch?id={id}"))
     } else {
         let status = server.status().await?;
