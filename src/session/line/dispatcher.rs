@@ -231,13 +231,14 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
         }
         let run = link.server;
         let valid = link.pass;
-        for past in self.turns.values_mut().filter(|_| !offers.used.is_empty()) {
+        let used: HashSet<_> = offers.used.iter().collect();
+        for past in self.turns.values_mut().filter(|_| !used.is_empty()) {
             let reservation = past
                 .turn
                 .pass
                 .filter(|pass| pass.server == run)
                 .map(|pass| pass.reservation);
-            past.is_used |= reservation.is_some_and(|reservation| offers.used.contains(&reservation));
+            past.is_used |= reservation.is_some_and(|reservation| used.contains(&reservation));
         }
         let mut turns = Vec::new();
         for offer in &offers.offers {

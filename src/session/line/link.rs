@@ -10,6 +10,10 @@ const MAX_PASS: Duration = Duration::from_hours(1);
 /// Most reservations that are given back at once. A server makes no more than it was told of clients; others that it
 /// claims to have made end by themselves.
 const MAX_BACK: usize = 2 * LISTED;
+/// Most addresses and users that a server passes over: those of the clients that it was told of.
+const MAX_PASSED: usize = 2 * LISTED;
+/// Most clients at its own door that count for the positions of others.
+const MAX_QUEUE: usize = 10_000;
 
 /// The connection to a simulation server that reserves slots.
 #[derive(Debug)]
@@ -66,8 +70,9 @@ impl Link {
     /// Records what it has sent at `now`, in milliseconds since 1970.
     pub(super) fn answered(&mut self, offers: &Offers, now: u64) {
         self.answered = offers.number.min(self.sent);
-        self.passed.clone_from(&offers.passed);
-        self.queue = offers.queue.iter().map(|waited| now.saturating_sub(*waited)).collect();
+        self.passed = offers.passed.iter().take(MAX_PASSED).cloned().collect();
+        let queue = offers.queue.iter().take(MAX_QUEUE);
+        self.queue = queue.map(|waited| now.saturating_sub(*waited)).collect();
         self.queue.sort_unstable();
     }
 
@@ -173,6 +178,18 @@ mod tests {
             answer(&mut link);
         }
         assert!((15..=20).contains(&sent), "{sent}");
+    }
+
+    #[test]
+    fn an_answer_of_any_length_costs_little_later() {
+        let mut link = link();
+        let offers = Offers {
+            queue: vec![5; 100_000],
+            passed: (0..20_000).map(|number| Passed::User(number.to_string())).collect(),
+            ..Offers::default()
+        };
+        link.answered(&offers, 7);
+        assert_eq!((link.queue.len(), link.passed.len()), (10_000, 64));
     }
 
     #[test]
