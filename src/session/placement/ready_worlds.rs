@@ -1,6 +1,7 @@
 //! What simulation servers keep ready: how much is left of it, and which server has to keep how much of a list.
 
-use std::collections::HashMap;
+use std::cmp::Reverse;
+use std::collections::{BinaryHeap, HashMap};
 use std::hash::Hash;
 use std::time::{Duration, Instant};
 
@@ -29,11 +30,9 @@ impl<Id> Default for ReadyWorlds<Id> {
 impl<Id: Clone + Eq + Hash> ReadyWorlds<Id> {
     /// Records what a server has reported.
     pub fn report(&mut self, id: &Id, now: Instant, report: &ServerReport) {
-        for (world, servers) in &mut self.0 {
-            if let Some(left) = servers.get_mut(id) {
-                left.reported = report.ready(world, View::default());
-                left.sent.retain(|at| now.saturating_duration_since(*at) < UNSEEN);
-            }
+        for left in self.0.values_mut().filter_map(|servers| servers.get_mut(id)) {
+            left.reported = 0;
+            left.sent.retain(|at| now.saturating_duration_since(*at) < UNSEEN);
         }
         for one in report
             .ready
@@ -41,19 +40,25 @@ impl<Id: Clone + Eq + Hash> ReadyWorlds<Id> {
             .filter(|one| one.ready > 0 && one.mode == View::default())
         {
             let servers = self.0.entry(one.world.clone()).or_default();
-            servers.entry(id.clone()).or_default().reported = report.ready(&one.world, View::default());
+            let left = servers.entry(id.clone()).or_default();
+            left.reported = left.reported.saturating_add(one.ready);
         }
-        self.0.retain(|_, servers| {
-            servers.retain(|_, left| left.reported > 0);
-            !servers.is_empty()
-        });
+        self.forget(id, |left| left.reported == 0);
     }
 
     /// Forgets a server.
     pub fn lose(&mut self, id: &Id) {
-        for servers in self.0.values_mut() {
-            servers.remove(id);
-        }
+        self.forget(id, |_| true);
+    }
+
+    /// Forgets the worlds of a server of which this holds.
+    fn forget(&mut self, id: &Id, is_gone: impl Fn(&Left) -> bool) {
+        self.0.retain(|_, servers| {
+            if servers.get(id).is_some_and(&is_gone) {
+                servers.remove(id);
+            }
+            !servers.is_empty()
+        });
     }
 
     /// A client was sent to a server.
@@ -89,19 +94,21 @@ pub fn shares<Id>(
             .iter()
             .map(|(id, _)| accepts(id, &one.world).then_some(0))
             .collect();
+        let candidates = servers.iter().zip(&taken).zip(&counts).enumerate();
+        // The servers that accept it and have room, the one with the smallest part in use first.
+        let mut with_room: BinaryHeap<Reverse<(u64, usize)>> = candidates
+            .filter(|(_, (_, count))| count.is_some())
+            .filter_map(|(index, (((_, slots), taken), _))| Some(Reverse((part(*taken, *slots)?, index))))
+            .collect();
         for _ in 0..one.count {
-            let candidates = servers.iter().zip(&taken).zip(&counts).enumerate();
-            let with_room = candidates.filter_map(|(index, (((_, slots), taken), count))| {
-                (count.is_some() && taken < slots).then_some((index, *taken, *slots))
-            });
-            // The server with the smallest part in use, compared as fractions.
-            let least = with_room.min_by(|(_, taken, slots), (_, other, others)| {
-                (u64::from(*taken) * u64::from(*others)).cmp(&(u64::from(*other) * u64::from(*slots)))
-            });
-            let Some((index, ..)) = least else { break };
+            let Some(Reverse((_, index))) = with_room.pop() else {
+                break;
+            };
+            let slots = servers.get(index).map_or(0, |(_, slots)| *slots);
             if let (Some(taken), Some(Some(count))) = (taken.get_mut(index), counts.get_mut(index)) {
                 *taken += 1;
                 *count += 1;
+                with_room.extend(part(*taken, slots).map(|part| Reverse((part, index))));
             }
         }
         for (list, count) in lists.iter_mut().zip(counts) {
@@ -109,6 +116,11 @@ pub fn shares<Id>(
         }
     }
     lists
+}
+
+/// The part of a server's slots that is in use, as a number that sorts like it; `None` if all are.
+fn part(taken: u32, slots: u32) -> Option<u64> {
+    (taken < slots).then(|| (f64::from(taken) / f64::from(slots)).to_bits())
 }
 
 #[cfg(test)]
