@@ -123,6 +123,23 @@ async fn each_server_keeps_its_share_and_clients_are_sent_where_one_is() {
 }
 
 #[actix_rt::test]
+async fn a_long_list_is_kept_too() {
+    let site = Site::new(&[2]).await;
+    // Those with 0 are for another time; all together are longer than a client's message may be.
+    let mut list = vec![json!({"world": arm(), "count": 1})];
+    list.extend((0..300).map(|number| {
+        let world = crate::support::world("lab/arm", "main", &format!("worlds/of_another_lesson_{number}.wbt"));
+        json!({"world": world, "count": 0})
+    }));
+    let session = site.session().set("ready", list).start().await;
+    site.until_ready(&[1]).await;
+    // The line has its link, too.
+    let mut line = Client::connect(&session.websocket("/session")).await;
+    line.send(&json!({"url": arm(), "wait": true}).to_string()).await;
+    line.until("pass: ").await;
+}
+
+#[actix_rt::test]
 async fn a_lesson_is_requested_until_its_end_and_outlives_a_restart() {
     let site = Site::new(&[4]).await;
     let folder = tempfile::tempdir().unwrap();

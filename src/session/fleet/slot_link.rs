@@ -258,6 +258,14 @@ async fn next_order(followed: &mut Option<Followed>) -> StopOrder {
 async fn send(socket: &mut Socket, message: &impl Serialize) -> Result<(), LinkError> {
     let broken = |error: &dyn std::error::Error| LinkError::Broken(error.to_string());
     let text = serde_json::to_string(message).map_err(|error| broken(&error))?;
+    if text.len() > MAX_LINK_MESSAGE {
+        // It would end the link, again and again.
+        log::error!(
+            "a message of {} bytes is too long for a simulation server: it is not sent",
+            text.len()
+        );
+        return Ok(());
+    }
     socket
         .send(Text::Text(text.into()))
         .await
@@ -278,6 +286,7 @@ async fn receive<M: DeserializeOwned>(socket: &mut Socket, limit: Duration) -> R
             Some(Ok(Frame::Ping(content))) => {
                 let answered = socket.send(Text::Pong(content)).await;
                 answered.map_err(|error| broken(&error.to_string()))?;
+                sleep(BETWEEN_MESSAGES).await;
             }
             Some(Ok(Frame::Pong(_))) => sleep(BETWEEN_MESSAGES).await,
             Some(Ok(_)) | None => return Err(broken("it has ended")),
@@ -285,4 +294,3 @@ async fn receive<M: DeserializeOwned>(socket: &mut Socket, limit: Duration) -> R
         }
     }
 }
-                sleep(BETWEEN_MESSAGES).await;

@@ -109,8 +109,8 @@ pub(super) const LISTED: usize = 32;
 /// Most clients of an address or user that a simulation server is told of while it passes these over: it needs the first
 /// of them for its next slot that they may have.
 const LISTED_OF_PASSED: usize = 2;
-/// Most bytes of worlds and users' names that a simulation server is told of, unless one client has more: it refuses
-/// messages of more than 8 KiB.
+/// Most bytes of worlds and users' names that a simulation server is told of, unless one client has more: clients choose
+/// their length.
 const MAX_TEXTS: usize = 4096;
 
 impl<Server: Clone + Eq, Client: Clone> WaitingLine<Server, Client> {

@@ -13,6 +13,9 @@ use super::fleet_key::{FleetKey, Purpose};
 use super::pass::{ReservationId, ServerRun};
 use super::project_url::ProjectUrl;
 
+/// Longest message of a session server, in bytes: a list of a thousand worlds, with URLs of common lengths.
+pub const MAX_LINK_MESSAGE: usize = 256 * 1024;
+
 /// The first message of a simulation server.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase")]

@@ -32,18 +32,25 @@ pub struct FrameReader {
     codec: Codec,
     /// The bytes of an incomplete frame.
     unread: BytesMut,
+    /// Size limit of a frame, in bytes.
+    max: usize,
 }
 
 impl Default for FrameReader {
     fn default() -> Self {
-        Self {
-            codec: Codec::new().max_size(MAX_MESSAGE),
-            unread: BytesMut::new(),
-        }
+        Self::new(MAX_MESSAGE)
     }
 }
 
 impl FrameReader {
+    fn new(max: usize) -> Self {
+        Self {
+            codec: Codec::new().max_size(max),
+            unread: BytesMut::new(),
+            max,
+        }
+    }
+
     /// Adds bytes of the client.
     pub fn add(&mut self, bytes: &[u8]) {
         self.unread.extend_from_slice(bytes);
@@ -56,7 +63,7 @@ impl FrameReader {
     pub fn take(&mut self) -> Result<Option<Frame>, ProtocolError> {
         let frame = self.codec.decode(&mut self.unread)?;
         // The codec reports a frame that is too large only once it is complete.
-        if frame.is_none() && self.unread.len() > MAX_MESSAGE + FRAME_HEADER {
+        if frame.is_none() && self.unread.len() > self.max + FRAME_HEADER {
             return Err(ProtocolError::Overflow);
         }
         Ok(frame)
@@ -67,13 +74,13 @@ impl FrameReader {
 ///
 /// Bytes are read only after all earlier messages were taken: actix's own stream reads on while messages wait, so that
 /// one client could fill the memory.
-fn messages(payload: Payload) -> impl Stream<Item = Result<Message, ProtocolError>> {
-    let state = (payload, FrameReader::default(), BytesMut::new());
+fn messages(payload: Payload, max: usize) -> impl Stream<Item = Result<Message, ProtocolError>> {
+    let state = (payload, FrameReader::new(max), BytesMut::new());
     stream::unfold(state, async |(mut payload, mut frames, mut partial)| {
         let message = loop {
             match frames.take() {
                 Ok(Some(frame)) => {
-                    if let Some(message) = complete(frame, &mut partial).transpose() {
+                    if let Some(message) = complete(frame, &mut partial, frames.max).transpose() {
                         break message;
                     }
                 }
@@ -91,7 +98,7 @@ fn messages(payload: Payload) -> impl Stream<Item = Result<Message, ProtocolErro
 
 /// The message that a frame completes; `partial` holds the earlier frames of a fragmented text (RFC 6455, section 5.4).
 /// The codec refuses frames in a wrong order.
-fn complete(frame: Frame, partial: &mut BytesMut) -> Result<Option<Message>, ProtocolError> {
+fn complete(frame: Frame, partial: &mut BytesMut, max: usize) -> Result<Option<Message>, ProtocolError> {
     Ok(Some(match frame {
         Frame::Text(text) => text_message(text),
         Frame::Binary(data) | Frame::Continuation(Item::FirstBinary(data)) => Message::Binary(data),
@@ -99,19 +106,19 @@ fn complete(frame: Frame, partial: &mut BytesMut) -> Result<Option<Message>, Pro
         Frame::Pong(content) => Message::Pong(content),
         Frame::Close(reason) => Message::Close(reason),
         Frame::Continuation(Item::FirstText(piece) | Item::Continue(piece)) => {
-            join(partial, &piece)?;
+            join(partial, &piece, max)?;
             return Ok(None);
         }
         Frame::Continuation(Item::Last(piece)) => {
-            join(partial, &piece)?;
+            join(partial, &piece, max)?;
             text_message(partial.split().freeze())
         }
     }))
 }
 
-fn join(partial: &mut BytesMut, piece: &[u8]) -> Result<(), ProtocolError> {
+fn join(partial: &mut BytesMut, piece: &[u8], max: usize) -> Result<(), ProtocolError> {
     partial.extend_from_slice(piece);
-    if partial.len() > MAX_MESSAGE {
+    if partial.len() > max {
         Err(ProtocolError::Overflow)
     } else {
         Ok(())
@@ -133,12 +140,20 @@ pub fn open<A>(request: &HttpRequest, payload: Payload, actor: A) -> HttpRespons
 where
     A: Actor<Context = WebsocketContext<A>> + StreamHandler<Result<Message, ProtocolError>>,
 {
+    open_for(MAX_MESSAGE, request, payload, actor)
+}
+
+/// As [`open`], for messages of up to `max` bytes.
+pub fn open_for<A>(max: usize, request: &HttpRequest, payload: Payload, actor: A) -> HttpResponse
+where
+    A: Actor<Context = WebsocketContext<A>> + StreamHandler<Result<Message, ProtocolError>>,
+{
     if let Some(refusal) = refuse_body(request) {
         return refusal;
     }
     match ws::handshake(request) {
-        Ok(mut answer) => answer.streaming(WebsocketContext::with_factory(stream::pending(), |ctx| {
-            ctx.add_stream(messages(payload));
+        Ok(mut answer) => answer.streaming(WebsocketContext::with_factory(stream::pending(), move |ctx| {
+            ctx.add_stream(messages(payload, max));
             actor
         })),
         Err(error) => refuse(&error),
