@@ -75,7 +75,8 @@ type Records = HashMap<PublicAddress, ServerRecord>;
 const NEWS: Duration = Duration::from_secs(1);
 
 impl LineKeeper {
-    /// Nobody waits. `has_key` is whether this server can ask for reservations. Observes in `waited` how long each client has waited, in seconds.
+    /// Nobody waits. `has_key` is whether this server can ask for reservations. Observes in `waited` how long each client has
+    /// waited, in seconds.
     pub(super) fn new(waited: Histogram, has_key: bool) -> Self {
         Self {
             dispatcher: Dispatcher::default(),

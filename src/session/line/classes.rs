@@ -5,6 +5,7 @@
 
 use std::cell::Cell;
 use std::rc::Rc;
+use std::sync::Arc;
 
 use super::rate::Basis;
 use crate::shared::domain::{Admission, ProjectUrl};
@@ -13,7 +14,7 @@ use crate::shared::domain::{Admission, ProjectUrl};
 #[derive(Debug)]
 pub(super) struct Group {
     /// One of its worlds.
-    pub(super) world: ProjectUrl,
+    pub(super) world: Arc<ProjectUrl>,
     /// The repository, in lower case.
     pub(super) repository: String,
     /// The class of its clients.

@@ -5,6 +5,7 @@
 
 use std::collections::{HashMap, HashSet};
 use std::hash::Hash;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::classes::{ClassId, Classes, Doors};
@@ -30,7 +31,7 @@ pub struct Turn<Server> {
     /// The server that takes it.
     pub server: Server,
     /// Its world.
-    pub world: ProjectUrl,
+    pub world: Arc<ProjectUrl>,
     /// Its pass, if the server has reserved a slot.
     pub pass: Option<Pass>,
     /// How long it has waited.
@@ -311,8 +312,8 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
         Served { turns, wishes }
     }
 
-    /// Shares the room of the fleet out, in the order of the line; servers that keep a client's world ready come first. The room that clients of reserving servers get is
-    /// counted only once they have offers.
+    /// Shares the room of the fleet out, in the order of the line; servers that keep a client's world ready come first. The
+    /// room that clients of reserving servers get is counted only once they have offers.
     fn share(
         &self,
         fleet: &mut LoadBalancer<Server>,
@@ -358,7 +359,7 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
                 let is_ready = self.links.contains_key(server) || !will_reserve(server);
                 admission(server, &waiting.group.world, load).filter(|_| is_ready && !passes_over(server))
             };
-            let world = &waiting.world;
+            let world: &ProjectUrl = &waiting.world;
             let of_ready = |server: &Server, load| {
                 let gone = used.get(&(server.clone(), world)).copied().unwrap_or_default();
                 terms(server, load).filter(|_| ready.left(server, world) > gone)

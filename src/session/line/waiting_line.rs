@@ -64,7 +64,7 @@ pub struct Progress {
 pub(super) struct Waiting<Client> {
     label: Option<Box<str>>,
     pub(super) group: Rc<Group>,
-    pub(super) world: ProjectUrl,
+    pub(super) world: Arc<ProjectUrl>,
     pub(super) client: Client,
     connection: u64,
     address: Option<IpAddr>,
@@ -136,7 +136,7 @@ impl<Server: Clone + Eq, Client: Clone> WaitingLine<Server, Client> {
         let repository = entry.world.repository().to_lowercase();
         let classes = &mut self.classes;
         let (group, count) = self.groups.entry(repository.clone()).or_insert_with(|| {
-            let world = entry.world.clone();
+            let world = Arc::new(entry.world.clone());
             let class = Cell::new(classes.of(&world, terms));
             let group = Group {
                 world,
@@ -147,10 +147,16 @@ impl<Server: Clone + Eq, Client: Clone> WaitingLine<Server, Client> {
         });
         *count += 1;
         classes.add(group.class.get(), 1);
+        // A class mostly waits for one world.
+        let world = if *group.world == entry.world {
+            Arc::clone(&group.world)
+        } else {
+            Arc::new(entry.world)
+        };
         let waiting = Waiting {
             label: entry.label.map(String::into_boxed_str),
             group: Rc::clone(group),
-            world: entry.world,
+            world,
             client: entry.client,
             connection: entry.connection,
             address: entry.address,
@@ -285,7 +291,7 @@ impl<Server: Clone + Eq, Client: Clone> WaitingLine<Server, Client> {
             waited: now.saturating_sub(place.since),
             address: waiting.address,
             user: waiting.user.as_deref().map(str::to_owned),
-            world: Some(waiting.world.clone()),
+            world: Some(ProjectUrl::clone(&waiting.world)),
         })
     }
 

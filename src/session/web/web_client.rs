@@ -20,7 +20,7 @@ use super::refusal;
 use crate::session::fleet::{LineEvent, StopWaiting, Wait};
 use crate::session::line::{Place, Progress, Ticket};
 use crate::session::state::{AppState, PLACED, read_world};
-use crate::shared::domain::{Failure, ProjectUrl};
+use crate::shared::domain::Failure;
 use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::websocket::wrong_message;
 use crate::shared::http::{ConnectionPermit, Peer};
@@ -38,14 +38,14 @@ pub struct WebClient {
     wants_announcements: bool,
     /// Identifies this connection in the line.
     connection: u64,
-    /// Its place in the line.
+    /// What it heard last of its place in the line, if it has one.
     waiting: Option<Waiting>,
     _permit: ConnectionPermit,
 }
 
 /// A client that waits in the line.
+#[derive(Default)]
 struct Waiting {
-    world: ProjectUrl,
     /// The seconds until its turn, as last sent.
     estimate: Option<u32>,
 }
@@ -112,10 +112,7 @@ impl WebClient {
             Ok(world) => world,
             Err(failure) => return Self::refuse(&failure, request.wants_reason, ctx),
         };
-        self.waiting = Some(Waiting {
-            world: world.clone(),
-            estimate: None,
-        });
+        self.waiting = Some(Waiting::default());
         let wait = Wait {
             world,
             ticket: ticket.and_then(|text| Ticket::read(text, &self.server.key, now())),
@@ -259,7 +256,7 @@ impl Handler<LineEvent> for WebClient {
             }
             LineEvent::Turn(turn) => {
                 if let Some(pass) = turn.pass {
-                    ctx.text(format!("pass: {}", pass.write(&self.server.key, &waiting.world)));
+                    ctx.text(format!("pass: {}", pass.write(&self.server.key, &turn.world)));
                 }
                 ctx.text(self.server.client_urls.websocket_url(&turn.server));
                 self.server.picks.with_label_values(&[PLACED]).inc();
