@@ -8,7 +8,7 @@ use webots_fleet::shared::domain::{
 };
 
 use crate::support::program::{Builder, Server};
-use crate::support::{Client, arm, arm_at, demo_server, until};
+use crate::support::{Client, SOON, arm, arm_at, demo_server, until};
 
 const SECRET: &str = "a secret of this test";
 
@@ -97,7 +97,8 @@ async fn start(server: &Server, world: &str, pass: &str) -> Client {
 /// The code of the reason for which a start is refused.
 async fn refused(server: &Server, world: &str, pass: &str) -> String {
     let mut client = start(server, world, pass).await;
-    let reason = client.until("reason: ").await;
+    // A simulation that runs would send other texts without an end.
+    let reason = client.within("reason: ", SOON).await;
     let reason: Value = serde_json::from_str(reason.trim_start_matches("reason: ")).unwrap();
     client.until("loading: Error: ").await;
     assert_eq!(client.closed().await, Some(1000));
