@@ -9,7 +9,7 @@
  */
 
 /** How long a ticket is valid, in milliseconds: the session server sends it again and again. */
-const VALIDITY = 30_000;
+const VALIDITY = 60_000;
 
 export class Store {
   #name;

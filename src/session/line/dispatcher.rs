@@ -112,7 +112,7 @@ pub struct Dispatcher<Server, Client> {
 /// How long a turn without a reservation can be resumed.
 const TURN: Duration = Duration::from_secs(10);
 /// How long a used ticket is known: longer than any ticket is valid.
-const KEPT: Duration = Duration::from_secs(40);
+const KEPT: Duration = Duration::from_secs(Ticket::VALIDITY.as_secs() + 10);
 
 impl<Server, Client> Default for Dispatcher<Server, Client> {
     fn default() -> Self {
