@@ -432,3 +432,30 @@ impl Drop for Repository {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::simulation::config::SimulationConfig;
+
+    #[actix_rt::test]
+    async fn only_the_generation_that_can_not_be_read_is_discarded() {
+        let folder = tempfile::tempdir().unwrap();
+        let config: SimulationConfig = serde_json::from_str("{}").unwrap();
+        let git = Arc::new(Git::new(folder.path(), Arc::new(config)));
+        let remote = Remote {
+            location: "https://host/lab/arm".to_owned(),
+            protocol: "https",
+        };
+        let path = folder.path().join("arm.git");
+        let repository = Repository::new(path.clone(), remote, git, mpsc::channel().0);
+        let damaged = repository.generation();
+        std::fs::create_dir(&path).unwrap();
+        let next = repository.discard(damaged).await.unwrap();
+        assert!(next > damaged && !path.exists());
+        // Another client has read the damaged one, too; meanwhile the repository was fetched anew.
+        std::fs::create_dir(&path).unwrap();
+        assert_eq!(repository.discard(damaged).await.unwrap(), next);
+        assert!(path.exists());
+    }
+}
