@@ -1,6 +1,7 @@
 //! A fleet for interactive robot simulations in the browser: a session server and simulation servers.
 //!
-//! They replace two Python servers, which comments call *the original*. This page is the map. Each directory is a
+//! They replace two Python servers, which comments call *the original*. This page is the map; `CONTRIBUTING.md`
+//! lists which file to open for which change. Each directory is a
 //! module: its `mod.rs` says what belongs there and re-exports its public API.
 //!
 //! | module | contents |
@@ -15,34 +16,37 @@
 //! | [`session::class`] | all simulations of the fleet and who waits, with the number of each change, and the links to servers for actions (`roster`) |
 //! | [`session::mail`] | notices: to whom (`smtp`, one address, from the key `administrator` in `config/session_config`) and how (`channel`), what is in them (`notice_text`), when they are sent (`outbox`) |
 //! | [`session::fleet`] | the registry and the monitors of simulation servers, and what connects them with the line (`line_keeper`, `slot_link`) |
-//! | [`session::web`] | routes, pages, `/status`, Prometheus metrics (gauges in `metrics`, counters in `app`) and the WebSocket of the session server |
+//! | [`session::web`] | routes, pages, `/status`, Prometheus metrics (gauges in `metrics`, counters in `app`) and the WebSocket of the session server with its messages (`web_client`) |
 //! | [`simulation::process`] | process trees: how they start and end (`process_group`: SIGTERM, grace period, SIGKILL; leftovers of a dead server: `process_tree`, `guardian`); directories of simulations |
-//! | [`simulation::machine`] | readings of the machine (`sensors`) and its GPUs (`gpus`), the load and `monitor.csv` (`load_monitor`); which GPU a simulation gets (`spread`) |
+//! | [`simulation::machine`] | readings of the machine (`sensors`) and its GPUs (`gpus`), the load and `monitor.csv` (`load_monitor`); which GPU a simulation gets if they are spread over several (`spread`) |
 //! | [`simulation::checkout`] | worlds checked out with git; `timing.checkout` limits a whole checkout (`checkout_service`), each git command, and by a quarter of it a silent remote (`git`); `projectSize` limits its size; the simulation server's `config/mirrors` has GitHub's address and the mirrors of others |
 //! | `simulation::isolation` | how a simulation is launched: its level of isolation (`launcher`), the variables that it inherits, limits; the control group that ends with it (`cgroup`) |
 //! | [`simulation::container`] | simulations in containers: what a project requests, its image, its compose project (`compose_project`, with its GPU and user) |
 //! | [`simulation::ends`] | how simulations have ended: counter, table, their logs (`kept_output`); for which reasons an end can be requested (`stop_reason`) |
 //! | [`simulation::webots`] | one running Webots: its command line and GPU (`launch_spec`), its log (path and size in `launched`, its lines in `output`), the wait for its end (`launched`) |
-//! | [`simulation::client`] | a client's WebSocket (`web_client`), that of a session server that asks for slots (`slot_link`), the session of its simulation, which sends it nearly all messages (`session`; `start`: before Webots runs, with the choice of the GPU) |
-//! | [`simulation::attachment`] | how a connection is attached to its session, and how a client resumes it |
+//! | [`simulation::client`] | a client's WebSocket (`web_client`), its simulation when it comes back on another one (`resume`), that of a session server that asks for slots (`slot_link`), the session of its simulation, which sends it nearly all messages (`session`; `start`: before Webots runs, with the choice of the GPU) |
+//! | [`simulation::attachment`] | what a connection and its session send each other, and the tokens by which a client that resumes finds its session |
 //! | [`simulation::slots`] | the slots that clients wait for: leases, the queue and the shares of addresses and users (`slot_pool`), those that are reserved for the line of session servers (`reservations`), the streams of simulations and the tokens that identify them (`stream`) |
 //! | [`simulation::spare_wishes`] | which worlds are kept ready before clients ask for them, and how many; the actor that does it is `spare_keeper` in [`simulation::client`], a spare's slot is in `spare` of [`simulation::slots`] |
 //! | `simulation::relay` | a stream between a client and the port of its Webots |
 //! | `simulation::web` | routes, pages, `/status` and Prometheus metrics of the simulation server (gauges in `metrics`, counters in `app` and `ends`) |
 //!
-//! The HTML of pages is in `templates/session` and `templates/simulation` (`monitor.html`: the head of the monitor's
-//! table, `row.html`: a row), their styles (`style.css`) and scripts in `templates/assets`. A column of `monitor.csv`
-//! appears in the charts (`charts.js` groups them by unit); the figures above are in `glance.html`.
+//! The HTML of pages is in `templates/session` and `templates/simulation` (in each, `monitor.html`: the head of the
+//! monitor's table, `row.html`: a row), their styles (`style.css`) and scripts in `templates/assets`. A column of
+//! `monitor.csv` appears in the charts (`charts.js` groups them by how their headings begin; the others are drawn in
+//! percent); the figures above are in `glance.html`.
 //!
 //! Each server also has a directory `config` (every key: `session_config`, `simulation_config`; time limits: `timing`;
 //! `docs/configuration.md` lists all), its `app` (start and end) and its `state` (what its routes share). Files of
 //! `simulation` are the [`protocol`](simulation::protocol) with the texts of messages to clients (except the reason in
-//! an error and the [`progress`](simulation::progress) of a start, which their causes define: a checkout's is in `checkout/steps`), the
-//! `snapshot` of all simulations, the `simulation_id`, the `client_identity`, the `announcer` (key `notify`),
-//! `preflight` (`--check`) and `readiness` (`/health`). The programs are in `src/bin`. Modules import only from layers
-//! below them, in the order that `tests/project/layering.rs` lists. `session` and `simulation` never see each other. A
-//! child never names its parent. The parent gives it a `Recipient` for the child's events, which the child's file
-//! defines.
+//! an error and the [`progress`](simulation::progress) of a start, which their causes define: a checkout's is in
+//! `checkout/steps`), the `snapshot` of all simulations, the `simulation_id`, the
+//! `simulated_time`, the `client_identity`, the `announcer` (key `notify`), `preflight`
+//! (`--check`) and `readiness` (`/health`). The programs are in `src/bin`. Modules import only from layers below them,
+//! in the order that `tests/project/layering.rs` lists. `session` and `simulation` never see each other. A child never
+//! names its parent. The parent gives it a `Recipient` for the child's events, which the child's file defines.
+//!
+//! `tests/session` and `tests/simulation` test the programs as black boxes; the first lines of each file say what it tests.
 //!
 //! # Words
 //!
@@ -53,7 +57,9 @@
 //! - **line**: the clients that wait at a session server for a slot of the fleet. Each has a [`session::line::Place`] in
 //!   it, which its **ticket** proves; a **pass** entitles it to one slot of one server.
 //! - **connection**: a TCP connection or a WebSocket, never a slot (the key `maxConnections` has its name from the original).
-//! - **client**: who holds a WebSocket of either server; **viewer**: who shows the stream of a Webots.
+//! - **client**: who holds a WebSocket of either server; **viewer**: who shows the stream of a Webots; **watcher**: an
+//!   administrator who looks at the simulation of another (`web/page_routes` checks the password, `slots/stream` issues a
+//!   token for one connection, `relay/watcher` lets it change nothing).
 //! - **reason**: why a request was refused, a start has failed or a simulation has ended, as a code
 //!   ([`shared::domain::Reason`]); a **failure** ([`shared::domain::Failure`]) has also its sentence and the output of others.
 //! - **stage**: the state of a simulation as pages show it ([`shared::domain::Stage`]); it follows from the state of its actor.

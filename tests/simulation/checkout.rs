@@ -1,4 +1,5 @@
-//! Checkouts: what a URL refers to, what is cached, and what a malicious repository can't do.
+//! Checkouts: what a URL refers to, what is cached, and what a malicious repository can't do. Fetches that hang or wait
+//! for each other: `fetching`.
 
 use std::path::Path;
 
