@@ -26,7 +26,7 @@
 //! | [`simulation::webots`] | one running Webots: its command line and GPU (`launch_spec`), its log (path and size in `launched`, its lines in `output`), the wait for its end (`launched`) |
 //! | [`simulation::client`] | a client's WebSocket (`web_client`), its simulation when it comes back on another one (`resume`), that of a session server that asks for slots (`slot_link`), the session of its simulation, which sends it nearly all messages (`session`; `start`: before Webots runs, with the choice of the GPU) |
 //! | [`simulation::attachment`] | what a connection and its session send each other, and the tokens by which a client that resumes finds its session |
-//! | [`simulation::slots`] | the slots that clients wait for: leases, the queue and the shares of addresses and users (`slot_pool`), those that are reserved for the line of session servers (`reservations`), the streams of simulations and the tokens that identify them (`stream`) |
+//! | [`simulation::slots`] | the slots that clients wait for: leases, the queue and the shares of addresses and users (`slot_pool`), those that are reserved for the line of session servers (`reservations`), how many run in real time (`real_time_places`), the streams of simulations and the tokens that identify them (`stream`) |
 //! | [`simulation::spare_wishes`] | which worlds are kept ready before clients ask for them, and how many; the actor that does it is `spare_keeper` in [`simulation::client`], a spare's slot is in `spare` of [`simulation::slots`] |
 //! | `simulation::relay` | a stream between a client and the port of its Webots |
 //! | `simulation::web` | routes, pages, `/status` and Prometheus metrics of the simulation server (gauges in `metrics`, counters in `app` and `ends`) |

@@ -44,6 +44,9 @@ const OWN_FILES: usize = 128;
 /// Webots, its log.
 const FILES_PER_SIMULATION: usize = 8;
 
+/// The upper bounds of real-time factors in the metric.
+const REAL_TIME_FACTORS: [f64; 9] = [0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 1.05, 2.0, 5.0];
+
 /// A server that is ready to serve: its port is bound, and its actors run.
 pub struct Application {
     /// The state that routes and web clients share.
@@ -136,6 +139,12 @@ pub async fn serve(assembly: Application) -> Result<(), AppError> {
     );
     let slots = Arc::clone(&server.slots);
     actix_rt::spawn(Arc::clone(&slots).recheck());
+    let histogram = server.metrics.histogram(
+        "webots_simulation_real_time_factor",
+        "Simulated seconds per second of running simulations, every five seconds",
+        &REAL_TIME_FACTORS,
+    )?;
+    actix_rt::spawn(Arc::clone(&slots).follow_real_time(config.real_time.target, histogram));
     let spare_keeper = SpareKeeper::new(Arc::clone(&server)).start();
     // This runs unless this thread is blocked, or another one holds the lock of the slots.
     actix_rt::spawn(service_manager::feed_watchdog(async move || {

@@ -26,6 +26,7 @@
 //! | `idle: SECONDS`, `idle: never` | when the paused simulation ends unless it runs or is kept; `never`: it no longer will |
 //! | `.` | Webots is alive |
 //! | `watched: 1` or `watched: 0` | an administrator watches the simulation from now on, or no longer |
+//! | `realTime: 0.6` | the simulation runs at this share of real time; repeated every five seconds while it is slow, `1` once it is not any more |
 //! | `reset controller: NAME/FILE` | the file was restored |
 //!
 //! Webots' page inserts every TEXT into `innerHTML`, so it passes through [`client_text`] and [`without_paths`] here,
@@ -275,6 +276,14 @@ pub fn absence(seconds: u64) -> String {
 /// Whether an administrator watches the simulation.
 pub fn watched(is_watched: bool) -> String {
     format!("watched: {}", u8::from(is_watched))
+}
+
+/// How fast the simulation runs, if it is slower than real time; `None`: it is not any more.
+pub fn real_time(slow: Option<f64>) -> String {
+    // What is shown is not better than it is.
+    slow.map_or("realTime: 1".to_owned(), |factor| {
+        format!("realTime: {:.1}", (10.0 * factor).floor() / 10.0)
+    })
 }
 
 /// The token with which the client can resume the simulation.

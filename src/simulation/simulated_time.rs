@@ -1,13 +1,15 @@
 //! How fast a simulation runs: its time against real time, as the stream of its Webots tells it.
 //!
 //! Streams are not parsed. Webots' updates begin with their time, so once a second the last update of what has just been
-//! copied is looked for.
+//! copied is looked for. A world can print what looks like an update: that changes what is known of its own simulation.
 
+use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use memchr::memmem;
 use parking_lot::Mutex;
+use serde::{Serialize, Serializer};
 
 /// The time of a simulation. Clones share it.
 #[derive(Debug, Clone, Default)]
@@ -15,11 +17,13 @@ pub struct SimulatedTime(Arc<Mutex<Readings>>);
 
 #[derive(Debug, Default)]
 struct Readings {
-    last: Option<Reading>,
-    /// The factor between the last two readings.
-    recent: Option<f64>,
-    /// The time that was simulated while somebody looked, and how long that took, in seconds.
-    total: (f64, f64),
+    /// Whether time passes, as the output of Webots tells. While it is paused nothing is read.
+    is_running: bool,
+    /// When the stream is looked at again.
+    next: Option<Instant>,
+    /// Those of the last seconds, the oldest first, without a pause between them.
+    recent: VecDeque<Reading>,
+    total: Total,
 }
 
 /// A time that was read.
@@ -30,54 +34,120 @@ struct Reading {
     simulated: f64,
 }
 
+/// What was read in all, in seconds: while somebody looked and time passed.
+#[derive(Debug, Clone, Copy, Default)]
+struct Total {
+    simulated: f64,
+    real: f64,
+    /// The part of `real` in which it ran below [`REAL_TIME`].
+    slow: f64,
+}
+
+/// The factor from which a simulation counts as one that runs in real time.
+pub const REAL_TIME: f64 = 0.9;
+
 /// The beginning of an update.
 const UPDATE: &[u8] = b"application/json:{\"time\":";
 /// Interval between two readings.
 const INTERVAL: Duration = Duration::from_secs(1);
-/// Between readings that are further apart nobody has looked, or the simulation was paused.
-const GAP: Duration = Duration::from_secs(10);
+/// Interval between two searches in a stream without updates, such as a download: they cost as much as the copy.
+const SEARCH: Duration = Duration::from_millis(20);
+/// The time over which the factor is taken.
+const WINDOW: Duration = Duration::from_secs(5);
+/// The least time over which it is.
+const SHORTEST: Duration = Duration::from_millis(1500);
+/// Between readings that are further apart nobody has looked.
+const GAP: Duration = Duration::from_secs(5);
+/// The largest factor. Beyond it the time was set, or is a forged one.
+const LARGEST: f64 = 1000.0;
 
 impl SimulatedTime {
     /// Looks for a time in a part of the stream, unless one was read just now.
     pub fn read(&self, part: &[u8]) {
         let mut readings = self.0.lock();
-        let is_due = readings.last.is_none_or(|last| last.at.elapsed() >= INTERVAL);
-        if is_due && let Some(milliseconds) = last_time(part) {
+        if !readings.is_running || part.is_empty() {
+            return;
+        }
+        let now = Instant::now();
+        if readings.next.is_some_and(|next| now < next) {
+            return;
+        }
+        let found = last_time(part);
+        readings.next = Some(now + if found.is_some() { INTERVAL } else { SEARCH });
+        if let Some(milliseconds) = found {
             readings.add(Reading {
-                at: Instant::now(),
+                at: now,
                 simulated: milliseconds / 1000.0,
             });
         }
     }
 
-    /// Simulated seconds per second, of the last seconds; `None` if it was not read lately.
+    /// The viewer takes less than Webots sends, so that the stream says nothing about the speed of the simulation.
+    pub fn interrupt(&self) {
+        self.0.lock().recent.clear();
+    }
+
+    /// Notes whether time passes, or the simulation is paused.
+    pub fn set_running(&self, is_running: bool) {
+        let mut readings = self.0.lock();
+        if readings.is_running != is_running {
+            readings.is_running = is_running;
+            readings.recent.clear();
+        }
+    }
+
+    /// Simulated seconds per second, of the last five seconds; `None` while it is paused, or nobody looks.
     pub fn recent(&self) -> Option<f64> {
-        let readings = self.0.lock();
-        let is_known = readings.last.is_some_and(|last| last.at.elapsed() < GAP);
-        readings.recent.filter(|_| is_known)
+        self.0.lock().factor(Instant::now())
     }
 
     /// Simulated seconds per second while somebody looked and time passed; `None` if that was never.
     pub fn mean(&self) -> Option<f64> {
-        let (simulated, real) = self.0.lock().total;
+        let Total { simulated, real, .. } = self.0.lock().total;
         (real > 0.0).then(|| simulated / real)
+    }
+
+    /// The share of that time in which it ran below [`REAL_TIME`].
+    pub fn slow_share(&self) -> Option<f64> {
+        let Total { slow, real, .. } = self.0.lock().total;
+        (real > 0.0).then(|| slow / real)
+    }
+}
+
+impl Serialize for SimulatedTime {
+    /// As [`Self::recent`], in hundredths.
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        self.recent()
+            .map(|factor| (100.0 * factor).round() / 100.0)
+            .serialize(serializer)
     }
 }
 
 impl Readings {
     fn add(&mut self, next: Reading) {
-        if let Some(last) = self.last {
+        if let Some(last) = self.recent.back() {
             let (simulated, real) = (next.simulated - last.simulated, next.at - last.at);
+            let factor = simulated / real.as_secs_f64();
             // A reset sets the time back.
-            if simulated >= 0.0 && real < GAP {
-                self.total.0 += simulated;
-                self.total.1 += real.as_secs_f64();
-                self.recent = Some(simulated / real.as_secs_f64());
+            if (0.0..=LARGEST).contains(&factor) && real < GAP {
+                self.total.simulated += simulated;
+                self.total.real += real.as_secs_f64();
+                if factor < REAL_TIME {
+                    self.total.slow += real.as_secs_f64();
+                }
             } else {
-                self.recent = None;
+                self.recent.clear();
             }
         }
-        self.last = Some(next);
+        self.recent.push_back(next);
+        self.recent.retain(|one| next.at - one.at <= WINDOW);
+    }
+
+    fn factor(&self, now: Instant) -> Option<f64> {
+        let (first, last) = (self.recent.front()?, self.recent.back()?);
+        let real = last.at - first.at;
+        let is_known = real >= SHORTEST && now.saturating_duration_since(last.at) < GAP;
+        is_known.then(|| (last.simulated - first.simulated) / real.as_secs_f64())
     }
 }
 
@@ -110,25 +180,72 @@ mod tests {
         }
     }
 
-    #[test]
-    fn pauses_and_resets_do_not_count() {
-        let begin = Instant::now();
+    /// Readings at these seconds, with these simulated seconds.
+    fn read(begin: Instant, times: &[(f64, f64)]) -> Readings {
         let mut readings = Readings::default();
-        for (seconds, simulated) in [
-            (0, 10.0),
-            (2, 11.0),
-            (4, 13.0),
-            (60, 13.0),
-            (61, 14.0),
-            (62, 0.0),
-            (63, 2.0),
-        ] {
+        for (seconds, simulated) in times {
             readings.add(Reading {
-                at: begin + Duration::from_secs(seconds),
-                simulated,
+                at: begin + Duration::from_secs_f64(*seconds),
+                simulated: *simulated,
             });
         }
-        assert_eq!(readings.total, (6.0, 6.0));
-        assert_eq!(readings.recent, Some(2.0));
+        readings
+    }
+
+    #[test]
+    fn gaps_resets_and_forged_times_do_not_count() {
+        let begin = Instant::now();
+        let readings = read(
+            begin,
+            &[
+                (0.0, 10.0),
+                (2.0, 11.0),
+                (4.0, 13.0),
+                (60.0, 13.0),
+                (61.0, 14.0),
+                (62.0, 0.0),
+                (63.0, 1e300),
+                (64.0, f64::INFINITY),
+                (65.0, 2.0),
+                (66.0, 4.0),
+                (67.0, 6.0),
+            ],
+        );
+        let total = readings.total;
+        assert_eq!((total.simulated, total.real, total.slow), (8.0, 7.0, 2.0));
+        assert_eq!(readings.factor(begin + Duration::from_secs(67)), Some(2.0));
+    }
+
+    #[test]
+    fn the_factor_is_that_of_the_last_five_seconds() {
+        let begin = Instant::now();
+        let at = |seconds| begin + Duration::from_secs_f64(seconds);
+        let mut times: Vec<(f64, f64)> = (0_u32..60)
+            .map(|second| (f64::from(second), f64::from(second)))
+            .collect();
+        assert_eq!(read(begin, &times[..2]).factor(at(1.0)), None, "one second says little");
+        assert_eq!(read(begin, &times).factor(at(59.0)), Some(1.0));
+        times.extend((1_u32..=5).map(|second| (59.0 + f64::from(second), 59.0 + 0.5 * f64::from(second))));
+        assert_eq!(read(begin, &times).factor(at(64.0)), Some(0.5));
+        assert_eq!(read(begin, &times).factor(at(70.0)), None, "nobody looks");
+    }
+
+    #[test]
+    fn while_it_is_paused_nothing_is_read() {
+        let time = SimulatedTime::default();
+        let update = b"application/json:{\"time\":20}";
+        let count = || time.0.lock().recent.len();
+        time.read(update);
+        assert_eq!(count(), 0);
+        time.set_running(true);
+        time.read(update);
+        time.read(update);
+        assert_eq!(count(), 1, "once a second");
+        time.interrupt();
+        assert_eq!(count(), 0);
+        time.0.lock().next = None;
+        time.read(update);
+        time.set_running(false);
+        assert_eq!(count(), 0);
     }
 }

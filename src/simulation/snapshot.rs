@@ -78,8 +78,8 @@ pub struct Simulation {
     /// The 3D scene that its Webots streams, once that is known; none for a video.
     #[serde(skip)]
     pub scene: Option<SceneKind>,
-    /// How fast it runs, if its stream is relayed.
-    #[serde(skip)]
+    /// How fast it runs: simulated seconds per second, if its stream is relayed.
+    #[serde(rename = "realTime")]
     pub time: SimulatedTime,
     /// The file that its output is kept in.
     pub log: Option<PathBuf>,

@@ -130,6 +130,7 @@ export const words = {
   },
   idle: (seconds) => `仿真已暂停，将在 ${duration(seconds)}后结束。`,
   closes: (seconds) => `仿真将在 ${duration(seconds)}后关闭。`,
+  slow: (share) => `此仿真以实时速度的 ${number(share)} 倍运行。`,
   visitor: (name) => `管理员看到的名字是 ${name}。`,
   problems: {
     'session-unreachable': '无法连接会话服务器。',

@@ -150,6 +150,8 @@ export const words = {
   idle: (seconds) => `The simulation is paused, and ends in ${duration(seconds)}.`,
   /** @param {number} seconds */
   closes: (seconds) => `It will be closed in ${duration(seconds)}.`,
+  /** @param {number} share */
+  slow: (share) => `This simulation runs at ${number(share)} of real time.`,
   /** @param {string} name */
   visitor: (name) => `The administrator sees you as ${name}.`,
 

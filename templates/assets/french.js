@@ -138,6 +138,7 @@ export const words = {
   },
   idle: (seconds) => `La simulation est en pause et se termine dans ${duration(seconds)}.`,
   closes: (seconds) => `Elle sera fermée dans ${duration(seconds)}.`,
+  slow: (share) => `Cette simulation tourne à ${number(share)} fois le temps réel.`,
   visitor: (name) => `L’administrateur vous voit sous le nom ${name}.`,
   problems: {
     'session-unreachable': 'Le serveur de sessions est injoignable.',

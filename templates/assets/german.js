@@ -139,6 +139,7 @@ export const words = {
   },
   idle: (seconds) => `Die Simulation ist angehalten und endet in ${duration(seconds)}.`,
   closes: (seconds) => `Sie wird in ${duration(seconds)} geschlossen.`,
+  slow: (share) => `Diese Simulation läuft mit dem ${number(share)}-Fachen der Echtzeit.`,
   visitor: (name) => `Für die Administration heißt du ${name}.`,
   problems: {
     'session-unreachable': 'Der Sitzungsserver ist nicht erreichbar.',

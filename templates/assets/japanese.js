@@ -134,6 +134,7 @@ export const words = {
   },
   idle: (seconds) => `シミュレーションは一時停止中です。あと ${duration(seconds)}で終了します。`,
   closes: (seconds) => `あと ${duration(seconds)}で終了します。`,
+  slow: (share) => `このシミュレーションは実時間の ${number(share)} 倍の速さで動いています。`,
   visitor: (name) => `管理者には ${name} と表示されます。`,
   problems: {
     'session-unreachable': 'セッションサーバーに接続できません。',

@@ -29,6 +29,7 @@
  *   | { is: 'ready', address: string, kind: string | undefined }
  *   | { is: 'resumable', resumption: Resumption }
  *   | { is: 'watched', now: boolean }
+ *   | { is: 'paced', share: number | undefined }
  *   | { is: 'idle', endsIn: number | undefined }
  *   | { is: 'failed', failure: Failure }
  *   | { is: 'alive' }} Message
@@ -181,6 +182,8 @@ export class SimulationReader {
         return { is: 'resumable', resumption: { token: value, absence: this.#absence } };
       case 'watched':
         return { is: 'watched', now: value === '1' };
+      case 'realTime':
+        return { is: 'paced', share: Number(value) < 1 ? Number(value) : undefined };
       case 'idle':
         return { is: 'idle', endsIn: value === 'never' ? undefined : Number(value) };
       default:

@@ -24,7 +24,7 @@ export const STEPS = /** @type {const} */ (['session', 'server', 'place', 'check
  * What is shown. `sentence`: what the server said, if that is not the text. `idle`, `closes`: seconds left. `leave`: the label of the button that leaves, which is off without one.
  * @typedef {{ lamp: 'on' | 'off' | undefined, availability: string[], progress: Progress | undefined,
  *   notice: Notice | undefined, problem: (Notice & { sentence: string | undefined, output: string | undefined }) | undefined,
- *   idle: string | undefined, closes: string | undefined, isWatched: boolean, leave: string | undefined }} PageView
+ *   idle: string | undefined, closes: string | undefined, isWatched: boolean, slow: string | undefined, leave: string | undefined }} PageView
  */
 
 /**
@@ -49,6 +49,7 @@ export function view({ fleet, state }, now, words) {
     idle: idle === undefined ? undefined : words.idle(idle),
     closes: closes === undefined ? undefined : words.closes(closes),
     isWatched: facts?.isWatched ?? false,
+    slow: facts?.slow === undefined ? undefined : words.slow(facts.slow),
     leave: leaveLabel(state, words),
   };
 }

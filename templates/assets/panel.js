@@ -172,10 +172,11 @@ export class Panel {
     const list = make('ol', { id: 'steps' }, ...steps.map(({ item }) => item));
     const left = hidden({ id: 'left', className: 'none' });
     const watched = hidden({ id: 'watched', role: 'status', textContent: page.watched });
+    const slow = hidden({ id: 'slow', role: 'status' });
     const title = make('h2', { id: 'steps-title', textContent: page.steps });
-    const section = part('steps', make('section', { className: 'sheet steps' }, title, list, left, watched));
+    const section = part('steps', make('section', { className: 'sheet steps' }, title, list, left, slow, watched));
     section.setAttribute('aria-labelledby', title.id);
-    return { steps, left, watched, workbench: make('div', { className: 'workbench' }, section) };
+    return { steps, left, slow, watched, workbench: make('div', { className: 'workbench' }, section) };
   }
 
   /* drawing */
@@ -197,6 +198,7 @@ export class Panel {
     show(parts.output, shown.problem?.output, parts.outputText);
     this.#drawIdle(shown.idle);
     show(parts.left, shown.closes);
+    show(parts.slow, shown.slow);
     parts.watched.hidden = !shown.isWatched;
     this.#drawButtons(shown.leave);
     const waits = waitingNotice(visit.state, words);

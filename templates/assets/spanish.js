@@ -138,6 +138,7 @@ export const words = {
   },
   idle: (seconds) => `La simulación está en pausa y terminará en ${duration(seconds)}.`,
   closes: (seconds) => `Se cerrará en ${duration(seconds)}.`,
+  slow: (share) => `Esta simulación va a ${number(share)} veces el tiempo real.`,
   visitor: (name) => `El administrador te ve como ${name}.`,
   problems: {
     'session-unreachable': 'No se pudo alcanzar el servidor de sesiones.',

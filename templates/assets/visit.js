@@ -34,8 +34,8 @@ import { helpsToWait } from './reasons.js';
  * @typedef {{ goal: Goal, server: string, isRestored: boolean }} Target
  */
 
-/** What the server has said about a simulation. Points in time in milliseconds.
- * @typedef {{ closesAt?: number | undefined, idleEndsAt?: number | undefined, isWatched: boolean }} Facts
+/** What the server has said about a simulation. Points in time in milliseconds. `slow`: its share of real time, if it is slower.
+ * @typedef {{ closesAt?: number | undefined, idleEndsAt?: number | undefined, isWatched: boolean, slow?: number | undefined }} Facts
  */
 
 /** What is shown of a running simulation.
@@ -506,6 +506,8 @@ function factsAfter(facts, message, now) {
       return { ...facts, closesAt: now + SECOND * message.closesIn };
     case 'watched':
       return { ...facts, isWatched: message.now };
+    case 'paced':
+      return { ...facts, slow: message.share };
     case 'idle':
       return { ...facts, idleEndsAt: message.endsIn === undefined ? undefined : now + SECOND * message.endsIn };
     default:

@@ -139,6 +139,11 @@ test('what is unknown is a sign of life', () => {
   for (const text of ['.', '', 'session: 1', 'ide: enable', 'type:demo\n', 'webots', 'of a later version: 1']) {
     assert.deepEqual(read(text), [{ is: 'alive' }], text);
   }
+  assert.deepEqual(read('realTime: 0.6', 'realTime: 1', 'realTime: 0.0'), [
+    { is: 'paced', share: 0.6 },
+    { is: 'paced', share: undefined },
+    { is: 'paced', share: 0 },
+  ]);
   assert.deepEqual(read('idle: never', 'idle: 5', 'watched: 1', 'error: old'), [
     { is: 'idle', endsIn: undefined },
     { is: 'idle', endsIn: 5 },

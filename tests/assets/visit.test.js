@@ -511,6 +511,12 @@ test('an administrator who watches is told to the visitor, also after a return',
   assert.equal(visit.receive('watched: 0').view.isWatched, false);
 });
 
+test('the visitor is told how slow a simulation is, until it is not slow any more', () => {
+  const visit = running().receive('realTime: 0.6');
+  assert.equal(visit.view.slow, 'This simulation runs at 0.6 of real time.');
+  assert.equal(visit.receive('realTime: 1').view.slow, undefined);
+});
+
 test('each way out of a connected state closes the connection once', () => {
   /** @type {VisitEvent[]} */
   const ways = [

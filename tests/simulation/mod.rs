@@ -20,6 +20,7 @@ mod protocol;
 mod readiness;
 pub mod readings;
 mod ready;
+mod real_time;
 mod relay;
 mod resuming;
 pub mod scene;

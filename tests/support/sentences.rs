@@ -84,6 +84,7 @@ pub fn all() -> Vec<String> {
             "webots:ws://localhost:1",
             "resume: f00d",
             "watched: 1",
+            "realTime: 0.6",
             "idle: 1",
         ]
         .map(str::to_owned),

@@ -10,6 +10,7 @@
 //! | `download` | there is no world yet, and the event loop runs: a client that requests the scene crashes the program |
 //! | `load` | the event loop is blocked: nothing is answered, and there is no heartbeat |
 //! | `busy` | the event loop is blocked, `@` so long after the world is loaded |
+//! | `work` | a processor is busy for each second of simulation: without it, time passes more slowly |
 
 use std::time::Duration;
 
@@ -25,6 +26,8 @@ pub(crate) struct Phases {
     pub(crate) load: Duration,
     /// How long the program is busy later.
     pub(crate) busy: Option<Busy>,
+    /// Processor time that a second of simulation needs.
+    pub(crate) work: Duration,
 }
 
 /// A time in which a simulation is busy.
@@ -57,6 +60,7 @@ impl Phases {
         match option.split_once('=')? {
             ("download", time) => self.download = seconds(time)?,
             ("load", time) => self.load = seconds(time)?,
+            ("work", time) => self.work = seconds(time)?,
             ("busy", time) => {
                 let (length, after) = time.split_once('@')?;
                 self.busy = Some(Busy {
@@ -93,8 +97,10 @@ mod tests {
                 length: Duration::from_secs(2),
                 after: Duration::from_secs(5),
             }),
+            work: Duration::from_millis(50),
         };
-        let text = "# a comment\n#demo-simulator: download=0.6 load=14\n#demo-simulator: busy=2@5\nWorldInfo { }\n";
+        let text =
+            "# a comment\n#demo-simulator: download=0.6 load=14\n#demo-simulator: busy=2@5 work=0.05\nWorldInfo { }\n";
         assert_eq!(phases(text), Ok(expected));
         for option in ["load", "load=x", "load=-1", "busy=2", "busy=2@", "fast=1"] {
             assert_eq!(phases(&format!("#demo-simulator: {option}\n")), Err(option.to_owned()));

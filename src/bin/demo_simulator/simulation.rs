@@ -10,6 +10,7 @@ use actix::{
     SpawnHandle, WrapFuture as _,
 };
 use nix::sys::signal::{Signal, raise};
+use nix::time::{ClockId, clock_gettime};
 use tokio::sync::oneshot;
 
 use crate::client::{ClientId, Event};
@@ -25,6 +26,12 @@ use crate::world::{Release, WorldError, WorldFile, WorldNames};
 const STEPS: u8 = 10;
 /// Time that the clients' tasks have to send the progress before the thread is blocked.
 const FLUSH: Duration = Duration::from_millis(10);
+
+/// The most simulated time that is made at once by a world that needs processor time.
+const CATCH_UP: Duration = Duration::from_millis(200);
+
+/// The least time between two ticks of a world that needs processor time.
+const YIELD: Duration = Duration::from_millis(1);
 
 /// Closes the WebSockets of all clients. Answered when all are closed.
 #[derive(Message)]
@@ -50,6 +57,8 @@ pub(crate) struct Simulation {
     /// `None` while the world's assets are downloaded. While it is read, nothing runs.
     scene: Option<Scene>,
     clock: Clock,
+    /// Processor time that a second of simulation needs.
+    work: Duration,
     /// Simulation time of the last update, in milliseconds.
     updated: f64,
     clients: Clients,
@@ -77,6 +86,7 @@ impl Simulation {
             names: WorldNames::default(),
             release: Release::default(),
             clock: Clock::new(mode, Scene::empty().step()),
+            work: Duration::ZERO,
             updated: 0.0,
             scene: None,
             clients: Clients::default(),
@@ -313,6 +323,7 @@ impl Simulation {
     fn loaded(&mut self, scene: Scene, phases: Phases, ctx: &mut Context<Self>) {
         self.clock.restart(scene.step());
         self.updated = 0.0;
+        self.work = phases.work;
         self.names = self.file.names();
         self.scene = Some(scene);
         for status in ["Parsing world", "Finalizing nodes"] {
@@ -344,7 +355,23 @@ impl Simulation {
             Mode::Fast => frame,
         };
         self.last_tick = Instant::now();
-        self.ticker = Some(ctx.run_interval(period, Self::tick));
+        self.ticker = Some(if self.work.is_zero() {
+            ctx.run_interval(period, Self::tick)
+        } else {
+            ctx.run_later(period, move |simulation, ctx| simulation.work_and_tick(period, ctx))
+        });
+    }
+
+    /// A tick of a world that needs processor time. The next one comes later if this one has taken longer, so that
+    /// messages are handled meanwhile.
+    fn work_and_tick(&mut self, period: Duration, ctx: &mut Context<Self>) {
+        let begin = Instant::now();
+        self.tick(ctx);
+        if self.clock.mode() != Mode::Pause {
+            let rest = period.saturating_sub(begin.elapsed()).max(YIELD);
+            let next = ctx.run_later(rest, move |simulation, ctx| simulation.work_and_tick(period, ctx));
+            self.ticker = Some(next);
+        }
     }
 
     fn stop_ticker(&mut self, ctx: &mut Context<Self>) {
@@ -355,8 +382,15 @@ impl Simulation {
 
     fn tick(&mut self, ctx: &mut Context<Self>) {
         let now = Instant::now();
-        let progress = self.clock.advance(now - self.last_tick, !self.clients.is_empty());
+        let before = self.clock.now();
+        let mut elapsed = now - self.last_tick;
+        if !self.work.is_zero() {
+            // A simulation that is too slow does not catch up.
+            elapsed = elapsed.min(CATCH_UP);
+        }
+        let progress = self.clock.advance(elapsed, !self.clients.is_empty());
         self.last_tick = now;
+        work(self.work.mul_f64((self.clock.now() - before).max(0.0) / 1000.0));
         if progress == Progress::None {
             return;
         }
@@ -376,6 +410,19 @@ impl Simulation {
                 .broadcast_update(protocol::update(&update), || protocol::update(&scene.state(now)));
         }
         self.updated = now;
+    }
+}
+
+/// Keeps a processor busy until this thread has used so much of its time.
+fn work(time: Duration) {
+    let used = || {
+        clock_gettime(ClockId::CLOCK_THREAD_CPUTIME_ID)
+            .map(Duration::from)
+            .unwrap_or_default()
+    };
+    let begin = used();
+    while used().saturating_sub(begin) < time {
+        std::hint::spin_loop();
     }
 }
 

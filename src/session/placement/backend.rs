@@ -251,7 +251,7 @@ impl Backend {
             return;
         };
         // Clients in the queue cost nothing yet.
-        let present = f64::from(instances.present().min(instances.slots));
+        let present = f64::from(instances.present() - instances.queued);
         let shown = (present - self.unseen).max(0.0);
         // While many start, it is uncertain how much of them the load shows.
         let trust = if shown < present { shown / present } else { 1.0 };

@@ -12,6 +12,6 @@ pub use fleet_key::check_fleet_key;
 pub use loading::{Configuration, LoadedConfig, load, require, schema};
 pub use secret::Secret;
 pub use value::{
-    Expanded, ExpandedPath, Minutes, OneOrMany, OptionalWhole, Percent, Seconds, SecondsOrZero, Sentence, Whole,
+    Expanded, ExpandedPath, Minutes, OneOrMany, OptionalWhole, Percent, Seconds, SecondsOrZero, Sentence, Share, Whole,
     expand, is_web_url,
 };

@@ -107,6 +107,8 @@ kinds! {
         json_schema!({"type": ["integer", "null"], "minimum": MIN, "maximum": MAX});
     /// A percentage from 0 to `MAX`.
     Percent<const MAX: u16> = json_schema!({"type": "number", "minimum": 0, "maximum": MAX});
+    /// A share from 0 to 1.
+    Share = json_schema!({"type": "number", "minimum": 0, "maximum": 1});
     /// A number of minutes from 0 to a day.
     Minutes = json_schema!({"type": "number", "minimum": 0, "maximum": DAY_IN_MINUTES});
 }
@@ -189,6 +191,18 @@ impl<const MAX: u16> Percent<MAX> {
     /// When the value is something else.
     pub fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
         between(deserializer, 0.0..=MAX.into(), "percent")
+    }
+}
+
+impl Share {
+    /// Reads the share.
+    ///
+    /// # Errors
+    /// When the value is something else.
+    pub fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+        let value = Value::deserialize(deserializer)?;
+        let number = value.as_f64().filter(|number| (0.0..=1.0).contains(number));
+        number.ok_or_else(|| not_allowed(&value, format_args!("a number from 0 to 1")))
     }
 }
 

@@ -499,6 +499,7 @@ impl Handler<SlotEvent> for Session {
                 self.settle_arrival(ctx);
             }
             SlotEvent::Viewed => self.settle_arrival(ctx),
+            SlotEvent::Pace(slow) => self.hint(protocol::real_time(slow)),
             SlotEvent::Stopped(why) => {
                 self.report(StopReason::Administrator);
                 self.finish(Failure::new(Reason::StoppedByAdministrator, why), ctx);

@@ -11,7 +11,7 @@ mod urls;
 pub use container::{ContainerDisplay, ContainerNetwork, ContainerSettings, EDITOR_PORT};
 pub use isolation::{IsolationSetting, SandboxFolders, SandboxNetwork, VariableName};
 pub use mirrors::{Mirrors, Remote};
-pub use resources::{GpuUse, ResourceLimits};
+pub use resources::{GpuUse, RealTime, ResourceLimits};
 pub use simulation_config::SimulationConfig;
 pub use timing::Timing;
 pub use urls::Streaming;

@@ -1,10 +1,10 @@
-//! The keys `limits` and `gpus`: the resources that one simulation may use.
+//! The keys `limits`, `gpus` and `realTime`: the resources that one simulation may use, and what it is to get.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::shared::config::keys::keys;
-use crate::shared::config::{OptionalWhole, Whole};
+use crate::shared::config::{OptionalWhole, Share, Whole};
 
 keys! {
 /// The resource limits of one simulation.
@@ -31,6 +31,18 @@ pub struct ResourceLimits {
     /// Limit of busy cores, if control groups are available. Default: none.
     #[serde(with = "OptionalWhole::<1, 100_000_000>")]
     pub cores: Option<u64> = None,
+}
+}
+
+keys! {
+/// What is promised of the speed of simulations.
+#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "camelCase", default, deny_unknown_fields)]
+pub struct RealTime {
+    /// The share of real time that simulations are to keep: while they are slower than they can be, no more clients are
+    /// offered places. Only with `"streaming": "relay"`; 0: places do not depend on it. Default: 0.9.
+    #[serde(with = "Share")]
+    pub target: f64 = 0.9,
 }
 }
 

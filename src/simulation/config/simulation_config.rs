@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use super::container::{ContainerDisplay, ContainerSettings, EDITOR_PORT};
 use super::isolation::{IsolationSetting, SandboxFolders, VariableName};
 use super::mirrors::Mirrors;
-use super::resources::{GpuUse, ResourceLimits};
+use super::resources::{GpuUse, RealTime, ResourceLimits};
 use super::timing::Timing;
 use super::urls::Streaming;
 use crate::shared::config::keys::keys;
@@ -71,6 +71,8 @@ pub struct SimulationConfig {
     pub environment: Vec<VariableName> = Vec::new(),
     /// The resource limits of one simulation.
     pub limits: ResourceLimits = ResourceLimits::default(),
+    /// What is promised of the speed of simulations.
+    pub real_time: RealTime = RealTime::default(),
     /// Run Webots in containers: the original's key for `isolation: "container"`. Default: false.
     pub docker: bool = false,
     /// A key of the original, without effect: only images that this server has built are ever removed.

@@ -12,7 +12,7 @@ use crate::shared::run::timestamp;
 use crate::shared::text::one_line;
 
 /// The first line.
-pub const HEADING: &str = "id,begin,end,client,repository,world,port,level,peak memory (bytes),processor time (s),reason,user,label (unverified),waited (s),duration (s),real time (%)\n";
+pub const HEADING: &str = "id,begin,end,client,repository,world,port,level,peak memory (bytes),processor time (s),reason,user,label (unverified),waited (s),duration (s),real time (%),below 0.9 of real time (% of the time)\n";
 /// The file of this month.
 const FILE: &str = "simulations.csv";
 /// Length of a month in the name of a file, and in a time: `2026-11`.
@@ -145,13 +145,14 @@ fn line(level: &str, ended: &Ended) -> String {
             .map(|waited| format!("{waited:.1}"))
             .unwrap_or_default(),
         ran.map(|seconds| seconds.to_string()).unwrap_or_default(),
-        simulation
-            .time
-            .mean()
-            .map(|factor| format!("{:.0}", 100.0 * factor))
-            .unwrap_or_default(),
+        percent(simulation.time.mean()),
+        percent(simulation.time.slow_share()),
     ];
     fields.join(",") + "\n"
+}
+
+fn percent(share: Option<f64>) -> String {
+    share.map(|share| format!("{:.0}", 100.0 * share)).unwrap_or_default()
 }
 
 /// A text that others choose, in quotes. An apostrophe is put before what a spreadsheet would read as a formula: at the

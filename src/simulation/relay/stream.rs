@@ -71,7 +71,11 @@ impl Stream {
     pub fn copy(&mut self, buffer: &mut [u8]) -> bool {
         let ending = self.ending.get().map(String::as_str);
         let (down, length) = self.down.copy(&self.up.from, ending, buffer);
-        self.time.read(buffer.get(..length).unwrap_or_default());
+        if self.down.pending.is_empty() {
+            self.time.read(buffer.get(..length).unwrap_or_default());
+        } else {
+            self.time.interrupt();
+        }
         let (up, _) = self.up.copy(&self.down.from, None, buffer);
         up || down
     }

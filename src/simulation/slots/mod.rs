@@ -1,6 +1,8 @@
 //! The slots that clients wait for: leases, the queue, and the limits per address and user; the streams of simulations.
 
 pub mod port;
+mod real_time;
+mod real_time_places;
 mod reservations;
 mod simulation_record;
 mod slot_lease;

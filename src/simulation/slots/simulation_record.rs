@@ -40,6 +40,8 @@ pub(super) struct SimulationRecord {
     /// Whether it was told to make room for a client that waits, and its own has not come back since; or it was kept ready
     /// and ends.
     pub makes_room: bool,
+    /// Whether its client was told that it is slower than real time.
+    pub is_slow: bool,
     /// Its end, once that is reported. Only the first report counts.
     pub end: Option<End>,
     events: Vec<String>,
@@ -83,6 +85,8 @@ pub enum SlotEvent {
     Watched(bool),
     /// A viewer opens its stream through this server.
     Viewed,
+    /// The simulation runs this fast, and slower than real time; `None`: it is not slow any more.
+    Pace(Option<f64>),
     /// The administrator stops the simulation; the text is for its client.
     Stopped(String),
     /// Another client waits for a slot, and the client of this one has been away for too long; or the
@@ -182,6 +186,7 @@ impl SimulationRecord {
             ending: Arc::default(),
             away_since: None,
             makes_room: false,
+            is_slow: false,
             end: None,
             events: Vec::new(),
         };

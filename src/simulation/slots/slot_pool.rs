@@ -14,6 +14,7 @@ use actix::Recipient;
 use parking_lot::Mutex;
 
 use super::port;
+use super::real_time_places::RealTimePlaces;
 use super::reservations::{Held, LinkId, Reservations, Reserved};
 use super::simulation_record::{Party, SimulationRecord, SlotEvent, SpareKind};
 use crate::shared::domain::{Failure, Instances, Reason, ReservationId, Stage, View, Wish, Wishes};
@@ -37,6 +38,8 @@ pub(super) struct Slots {
     freed: u64,
     /// The slots that are reserved for clients of session servers' lines.
     pub(super) reservations: Reservations,
+    /// How many of the slots are offered, as far as simulations run in real time.
+    pub(super) real_time: RealTimePlaces,
     /// All simulations in the order in which they were requested. Those without a port are the queue.
     pub(super) records: BTreeMap<SimulationId, SimulationRecord>,
     ends: Ends,
@@ -69,6 +72,7 @@ impl SlotPool {
             arrivals: 0,
             freed: 0,
             reservations: Reservations::new(pass),
+            real_time: RealTimePlaces::default(),
             records: BTreeMap::new(),
             ends,
         })))
@@ -291,7 +295,7 @@ impl Slots {
                 return Some(party.0.refusal(all - waiting, waiting));
             }
         }
-        let slots = self.ports.len();
+        let slots = self.places();
         let waiting = self.queue().count();
         (waiting >= self.queue_capacity).then(|| {
             let message = format!(
@@ -307,13 +311,7 @@ impl Slots {
         self.grant();
         self.make_room();
         let queue: Vec<Instant> = self.queue().map(|waiting| waiting.since).collect();
-        // A slot of a simulation without a client is as good as free, unless it is promised.
-        let of_clients = self
-            .records
-            .values()
-            .filter(|record| record.simulation.port.is_some() && record.spare().is_none());
-        let used = of_clients.count() + self.reservations.reserved.len();
-        let free = self.ports.len().saturating_sub(used);
+        let free = self.places().saturating_sub(self.used());
         let lent = self.lent();
         let has_share = |(party, most): &(Party, usize)| lent.get(party).is_some_and(|slots| slots >= most);
         self.reservations.tell(free, &queue, has_share);
@@ -330,8 +328,36 @@ impl Slots {
         }
     }
 
+    /// The slots of this server.
+    pub(super) fn all_places(&self) -> usize {
+        self.ports.len()
+    }
+
+    /// The slots that are offered: all, or as many as run in real time.
+    fn places(&self) -> usize {
+        let all = self.all_places();
+        self.real_time.places().map_or(all, |places| places.min(all))
+    }
+
+    /// The slots that clients have, or that are reserved for them. That of a simulation without a client is as good as free,
+    /// unless it is promised.
+    pub(super) fn used(&self) -> usize {
+        let of_clients = self
+            .records
+            .values()
+            .filter(|record| record.simulation.port.is_some() && record.spare().is_none());
+        of_clients.count() + self.reservations.reserved.len()
+    }
+
+    /// Whether another client may have a slot, which may be that of a simulation without a client.
+    pub(super) fn offers_slot(&self) -> bool {
+        self.used() < self.places()
+    }
+
     fn grant(&mut self) {
-        while let Some(next) = self.next() {
+        while self.offers_slot()
+            && let Some(next) = self.next()
+        {
             match next {
                 Next::InLine(link, index) => {
                     let Some(held) = self.to_hold(link, index) else { return };
@@ -372,7 +398,8 @@ impl Slots {
     /// simulation after the other can't keep all slots.
     fn make_room(&mut self) {
         let waiting = self.waiting();
-        if waiting == 0 || self.free_port().is_some() {
+        let offers_slot = self.offers_slot();
+        if waiting == 0 || offers_slot && self.free_port().is_some() {
             return;
         }
         let leaving = self
@@ -380,7 +407,8 @@ impl Slots {
             .values()
             .filter(|record| record.makes_room && (record.is_away() || record.spare().is_some()));
         for _ in leaving.count()..waiting {
-            if let Some(spare) = self.least_spare() {
+            // Where no slot is offered, theirs would help nobody.
+            if offers_slot && let Some(spare) = self.least_spare() {
                 self.end_least(spare);
                 continue;
             }
@@ -445,7 +473,7 @@ impl Slots {
             starting: count(&[Stage::CheckingOut, Stage::Launching]),
             idle: count(&[Stage::Idle, Stage::Stopping]),
             running: count(&[Stage::Running]),
-            slots: u32::try_from(self.ports.len()).unwrap_or(u32::MAX),
+            slots: u32::try_from(self.places()).unwrap_or(u32::MAX),
             arrivals: self.arrivals,
             reserved: u32::try_from(self.reservations.reserved.len()).unwrap_or(u32::MAX),
             freed: self.freed,

@@ -80,7 +80,11 @@ impl SlotPool {
         let reserved = reservation.and_then(|id| slots.reservations.reserved.get(&id));
         let own = reserved.and_then(|reserved| reserved.held.spare());
         let counts_already = reserved.is_some_and(|reserved| reserved.parties == parties);
-        if reservation.is_some() && reserved.is_none() || !counts_already && !may_have(&slots.lent(), &parties) {
+        let has_slot = reserved.is_some() || slots.offers_slot();
+        if reservation.is_some() && reserved.is_none()
+            || !has_slot
+            || !counts_already && !may_have(&slots.lent(), &parties)
+        {
             return None;
         }
         let id = own

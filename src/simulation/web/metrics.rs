@@ -59,6 +59,11 @@ pub fn gauges<'text>(server: &AppState, snapshot: &Snapshot) -> Vec<Gauge<'text>
             "Simulations that fit",
             f64::from(instances.slots),
         ),
+        Gauge::plain(
+            "webots_simulation_places_withheld",
+            "Places that are not offered because simulations are slower than they can be",
+            f64::from(server.config.max_connections) - f64::from(instances.slots),
+        ),
         Gauge {
             name: "webots_simulation_instances",
             help: "Simulations by state",

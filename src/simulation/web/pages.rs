@@ -161,6 +161,11 @@ impl Monitor<'_> {
     }
 }
 
+/// A factor as a percentage, for sorting; -1 if it is not known.
+fn percent(factor: Option<f64>) -> String {
+    factor.map_or("-1".to_owned(), |factor| format!("{:.0}", 100.0 * factor))
+}
+
 fn time(seconds_since_1970: u64) -> String {
     timestamp(SystemTime::UNIX_EPOCH + Duration::from_secs(seconds_since_1970))
 }

@@ -49,6 +49,8 @@ pub fn status_page(server: &AppState, snapshot: &Snapshot, names_machine: bool) 
         "machine": readings.machine,
         "gpus": readings.gpus,
         "gpuProblem": readings.gpu_problem,
+        // `places`: how many are offered because simulations are slow; null: all.
+        "realTime": {"target": server.config.real_time.target, "places": server.slots.real_time_places()},
         "viewer": webots_viewer::folder(&server.config).map(|_| webots_viewer::PATH),
         "simulations": snapshot.simulations,
     });

@@ -378,7 +378,10 @@ impl Webots {
 
     fn show(&self) {
         let stage = self.state.stage();
-        self.spec.slot.lease.update(|simulation| simulation.stage = stage);
+        self.spec.slot.lease.update(|simulation| {
+            simulation.stage = stage;
+            simulation.time.set_running(stage == Stage::Running);
+        });
     }
 
     /// Takes the state out, in order to enter another one.
