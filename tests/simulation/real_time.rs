@@ -6,7 +6,9 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use serde_json::{Value, json};
 
-use crate::support::{Builder, Client, Server, WORLD, arm, demo_server, http, instances_below, session_server, until};
+use crate::support::{
+    Builder, Client, SOON, Server, WORLD, arm, demo_server, http, instances_below, session_server, until,
+};
 
 /// A server whose simulations have a relayed stream and need this much processor time for each second.
 fn server(places: u16, work: &str) -> Builder {
@@ -86,7 +88,7 @@ async fn a_simulation_that_is_slow_is_shown_told_counted_and_recorded() {
     // It needs two processors, and uses one.
     let server = server(1, "2").start().await;
     let mut seat = Seat::take(&server).await;
-    let told = seat.client.until("realTime: ").await;
+    let told = seat.client.within("realTime: ", SOON).await;
     let share: f64 = told["realTime: ".len()..].parse().unwrap();
     assert!((0.0..=0.5).contains(&share), "{told}");
     let factor = factors(&server).await[0].unwrap();
@@ -104,7 +106,7 @@ async fn a_simulation_that_is_slow_is_shown_told_counted_and_recorded() {
     );
     // While it is paused, it is not slow.
     seat.say("pause");
-    seat.client.until("realTime: 1").await;
+    seat.client.within("realTime: 1", SOON).await;
     assert_eq!(factors(&server).await, [None]);
     seat.leave().await;
     let line = recorded(&server).await;
