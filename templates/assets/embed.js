@@ -4,6 +4,7 @@ import { Store } from './kept.js';
 import { firstOf, LANGUAGES } from './language.js';
 import { problemText } from './page_view.js';
 import { Panel } from './panel.js';
+import { styles } from './styles.js';
 import { isConnected, reasonOf } from './visit.js';
 import { VisitRunner } from './visit_runner.js';
 
@@ -18,8 +19,9 @@ import { VisitRunner } from './visit_runner.js';
 
 /** The URL of the session server: these files are its assets. */
 const BASE = new URL('..', import.meta.url).href;
-const STYLES = ['theme.css', 'simulation.css'];
 const NAME = 'webots-simulation';
+/** The looks of all elements. */
+const SHEET = new CSSStyleSheet();
 /** The names of the stores of the elements that are in this page. @type {Set<string>} */
 const storeNames = new Set();
 
@@ -133,10 +135,9 @@ export class WebotsSimulation extends HTMLElement {
 
   async #open() {
     const root = this.shadowRoot ?? this.attachShadow({ mode: 'open' });
-    const styles = STYLES.map(styleSheet);
-    root.replaceChildren(...styles);
-    const wanted = firstOf([this.getAttribute('lang') ?? '', ...navigator.languages]);
-    const [{ words }] = await Promise.all([LANGUAGES[wanted](), ...styles.map(loaded)]);
+    root.adoptedStyleSheets = [SHEET];
+    root.replaceChildren();
+    const { words } = await LANGUAGES[firstOf([this.getAttribute('lang') ?? '', ...navigator.languages])]();
     this.#isOpening = false;
     // It may be gone again.
     if (!this.isConnected) {
@@ -303,25 +304,6 @@ export class WebotsSimulation extends HTMLElement {
   }
 }
 
-/** @param {string} name */
-function styleSheet(name) {
-  return Object.assign(document.createElement('link'), {
-    rel: 'stylesheet',
-    href: new URL(name, import.meta.url).href,
-  });
-}
-
-/**
- * Waits until a style sheet is there, or can't be had.
- * @param {HTMLLinkElement} sheet
- */
-function loaded(sheet) {
-  return new Promise((resolve) => {
-    sheet.addEventListener('load', resolve);
-    sheet.addEventListener('error', resolve);
-  });
-}
-
 /** @param {State} state */
 function isShown(state) {
   return state.is === 'running' && (state.scene.is === 'shown' || state.scene.is === 'framed');
@@ -341,4 +323,5 @@ function worldOf(state) {
   return going.is === 'idle' ? undefined : going.goal.world;
 }
 
+SHEET.replaceSync(styles);
 customElements.get(NAME) ?? customElements.define(NAME, WebotsSimulation);

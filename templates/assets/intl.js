@@ -1,15 +1,29 @@
 // Numbers, durations and plural forms in a language. No DOM.
 
 /**
+ * Makes something when it is first used: browsers take milliseconds to make the first of these.
+ * @template T
+ * @param {() => T} make
+ */
+function lazy(make) {
+  /** @type {T | undefined} */
+  let made;
+  return () => {
+    made ??= make();
+    return made;
+  };
+}
+
+/**
  * The formats of a language.
  * @param {string} language
  */
 export function formats(language) {
-  const numbers = new Intl.NumberFormat(language);
-  const percents = new Intl.NumberFormat(language, { style: 'percent' });
-  const plurals = new Intl.PluralRules(language);
-  const parts = new Intl.ListFormat(language, { type: 'unit', style: 'short' });
-  const clock = new Intl.NumberFormat(language, { minimumIntegerDigits: 2, minimumFractionDigits: 3 });
+  const numbers = lazy(() => new Intl.NumberFormat(language));
+  const percents = lazy(() => new Intl.NumberFormat(language, { style: 'percent' }));
+  const plurals = lazy(() => new Intl.PluralRules(language));
+  const parts = lazy(() => new Intl.ListFormat(language, { type: 'unit', style: 'short' }));
+  const clock = lazy(() => new Intl.NumberFormat(language, { minimumIntegerDigits: 2, minimumFractionDigits: 3 }));
   /**
    * @param {number} count
    * @param {string} unit
@@ -18,15 +32,15 @@ export function formats(language) {
     new Intl.NumberFormat(language, { style: 'unit', unit, unitDisplay: 'long' }).format(count);
   return {
     /** @param {number} count */
-    number: (count) => numbers.format(count),
+    number: (count) => numbers().format(count),
     /** @param {number} count */
-    percent: (count) => percents.format(count / 100),
+    percent: (count) => percents().format(count / 100),
     /**
      * The form that goes with a number.
      * @param {number} count
      * @param {{ one?: string, other: string }} forms
      */
-    plural: (count, forms) => (plurals.select(count) === 'one' ? forms.one : undefined) ?? forms.other,
+    plural: (count, forms) => (plurals().select(count) === 'one' ? forms.one : undefined) ?? forms.other,
     /** @param {number} seconds */
     duration: (seconds) => {
       const rest = Math.max(0, Math.round(seconds));
@@ -38,12 +52,12 @@ export function formats(language) {
         { count: hours > 0 ? 0 : rest % 60, unit: 'second' },
       ];
       const used = all.filter(({ count }) => count > 0).map(({ count, unit }) => amount(count, unit));
-      return parts.format(used.length > 0 ? used : [amount(0, 'second')]);
+      return parts().format(used.length > 0 ? used : [amount(0, 'second')]);
     },
     /**
      * A time of the simulation.
      * @param {number} time in milliseconds
      */
-    clock: (time) => `${Math.floor(time / 60_000)}:${clock.format((Math.round(time) % 60_000) / 1000)}`,
+    clock: (time) => `${Math.floor(time / 60_000)}:${clock().format((Math.round(time) % 60_000) / 1000)}`,
   };
 }

@@ -11,13 +11,13 @@ use crate::asset;
 use crate::session::config::AskName;
 use crate::session::fleet::FleetStatus;
 use crate::session::state::AppState;
-use crate::shared::http::assets::{self, Asset};
+use crate::shared::http::assets::{self, Asset, Content};
 use crate::shared::http::routing::{GET, READ, path};
 use crate::shared::http::{ConnectionKind, FOREIGN_SCRIPTS, OWN_FILES, PageView, VIEWER, framed_by, html};
 use crate::shared::run::timestamp;
 
 /// Assets of this server's pages, besides those that both servers share.
-static ASSETS: [Asset; 17] = [
+static ASSETS: [Asset; 18] = [
     asset!("viewer.js"),
     asset!("viewer.css"),
     asset!("embed.js"),
@@ -30,6 +30,12 @@ static ASSETS: [Asset; 17] = [
     asset!("session_server.js"),
     asset!("simulation_link.js"),
     asset!("stage.js"),
+    Asset::new("styles.js", || {
+        Content::style_module(&[
+            include_str!("../../../templates/assets/theme.css"),
+            include_str!("../../../templates/assets/simulation.css"),
+        ])
+    }),
     asset!("kept.js"),
     asset!("turn.js"),
     asset!("class.css"),

@@ -39,6 +39,17 @@ impl Content {
             "js" | "css" => without_comments(text).into(),
             _ => Bytes::from_static(text.as_bytes()),
         };
+        Self::of(plain)
+    }
+
+    /// A module with these style sheets, for elements in pages of others: it comes with the scripts, where links would be
+    /// asked for only after them.
+    pub fn style_module(sheets: &[&str]) -> Self {
+        let styles: String = sheets.iter().map(|sheet| without_comments(sheet)).collect();
+        Self::of(format!("export const styles = {};\n", serde_json::Value::from(styles)).into())
+    }
+
+    fn of(plain: Bytes) -> Self {
         let gzip = compressed(&plain);
         Self { plain, gzip }
     }
