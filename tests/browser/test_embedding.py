@@ -8,11 +8,13 @@ import unittest
 import urllib.request
 
 from case import BrowserTest
+from firefox import MISSING, Firefox
 from fleet import SOON, WORLD, Fleet, free_ports, until
 from playwright.sync_api import expect
 from site_of_others import Site, printed
 
 SHOWN = "[data-step=simulation].done"
+in_firefox = unittest.skipIf(MISSING, MISSING)
 
 
 class Embedding(BrowserTest):
@@ -30,6 +32,13 @@ class Embedding(BrowserTest):
 
     def visit(self, name, text, **options):
         return self.open(self.site.put(name, text), **options)
+
+    def firefox(self, name, text):
+        """A Firefox that shows a page of the site, and a function that looks at what an element of it shows."""
+        tab = self.enterContext(Firefox())
+        self.addCleanup(lambda: self.may_complain or self.assertEqual(tab.complaints, [], "the console"))
+        tab.goto(self.site.put(name, text))
+        return tab, lambda name, selector: f"document.getElementById('{name}')?.shadowRoot?.querySelector('{selector}')"
 
     def simulations(self):
         """The simulations of all servers."""
@@ -68,6 +77,52 @@ class PrintedPages(Embedding):
         tab.reload()
         expect(tab.get_by_role("button", name="Connect")).to_be_visible()
         self.assertEqual(self.simulations(), [])
+
+    @in_firefox
+    def test_in_firefox_a_page_starts_reloads_goes_on_and_ends(self):
+        tab, part = self.firefox("page", printed("A page"))
+        until("it is available", lambda: tab.evaluate(f"!!{part('robot', '#availability.on')}"))
+        tab.evaluate(part("robot", "[part=start]") + ".click()")
+        until("it is shown", lambda: tab.evaluate(f"!!{part('robot', SHOWN)}"))
+        tab.evaluate("document.getElementById('robot').play()")
+        told = "document.getElementById('told').textContent"
+        until("time passes", lambda: re.search(r"^[1-9]\d*\.\d seconds$", tab.evaluate(told)))
+        (before,) = self.simulations()
+        tab.reload()
+        mode = f"{part('robot', '#mode')}?.textContent"
+        until("it goes on", lambda: tab.evaluate(mode) == "real time")
+        (after,) = self.simulations()
+        self.assertEqual((before["id"], before["pid"]), (after["id"], after["pid"]))
+        tab.evaluate(part("robot", "[part=leave]") + ".click()")
+        until("it ends", lambda: tab.evaluate(told) == "Goodbye.")
+        until("it is gone", lambda: not self.simulations())
+
+    @in_firefox
+    def test_in_firefox_two_elements_are_two_simulations_and_the_removal_of_one_ends_it(self):
+        tab, part = self.firefox("race", printed("Two simulations"))
+        for side in ("left", "right"):
+            mode = f"{part(side, '#mode')}?.textContent"
+            until(f"{side} runs", lambda mode=mode: tab.evaluate(mode) == "real time")
+        self.assertEqual(len({one["id"] for one in self.simulations()}), 2)
+        tab.evaluate("document.getElementById('give-up').click()")
+        until("one has ended", lambda: len(self.simulations()) == 1)
+        self.assertEqual(tab.evaluate("document.getElementById('left').state"), "running")
+        tab.evaluate("document.getElementById('left').remove()")
+        until("the other has ended", lambda: not self.simulations())
+
+    def test_a_page_whose_policy_allows_what_the_guide_names(self):
+        fleet = self.fleet.session.url("").rstrip("/")
+        policy = (
+            f"default-src 'none'; script-src 'unsafe-inline' {fleet}; frame-src {fleet}; "
+            f"connect-src {fleet} http://127.0.0.1:* ws://127.0.0.1:*"
+        )
+        meta = f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n<title>'
+        page = self.visit("page", printed("A page").replace("<title>", meta))
+        page.tab.get_by_role("button", name="Connect").click()
+        expect(page.tab.locator(SHOWN)).to_be_visible()
+        self.assertEqual(page.faults(), [])
+        page.tab.get_by_role("button", name="Disconnect").click()
+        until("it is gone", lambda: not self.simulations())
 
     def test_a_failure_has_a_code_for_the_page_and_words_for_its_visitor(self):
         text = printed("A page").replace("playground.wbt", "missing.wbt")
@@ -245,6 +300,24 @@ class InLine(Embedding):
         first.tab.evaluate("document.getElementById('left').remove()")
         until("all is over", lambda: not self.simulations())
 
+    @in_firefox
+    def test_in_firefox_a_page_waits_in_line_also_over_a_reload(self):
+        first = self.visit("race", printed("Two simulations"))
+        for side in ("left", "right"):
+            expect(first.tab.locator(f"#{side} {SHOWN}")).to_be_visible()
+        tab, part = self.firefox("page", printed("A page"))
+        until("it is known", lambda: tab.evaluate("document.getElementById('robot').state") == "idle")
+        tab.evaluate("document.getElementById('robot').start()")
+        note = f"{part('robot', '#step-session small')}?.textContent"
+        until("it waits", lambda: "you are next" in (tab.evaluate(note) or ""))
+        tab.reload()
+        until("it waits again", lambda: "you are next" in (tab.evaluate(note) or ""))
+        first.tab.get_by_role("button", name="Give up").click()
+        until("it is shown", lambda: tab.evaluate(f"!!{part('robot', SHOWN)}"))
+        tab.evaluate("document.getElementById('robot').remove()")
+        first.tab.evaluate("document.getElementById('left').remove()")
+        until("all is over", lambda: not self.simulations())
+
 
 class Refused(Embedding):
     may_complain = True
@@ -263,6 +336,18 @@ class Refused(Embedding):
         self.assertEqual(len(own), 1, page.complaints)
         self.assertIn(self.site.origin, own[0])
         expect(tab.locator("#told")).to_contain_text("It has ended: The simulation server starts nothing")
+
+    @in_firefox
+    def test_in_firefox_a_site_that_is_not_listed_is_told_once_on_the_page_and_in_the_console(self):
+        tab, part = self.firefox("page", printed("A page"))
+        until("it is known", lambda: tab.evaluate("document.getElementById('robot').state") == "idle")
+        tab.evaluate("document.getElementById('robot').start()")
+        problem = f"{part('robot', '#problem-text')}?.textContent"
+        words = "The simulation server starts nothing for pages of this site."
+        until("it is told", lambda: tab.evaluate(problem) == words)
+        own = [one for one in tab.complaints if "webots-simulation" in one]
+        self.assertEqual(len(own), 1, tab.complaints)
+        self.assertIn(self.site.origin, own[0])
 
 
 class InAFrame(Embedding):
