@@ -205,6 +205,23 @@ async fn the_order_of_arrival_holds_for_its_own_queue_and_all_session_servers() 
 }
 
 #[actix_rt::test]
+async fn the_order_of_a_session_server_holds_whatever_its_messages_round() {
+    let server = reserving().start().await;
+    let inside = [Client::ready(&server).await, Client::ready(&server).await];
+    let mut link = Link::open(&server).await;
+    // Both came in one millisecond, but one was told of before, by a message that was faster.
+    link.want(&[(2, 500)]).await;
+    link.offers().await;
+    link.want(&[(1, 400), (2, 400)]).await;
+    link.offers().await;
+    let [first, second] = inside;
+    first.leave().await;
+    assert_eq!(link.slots().await[0].0, 1);
+    second.leave().await;
+    assert_eq!(link.slots().await[0].0, 2);
+}
+
+#[actix_rt::test]
 async fn only_a_server_with_the_key_gets_slots() {
     let server = reserving().start().await;
     let (mut socket, hello) = Link::challenged(&server).await;

@@ -147,6 +147,12 @@ impl Reservations {
             }
         });
         link.wanted = wanted.collect();
+        // Their order is exact. The times are not: messages round them, and are on their way for some time.
+        let mut next: Option<Instant> = None;
+        for one in link.wanted.iter_mut().rev() {
+            one.since = next.map_or(one.since, |next| one.since.min(next));
+            next = Some(one.since);
+        }
         link.all = (wishes.all as usize).max(link.wanted.len());
         link.news.number = wishes.number;
         link.has_news = true;
