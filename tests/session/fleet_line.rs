@@ -51,6 +51,8 @@ struct Visitor<'class> {
     session: String,
     owner: &'static str,
     ticket: String,
+    /// Whether a turn has come with its ticket, which may be worth nothing since then.
+    had_turn: bool,
     stay: Duration,
     /// Whether it reloads its page while it waits.
     reloads: bool,
@@ -87,6 +89,7 @@ impl Visitor<'_> {
         let mut line = Client::try_connect(&self.session).await.ok()?;
         let request = json!({"url": self.world(), "wait": true, "ticket": self.ticket});
         line.try_send(&request.to_string()).await.ok()?;
+        let before = (!self.had_turn && !self.ticket.is_empty()).then(|| place(&self.ticket));
         let mut from = None;
         let mut pass = String::new();
         let turn = loop {
@@ -96,6 +99,8 @@ impl Visitor<'_> {
                     ("ticket", ticket) => {
                         from.get_or_insert_with(SystemTime::now);
                         ticket.clone_into(&mut self.ticket);
+                        let kept = place(&self.ticket);
+                        assert_eq!(before.unwrap_or(kept), kept, "it has lost its place");
                     }
                     ("queue", ahead) => {
                         let position: usize = ahead.parse().unwrap();
@@ -111,6 +116,7 @@ impl Visitor<'_> {
                 },
             }
         };
+        self.had_turn |= turn.is_some();
         if let Some(from) = from {
             self.class.waits.borrow_mut().push(Wait {
                 place: place(&self.ticket),
@@ -320,6 +326,7 @@ async fn on_a_quiet_machine_two_session_servers_are_as_fair_as_their_messages_ar
             session: session.websocket("/session"),
             owner: "lab",
             ticket: String::new(),
+            had_turn: false,
             stay: Duration::from_millis(300 + 10 * (number as u64 * 37 % 50)),
             reloads: false,
         };
@@ -351,9 +358,11 @@ async fn on_a_quiet_machine_two_session_servers_are_as_fair_as_their_messages_ar
     assert!(unfair.is_empty(), "{unfair:#?}");
 }
 
+/// `LINE_STAYS=10` makes the stays ten times as long, 5 to 15 seconds.
 #[actix_rt::test]
 async fn on_a_quiet_machine_two_hundred_share_twenty_slots_in_order_whatever_happens() {
     const CLIENTS: usize = 200;
+    let times: u32 = std::env::var("LINE_STAYS").map_or(1, |times| times.parse().unwrap());
     let forge = Forge::with_arm();
     let webots = Webots::launcher();
     forge.commit("school/arm", "main", &[("worlds/a.wbt", WORLD)]);
@@ -374,7 +383,8 @@ async fn on_a_quiet_machine_two_hundred_share_twenty_slots_in_order_whatever_hap
             session: url.clone(),
             owner: if number % 3 == 0 { "school" } else { "lab" },
             ticket: String::new(),
-            stay: Duration::from_millis(500 + 10 * (number as u64 * 37 % 100)),
+            had_turn: false,
+            stay: times * Duration::from_millis(500 + 10 * (number as u64 * 37 % 100)),
             reloads: number % 10 == 5,
         };
         async move {
@@ -386,7 +396,7 @@ async fn on_a_quiet_machine_two_hundred_share_twenty_slots_in_order_whatever_hap
         let begun = Instant::now();
         while class.served.get() < count {
             assert!(
-                begun.elapsed() < Duration::from_secs(120),
+                begun.elapsed() < times * Duration::from_secs(120),
                 "{} are served",
                 class.served.get()
             );
