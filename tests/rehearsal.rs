@@ -237,15 +237,38 @@ async fn who_gets_no_slot_waits_for_the_next_one() {
     let full = "Error: no simulation server available at the moment.";
     let never = "Error: no simulation server accepts https://github.com/lab/arm.";
     let given_up = format!("None fits; 1 got none: no simulation within 4s: {full}");
-    for (session, verdict, code, asked) in [
-        (vec![full, full, "ws://{}"], "All 1 fit.", 0, 3..=3),
+    let retold = "Error: come back later.";
+    for (session, reason, verdict, code, asked) in [
+        (vec![full, full, "ws://{}"], None, "All 1 fit.", 0, 3..=3),
         // There is a pause between requests.
-        (vec![full], given_up.as_str(), 1, 2..=5),
+        (vec![full], None, given_up.as_str(), 1, 2..=5),
         // A permanent refusal is not retried.
-        (vec![never], "1 got none: Error: no simulation server accepts", 1, 1..=1),
+        (
+            vec![never],
+            None,
+            "1 got none: Error: no simulation server accepts",
+            1,
+            1..=1,
+        ),
+        // The code decides, if there is one.
+        (
+            vec![retold, "ws://{}"],
+            Some("no-server-available"),
+            "All 1 fit.",
+            0,
+            2..=2,
+        ),
+        (
+            vec![full],
+            Some("repository-blocked"),
+            "1 got none: Error: no",
+            1,
+            1..=1,
+        ),
     ] {
         let fleet = StandIn::start(Script {
             session,
+            reason,
             ..Script::default()
         })
         .await;

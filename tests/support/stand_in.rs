@@ -17,6 +17,8 @@ use super::authority::Certificate;
 pub struct Script {
     /// The answers of `/session` in order; the last one is repeated.
     pub session: Vec<&'static str>,
+    /// The code of a reason in the header of these answers.
+    pub reason: Option<&'static str>,
     /// The texts on `/client`; after them, `.` is sent repeatedly.
     pub client: Vec<&'static str>,
     /// The texts on `/webots`; after them, updates with the simulated time.
@@ -28,6 +30,7 @@ impl Default for Script {
     fn default() -> Self {
         Self {
             session: vec!["ws://{}"],
+            reason: None,
             client: vec!["shutdownTimeout: 60", "webots:ws://{}/webots"],
             webots: vec!["model:<Scene/>", "paused by client"],
         }
@@ -136,9 +139,11 @@ impl Part {
             "/load" => "1.0".to_owned(),
             _ => self.fill(self.script.session[before.min(self.script.session.len() - 1)]),
         };
+        let reason = self.script.reason.map(|code| format!("\r\nWebots-Reason: {code}"));
         let head = format!(
-            "HTTP/1.1 200 OK\r\nContent-Length: {}\r\nConnection: close",
-            content.len()
+            "HTTP/1.1 200 OK\r\nContent-Length: {}\r\nConnection: close{}",
+            content.len(),
+            reason.unwrap_or_default()
         );
         socket
             .write_all(format!("{head}\r\n\r\n{content}").as_bytes())

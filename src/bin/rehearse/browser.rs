@@ -10,7 +10,7 @@ use crate::behaviour::Behaviour;
 use crate::board::{Board, Stage};
 use crate::connection::{Connection, Ended, simulated_time, unless_error};
 use crate::returning::WayBack;
-use crate::session_server::SessionServer;
+use crate::session_server::{NoServer, SessionServer};
 use crate::visit::{Outcome, Pace, Steps, Visit};
 use crate::words::line;
 
@@ -215,8 +215,8 @@ impl<'class> Browser<'class> {
                     self.full = None;
                     return Ok(server);
                 }
-                Err(why) if is_of_no_place(&why) => self.full = Some(why),
-                Err(why) => return Err(StartError::Refused(why)),
+                Err(NoServer { answer, is_full: true }) => self.full = Some(answer),
+                Err(NoServer { answer, .. }) => return Err(StartError::Refused(answer)),
             }
             // Clients that wait together must not retry together.
             actix_rt::time::sleep(pause.mul_f64(rand::random_range(0.5..1.0))).await;
@@ -346,11 +346,6 @@ impl Drop for Browser<'_> {
         }
         self.visits.borrow_mut().push(self.visit.clone());
     }
-}
-
-/// Whether an answer of the session server says that all simulation servers are full, which is temporary.
-fn is_of_no_place(answer: &str) -> bool {
-    answer.to_ascii_lowercase().contains("no simulation server available")
 }
 
 /// Whether a text says that no slot is free yet.

@@ -154,7 +154,10 @@ impl StepLog {
         session_server: &SessionServer,
     ) -> Result<(Connection, String), StepError> {
         let server = session_server.simulation_server(&arguments.world).await;
-        let came = excerpt(server.as_ref().map_or_else(Clone::clone, Clone::clone).as_str());
+        let came = excerpt(match &server {
+            Ok(url) => url,
+            Err(none) => &none.answer,
+        });
         self.note(
             "simulation server",
             "`ws://HOST:PORT` or `wss://HOST/PORT`",

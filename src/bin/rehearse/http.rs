@@ -6,6 +6,7 @@ use std::time::Duration;
 use awc::Client;
 use awc::error::SendRequestError;
 use rustls::ClientConfig;
+use webots_fleet::shared::domain::Reason;
 use webots_fleet::shared::http::tls;
 
 /// Timeout of an answer.
@@ -30,11 +31,19 @@ pub(crate) fn client() -> Client {
     Client::builder().connector(connector).timeout(ANSWER).finish()
 }
 
-/// The body of an answer with any status: the page ignores the status too.
+/// An answer with any status: the page ignores the status too.
+pub(crate) struct Answer {
+    /// Its body.
+    pub(crate) text: String,
+    /// Why a request was refused; servers that don't know reasons, such as the original, send none.
+    pub(crate) reason: Option<Reason>,
+}
+
+/// The answer to a request.
 ///
 /// # Errors
 /// Why there is none.
-pub(crate) async fn get(http: &Client, url: &str) -> Result<String, String> {
+pub(crate) async fn get(http: &Client, url: &str) -> Result<Answer, String> {
     let unreachable = |error: SendRequestError| {
         let why = tls::reason(&error).unwrap_or_else(|| error.to_string());
         format!("{url} can't be reached: {why}")
@@ -45,5 +54,9 @@ pub(crate) async fn get(http: &Client, url: &str) -> Result<String, String> {
         .limit(LONGEST_ANSWER)
         .await
         .map_err(|error| format!("{url} can't be read: {error}"))?;
-    Ok(String::from_utf8_lossy(&body).into_owned())
+    let code = answer.headers().get(Reason::HEADER);
+    Ok(Answer {
+        reason: code.and_then(|code| Reason::of_code(code.to_str().ok()?)),
+        text: String::from_utf8_lossy(&body).into_owned(),
+    })
 }

@@ -35,7 +35,7 @@ impl Servers {
         // A server that is too busy to answer keeps its last load.
         let load = answer
             .ok()
-            .and_then(|text| text.trim().parse::<f64>().ok())
+            .and_then(|answer| answer.text.trim().parse::<f64>().ok())
             .filter(|load| load.is_finite());
         if let (Some(load), Some(peak)) = (load, self.0.borrow_mut().get_mut(server)) {
             *peak = Some(peak.map_or(load, |peak| peak.max(load)));

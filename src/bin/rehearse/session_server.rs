@@ -2,10 +2,22 @@
 
 use awc::Client;
 use url::Url;
+use webots_fleet::shared::domain::Blame;
 
 use crate::connection::{Connection, Ended};
-use crate::http::{client, get};
+use crate::http::{Answer, client, get};
 use crate::words::{excerpt, line};
+
+/// Why no simulation server was chosen.
+pub(crate) struct NoServer {
+    /// What was received instead.
+    pub(crate) answer: String,
+    /// Whether the fleet is full, which is temporary.
+    pub(crate) is_full: bool,
+}
+
+/// What the original answers if its fleet is full; it sends no code.
+const FULL: &str = "Error: no simulation server available at the moment.";
 
 /// A session server.
 #[derive(Clone)]
@@ -29,7 +41,7 @@ impl SessionServer {
     /// What was received instead of a load and of the availability.
     pub(crate) async fn answers(&self) -> Result<(), String> {
         let url = format!("{}/load", self.base());
-        let text = get(&self.http, &url).await?;
+        let text = get(&self.http, &url).await?.text;
         let load = text.trim().parse::<f64>();
         load.map_err(|_| format!("{url} is no load but {}: no session server", excerpt(&text)))?;
         // Simulation servers have a load too, but nothing at `/`.
@@ -66,20 +78,22 @@ impl SessionServer {
     /// Requests a simulation server for a world: `ws://HOST:PORT` or `wss://HOST/PORT`.
     ///
     /// # Errors
-    /// The text that was received instead.
-    pub(crate) async fn simulation_server(&self, world: &str) -> Result<String, String> {
+    /// Why there is none.
+    pub(crate) async fn simulation_server(&self, world: &str) -> Result<String, NoServer> {
+        let none = |answer| NoServer { answer, is_full: false };
         // The page inserts the world verbatim, and its browser encodes characters that a URL must not contain, such as
         // spaces.
         let url = format!("{}/session?url={world}", self.base());
-        let url = Url::parse(&url).map_err(|error| format!("{url} is no URL: {error}"))?;
-        let answer = get(&self.http, url.as_str()).await?;
-        let answer = line(answer.trim());
-        let is_one = answer.starts_with("ws://") || answer.starts_with("wss://");
-        if is_one {
-            Ok(answer.trim_end_matches('/').to_owned())
-        } else {
-            Err(answer)
+        let url = Url::parse(&url).map_err(|error| none(format!("{url} is no URL: {error}")))?;
+        let Answer { text, reason } = get(&self.http, url.as_str()).await.map_err(none)?;
+        let answer = line(text.trim());
+        if answer.starts_with("ws://") || answer.starts_with("wss://") {
+            return Ok(answer.trim_end_matches('/').to_owned());
         }
+        Err(NoServer {
+            is_full: reason.map_or(answer == FULL, |reason| reason.blame() == Blame::Fleet),
+            answer,
+        })
     }
 
     /// Waits for a simulation server in the line. Returns its URL and the pass for it, if it has reserved a slot.

@@ -6,9 +6,6 @@ use serde_json::json;
 use crate::shared::domain::{Failure, Reason};
 use crate::shared::text::client_text;
 
-/// The header of an answer of `/session` that has the reason's code.
-pub const REASON_HEADER: &str = "Webots-Reason";
-
 /// The sentence, safe to show.
 pub fn sentence(failure: &Failure) -> String {
     client_text(&format!("Error: {}.", failure.message))

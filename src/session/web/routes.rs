@@ -9,13 +9,13 @@ use actix_web::{HttpRequest, HttpResponse, Result, web};
 use percent_encoding::percent_decode_str;
 use serde::Deserialize;
 
-use super::refusal::{self, REASON_HEADER};
+use super::refusal;
 use super::status::status_page;
 use super::web_client::WebClient;
 use super::{class_routes, metrics, page_routes};
 use crate::session::fleet::RequestReady;
 use crate::session::state::AppState;
-use crate::shared::domain::ReadyEntry;
+use crate::shared::domain::{ReadyEntry, Reason};
 use crate::shared::http::routing::{self, GET, POST, READ, body, json_body, path, retry_after};
 use crate::shared::http::{CONTENT_TYPE, ConnectionKind, openapi, sign_in, websocket};
 use crate::shared::text::one_line;
@@ -89,7 +89,7 @@ async fn session(request: HttpRequest, stream: web::Payload, server: web::Data<A
     if status == StatusCode::SERVICE_UNAVAILABLE {
         response.insert_header(retry_after());
     }
-    response.insert_header((REASON_HEADER, failure.reason.code()));
+    response.insert_header((Reason::HEADER, failure.reason.code()));
     Ok(response.content_type(TEXT).body(refusal::sentence(&failure)))
 }
 

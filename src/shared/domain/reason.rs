@@ -53,6 +53,14 @@ macro_rules! reasons {
             /// All reasons.
             pub const ALL: &[Self] = &[$($(Self::$name,)+)+];
 
+            /// The header of an HTTP answer that has its code.
+            pub const HEADER: &str = "Webots-Reason";
+
+            /// The reason with this code.
+            pub fn of_code(code: &str) -> Option<Self> {
+                Self::ALL.iter().copied().find(|reason| reason.code() == code)
+            }
+
             /// Its code, which stays the same in all later versions.
             pub fn code(self) -> &'static str {
                 match self {
@@ -270,6 +278,7 @@ mod tests {
     #[test]
     fn only_a_fault_of_the_server_sends_a_client_elsewhere() {
         for reason in Reason::ALL {
+            assert_eq!(Reason::of_code(reason.code()), Some(*reason));
             assert!(
                 reason.retry() != Retry::Elsewhere || reason.blame() == Blame::Server,
                 "{reason}"
