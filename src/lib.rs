@@ -25,6 +25,7 @@
 //! | [`simulation::ends`] | how simulations have ended: counter, table, their logs (`kept_output`); for which reasons an end can be requested (`stop_reason`) |
 //! | [`simulation::webots`] | one running Webots: its command line and GPU (`launch_spec`), its log (path and size in `launched`, its lines in `output`), the wait for its end (`launched`) |
 //! | [`simulation::client`] | a client's WebSocket (`web_client`), its simulation when it comes back on another one (`resume`), that of a session server that asks for slots (`slot_link`), the session of its simulation, which sends it nearly all messages (`session`; `start`: before Webots runs, with the choice of the GPU) |
+//! | `simulation::handover`, [`simulation::upgrade`] | an upgrade: the processes of a server, what they tell and pass each other, and which one a connection is for; the old process' side is `upgrade` |
 //! | [`simulation::attachment`] | what a connection and its session send each other, and the tokens by which a client that resumes finds its session |
 //! | [`simulation::slots`] | the slots that clients wait for: leases, the queue and the shares of addresses and users (`slot_pool`), those that are reserved for the line of session servers (`reservations`), how many run in real time (`real_time_places`), the streams of simulations and the tokens that identify them (`stream`) |
 //! | [`simulation::spare_wishes`] | which worlds are kept ready before clients ask for them, and how many; the actor that does it is `spare_keeper` in [`simulation::client`], a spare's slot is in `spare` of [`simulation::slots`] |
@@ -40,8 +41,8 @@
 //! `docs/configuration.md` lists all), its `app` (start and end) and its `state` (what its routes share). Files of
 //! `simulation` are the [`protocol`](simulation::protocol) with the texts of messages to clients (except the reason in
 //! an error and the [`progress`](simulation::progress) of a start, which their causes define: a checkout's is in
-//! `checkout/steps`), the `snapshot` of all simulations, the `simulation_id`, the
-//! `simulated_time`, the `client_identity`, the `announcer` (key `notify`), `preflight`
+//! `checkout/steps`), the `snapshot` of all simulations, the `simulation_id`, the `run_id` of a
+//! process, the `simulated_time`, the `client_identity`, the `announcer` (key `notify`), `preflight`
 //! (`--check`) and `readiness` (`/health`). The programs are in `src/bin`. Modules import only from layers below them,
 //! in the order that `tests/project/layering.rs` lists. `session` and `simulation` never see each other. A child never
 //! names its parent. The parent gives it a `Recipient` for the child's events, which the child's file defines.

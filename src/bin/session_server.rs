@@ -40,7 +40,12 @@ fn main() -> ExitCode {
     let log = loaded.config.log_dir.0.join("session/output.log");
     let log = (!loaded.config.debug).then_some(log.as_path());
     let server = app::run(loaded.config.clone(), arguments.config);
-    start::serve(log, &arguments.options, &loaded.remarks(), server)
+    // It is held until the end of the process.
+    let _pid_file = match start::claim_pid_file(&arguments.options) {
+        Ok(file) => file,
+        Err(code) => return code,
+    };
+    start::serve(log, &loaded.remarks(), server)
 }
 
 /// Sends one mail to the administrator and a test to the webhook, if they are configured, and prints the outcomes.

@@ -15,7 +15,7 @@ use crate::session::fleet::{GetStatus, Reconfigure, Registry};
 use crate::session::web::configure;
 use crate::shared::config;
 use crate::shared::domain::{ClientUrls, FleetKey, Reason};
-use crate::shared::http::server::{self, HttpServerOptions};
+use crate::shared::http::server::{self, HttpServerOptions, Source};
 use crate::shared::http::{AdminAuth, AuthSettings, ConnectionLimiter, LiveUpdates, Metrics, SharedPage};
 use crate::shared::run::{
     AppError, Phase, ServerCommand, Signals, limit_clients, permanent, raise_open_files, service_manager, start,
@@ -54,6 +54,7 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
         silence: config.timing.silence,
         stop: STOP_TIMEOUT,
         trusted_proxies: config.trusted_proxies.clone(),
+        router: None,
     };
     let connections = ConnectionLimiter::new(connections, clients, config.max_clients_per_address);
     let (phase_sender, phase) = watch::channel(Phase::Open);
@@ -72,7 +73,7 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
             .app_data(auth.clone())
             .configure(configure)
     };
-    let http = server::serve(socket, server.connections.clone(), options, app)?;
+    let http = server::serve(Source::Port(socket), server.connections.clone(), options, app)?;
     let handle = http.handle();
     let mut serving = actix_rt::spawn(http);
     start::announce("session server", &http_url, &websocket_url, port);

@@ -11,6 +11,7 @@ use tokio::sync::mpsc::UnboundedReceiver;
 use crate::shared::domain::{Failure, ProjectUrl, View};
 use crate::shared::http::Peer;
 use crate::simulation::client_identity::ClientIdentity;
+use crate::simulation::run_id::RunId;
 
 /// A connection of a client, for the session that it is attached to.
 pub struct Connection {
@@ -95,7 +96,7 @@ impl ResumableSessions {
 /// a session in no URL. A comparison is of numbers, so its duration reveals nothing.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub struct Token {
-    /// The same for all tokens of a session.
+    /// The same for all tokens of a session. It names the process that has given it.
     number: u64,
     secret: u128,
 }
@@ -107,7 +108,7 @@ impl Token {
     /// A new token.
     pub fn random() -> Self {
         Self {
-            number: rand::random(),
+            number: RunId::number(),
             secret: rand::random(),
         }
     }
@@ -118,6 +119,11 @@ impl Token {
             secret: rand::random(),
             ..self
         }
+    }
+
+    /// The process that has given it.
+    pub fn run(self) -> RunId {
+        RunId::of(self.number)
     }
 
     /// Parses a token of a client; `None` if it is invalid.

@@ -2,12 +2,12 @@
 
 use std::fmt;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use crate::shared::text::{chosen_name, one_line};
 
 /// The identity of a client. Only administrators see it: on pages, in the server's log and in `simulations.csv`.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ClientIdentity {
     /// The user name that a trusted reverse proxy sends.
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use memchr::memmem;
 use parking_lot::Mutex;
-use serde::{Serialize, Serializer};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 /// The time of a simulation. Clones share it.
 #[derive(Debug, Clone, Default)]
@@ -24,6 +24,8 @@ struct Readings {
     /// Those of the last seconds, the oldest first, without a pause between them.
     recent: VecDeque<Reading>,
     total: Total,
+    /// The factor that another process of this server has told, whose simulation it is.
+    told: Option<f64>,
 }
 
 /// A time that was read.
@@ -98,7 +100,8 @@ impl SimulatedTime {
 
     /// Simulated seconds per second, of the last five seconds; `None` while it is paused, or nobody looks.
     pub fn recent(&self) -> Option<f64> {
-        self.0.lock().factor(Instant::now())
+        let readings = self.0.lock();
+        readings.told.or_else(|| readings.factor(Instant::now()))
     }
 
     /// Simulated seconds per second while somebody looked and time passed; `None` if that was never.
@@ -111,6 +114,16 @@ impl SimulatedTime {
     pub fn slow_share(&self) -> Option<f64> {
         let Total { slow, real, .. } = self.0.lock().total;
         (real > 0.0).then(|| slow / real)
+    }
+}
+
+impl<'de> Deserialize<'de> for SimulatedTime {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let readings = Readings {
+            told: Option::deserialize(deserializer)?,
+            ..Readings::default()
+        };
+        Ok(Self(Arc::new(Mutex::new(readings))))
     }
 }
 

@@ -4,7 +4,9 @@ use std::fmt;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, SystemTime};
 
-use serde::{Serialize, Serializer};
+use humantime::parse_rfc3339;
+use serde::de::Error;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::shared::run::timestamp_in_milliseconds;
 
@@ -28,6 +30,30 @@ impl SimulationId {
             number: NEXT.fetch_add(1, Ordering::Relaxed),
             requested,
         }
+    }
+
+    /// Parses an id as another process of this server has written it.
+    fn parse(text: &str) -> Option<Self> {
+        let (time, number) = text.split_once('-')?;
+        let mut spelled = String::new();
+        for (index, letter) in time.chars().enumerate() {
+            spelled.push_str(match index {
+                4 | 6 => "-",
+                11 | 13 => ":",
+                15 => ".",
+                _ => "",
+            });
+            spelled.push(letter);
+        }
+        spelled.push('Z');
+        let requested = parse_rfc3339(&spelled)
+            .ok()?
+            .duration_since(SystemTime::UNIX_EPOCH)
+            .ok()?;
+        Some(Self {
+            number: number.parse().ok()?,
+            requested,
+        })
     }
 
     /// Whether a text has only characters of an id, so that it is safe in a file name.
@@ -54,6 +80,13 @@ impl Serialize for SimulationId {
     }
 }
 
+impl<'de> Deserialize<'de> for SimulationId {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let text = String::deserialize(deserializer)?;
+        Self::parse(&text).ok_or_else(|| D::Error::custom("this is no id of a simulation"))
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -66,6 +99,10 @@ mod tests {
         };
         assert_eq!(id.to_string(), "20261122T220517042-17");
         assert!(SimulationId::is_like(&id.to_string()));
+        assert_eq!(SimulationId::parse(&id.to_string()), Some(id));
+        for other in ["", "-", "20261122T220517042", "2026-1", "20261122T220517042-x"] {
+            assert_eq!(SimulationId::parse(other), None, "{other:?}");
+        }
         assert!(SimulationId::next() < SimulationId::next());
         for other in ["..", "../x", "1/2", "20261122T220517-17.log", "1\0"] {
             assert!(!SimulationId::is_like(other), "{other:?}");

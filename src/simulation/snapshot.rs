@@ -1,8 +1,9 @@
 //! A snapshot of all simulations of this server, for pages and programs.
 
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use crate::shared::domain::{Instances, ProjectUrl, Stage};
 use crate::shared::run::seconds_since_1970;
@@ -36,12 +37,30 @@ pub struct Snapshot {
     pub instances: Instances,
     /// Each simulation that has a client, sorted by id.
     pub simulations: Vec<Simulation>,
-    /// Number of those that are kept ready without a client.
-    pub spares: usize,
+}
+
+/// What a process of this server has, as it tells the one that has the port.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+pub struct Holdings {
+    /// The ports that it may use.
+    pub ports: BTreeSet<u16>,
+    /// The numbers by state.
+    pub instances: Instances,
+    /// Each simulation that has a client.
+    pub simulations: Vec<Simulation>,
+}
+
+impl Holdings {
+    /// Adds those of another process.
+    pub fn add(&mut self, other: &Self) {
+        self.ports.extend(&other.ports);
+        self.instances.add(&other.instances);
+        self.simulations.extend_from_slice(&other.simulations);
+    }
 }
 
 /// One simulation, as pages and programs see it.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub struct Simulation {
     /// Its id; unique.

@@ -11,6 +11,8 @@ use tokio::sync::watch;
 use super::attachment::ResumableSessions;
 use super::config::SimulationConfig;
 use super::ends::Ends;
+use super::handover::Predecessors;
+use super::handover::control::StopOrder;
 use super::readiness::FailedStarts;
 use super::slots::{SlotPool, SpareKind, SpareStatus};
 use super::spare_wishes::SpareWishes;
@@ -43,8 +45,12 @@ pub struct AppState {
     pub fleet_key: Option<FleetKey>,
     /// This run of the server, for which passes are valid.
     pub server_run: ServerRun,
+    /// The secret that signs administrators' sign-ins in a fleet without a key.
+    pub sign_in: String,
     /// Which worlds may run.
     pub rules: AdmissionRules,
+    /// The processes of this server before this one.
+    pub predecessors: Arc<Predecessors>,
     /// Leases slots.
     pub slots: Arc<SlotPool>,
     /// What simulations are asked for to be kept ready.
@@ -153,6 +159,18 @@ impl AppState {
     /// Stops the simulations with these ids, for a reason, which may be empty; `by` is who stops them, for the log. Returns
     /// the ids of those that are there.
     pub fn stop(&self, ids: &[String], reason: &str, by: &str) -> Vec<String> {
+        let order = StopOrder {
+            ids: ids.to_vec(),
+            reason: reason.to_owned(),
+            by: by.to_owned(),
+        };
+        let mut stopped = self.stop_here(ids, reason, by);
+        stopped.extend(self.predecessors.stop(&order));
+        stopped
+    }
+
+    /// As [`Self::stop`], those of this process.
+    pub fn stop_here(&self, ids: &[String], reason: &str, by: &str) -> Vec<String> {
         let reason = excerpt(reason.trim(), MAX_REASON_LENGTH);
         let stopped = self.slots.stop(
             ids,

@@ -13,8 +13,8 @@ const ROOMS: [(&str, &str); 3] = [
     ("session", "placement line config mail class fleet state web app"),
     (
         "simulation",
-        "client_identity simulated_time simulation_id snapshot ends attachment slots spare_wishes relay progress protocol process machine config checkout \
-         isolation container readiness preflight announcer webots state client web app",
+        "client_identity run_id simulated_time simulation_id snapshot ends attachment slots spare_wishes relay progress protocol process machine config checkout \
+         isolation container readiness preflight announcer webots handover state upgrade client web app",
     ),
 ];
 

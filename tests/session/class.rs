@@ -450,3 +450,43 @@ async fn how_fast_a_simulation_runs_is_told_and_recorded() {
     })
     .await;
 }
+
+#[actix_rt::test]
+async fn an_upgrade_of_a_simulation_server_is_no_failure() {
+    let server = keyed(4).start().await;
+    let session = fleet(&[server.address()]).await;
+    until_states(&session, &["up"]).await;
+    let mut waiting = Client::connect(&session.websocket("/session")).await;
+    assert_eq!(waiting.until("").await, "1");
+    let changes = session.status().await["changes"].clone();
+    let mut students = Vec::new();
+    for count in 1..=3 {
+        students.push(start(&server, "Nora").await);
+        let (succeeds, told) = server.upgrade().await;
+        assert!(succeeds, "{told}");
+        until("the whole class is listed", async || {
+            let list = class(&session).await;
+            list.len() == count
+                && list
+                    .iter()
+                    .all(|one| one["state"] == "idle" || one["state"] == "running")
+        })
+        .await;
+    }
+    // One of the oldest process is stopped through the newest.
+    let path = format!("/simulations/{}/stop", students[0].id());
+    let (status, text) = send(&session, &path, TOKEN, &json!({})).await;
+    assert_eq!(status, 202, "{text}");
+    students[0].until(TOLD).await;
+    until_class(&session, 2).await;
+    assert_eq!(session.status().await["changes"], changes);
+    assert!(
+        waiting.is_silent(std::time::Duration::from_secs(1)).await,
+        "{:?}",
+        waiting.heard
+    );
+    // The line gives its clients slots of the newest.
+    let mut line = Client::connect(&session.websocket("/session")).await;
+    line.send(&json!({"url": arm(), "wait": true}).to_string()).await;
+    line.until("pass: ").await;
+}

@@ -190,6 +190,12 @@ async fn a_cookie_is_for_one_password_and_one_fleet() {
         let cookie = signed_in(&alone).await;
         assert_eq!(with_cookie(&alone, &cookie).await, 200);
         assert_eq!(with_cookie(&other(None, PASSWORD).start().await, &cookie).await, 401);
+        if home(&alone) == "monitor" {
+            // It goes on in the process that takes over.
+            let (succeeds, told) = alone.upgrade().await;
+            assert!(succeeds, "{told}");
+            assert_eq!(with_cookie(&alone, &cookie).await, 200);
+        }
     }
 }
 

@@ -29,4 +29,5 @@ mod soak;
 mod spares;
 mod stopping;
 mod stopping_one;
+mod upgrades;
 mod who;

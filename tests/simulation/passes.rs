@@ -237,12 +237,6 @@ async fn only_a_server_with_the_key_gets_slots() {
     let (mut socket, _) = Link::challenged(&server).await;
     socket.send(r#"{"number": 1, "first": [], "all": 0}"#).await;
     assert_eq!(socket.closed().await, Some(1008));
-    // Who has not proved anything sends no long messages, and is not waited for.
-    let (mut socket, _) = Link::challenged(&server).await;
-    socket.send(&"x".repeat(9 * 1024)).await;
-    assert_eq!(socket.closed().await, Some(1008));
-    let (mut socket, _) = Link::challenged(&server).await;
-    assert_eq!(socket.closed().await, Some(1008));
     let plain = demo_server(1).start().await;
     assert_eq!(
         Client::with_headers(&plain.websocket("/slots"), &[]).await.unwrap_err(),
@@ -361,4 +355,31 @@ async fn a_session_server_that_sends_nonsense_disturbs_no_other() {
     }
     let mut client = start(&server, &arm(), &good.pass(slots[0].1)).await;
     client.until("webots:").await;
+}
+
+#[actix_rt::test]
+async fn a_pass_is_valid_over_an_upgrade() {
+    let server = reserving().start().await;
+    let mut link = Link::open(&server).await;
+    link.want(&[(1, 0)]).await;
+    let slots = link.slots().await;
+    let pass = link.pass(slots[0].1);
+    let (succeeds, told) = server.upgrade().await;
+    assert!(succeeds, "{told}");
+    // The session server connects again, to the new process.
+    assert_eq!(link.socket.closed().await, Some(1001));
+    let mut next = Link::open(&server).await;
+    assert_ne!(next.hello.server, link.hello.server);
+    // The promised slot is no other's.
+    next.want(&[(2, 0), (3, 0)]).await;
+    let others = next.slots().await;
+    assert_eq!(others.iter().map(|(ticket, _)| *ticket).collect::<Vec<_>>(), [2]);
+    let mut client = start(&server, &arm(), &pass).await;
+    client.until("webots:").await;
+    let mut other = start(&server, &arm(), &next.pass(others[0].1)).await;
+    other.until("webots:").await;
+    assert_eq!(server.status().await["instances"]["places"], 2);
+    // The slot of the older process is given to the line of the new one.
+    client.close_with(1000).await;
+    assert_eq!(next.slots().await[0].0, 3);
 }

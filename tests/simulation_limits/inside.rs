@@ -10,7 +10,7 @@ use webots_fleet::shared::config;
 use webots_fleet::shared::domain::Stage;
 use webots_fleet::shared::http::ConnectionKind;
 use webots_fleet::shared::run::AppError;
-use webots_fleet::simulation::app::{self, Application};
+use webots_fleet::simulation::app::{self, Application, Origin};
 use webots_fleet::simulation::config::SimulationConfig;
 use webots_fleet::simulation::state::AppState;
 
@@ -36,7 +36,7 @@ impl Inside {
             .config;
         change(&mut config);
         let port = config.port;
-        let assembly = Application::new(config).unwrap();
+        let assembly = Application::new(config, Origin::Start(None)).unwrap();
         let server = Arc::clone(&assembly.server);
         let running = actix_rt::spawn(app::serve(assembly));
         until("the server listens", async || {

@@ -335,6 +335,28 @@ impl Server {
         self.child.try_wait().unwrap()?.code()
     }
 
+    /// Has a simulation server start its program anew. Returns whether it did, and what was printed.
+    pub async fn upgrade(&self) -> (bool, String) {
+        let mut command = tokio::process::Command::new(env!("CARGO_BIN_EXE_simulation-server"));
+        let command = command.arg("upgrade").arg(self.folder.join("config.json"));
+        let done = actix_rt::time::timeout(4 * super::SOON, command.output()).await;
+        let done = done.expect("an upgrade ends").unwrap();
+        let printed = [done.stdout, done.stderr].concat();
+        (done.status.success(), String::from_utf8(printed).unwrap())
+    }
+
+    /// All processes that serve this configuration.
+    pub fn processes(&self) -> Vec<i32> {
+        let file = self.folder.join("config.json");
+        let serves = |one: &procfs::process::Process| {
+            let words = one.cmdline().unwrap_or_default();
+            let is_server = words.first().is_some_and(|program| program.ends_with("-server"));
+            is_server && words.get(1).is_some_and(|word| Path::new(word) == file)
+        };
+        let all = procfs::process::all_processes().unwrap().flatten();
+        all.filter(serves).map(|one| one.pid()).collect()
+    }
+
     /// Waits until the server has ended; returns its exit code.
     pub async fn ended(&mut self) -> Option<i32> {
         let ends = holds_soon(async || self.child.try_wait().unwrap().is_some()).await;
@@ -377,6 +399,9 @@ impl Drop for Server {
     fn drop(&mut self) {
         self.child.kill().ok();
         self.child.wait().ok();
+        for later in self.processes() {
+            kill(Pid::from_raw(later), Signal::SIGKILL).ok();
+        }
         if std::thread::panicking() {
             eprintln!("--- {} on port {} ---\n{}---", self.name, self.port, self.log());
         }

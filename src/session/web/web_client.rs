@@ -4,7 +4,6 @@
 //! latest value, and never the same twice in a row. A text from the client requests a simulation server, at once or when
 //! it is its turn in the line.
 
-use std::hash::{DefaultHasher, Hash, Hasher};
 use std::sync::Arc;
 use std::time::SystemTime;
 
@@ -21,7 +20,7 @@ use super::refusal;
 use crate::session::fleet::{LineEvent, StopWaiting, Wait};
 use crate::session::line::{Place, Progress, Ticket};
 use crate::session::state::{AppState, PLACED, read_world};
-use crate::shared::domain::{Failure, ProjectUrl};
+use crate::shared::domain::Failure;
 use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::websocket::wrong_message;
 use crate::shared::http::{ConnectionPermit, Peer};
@@ -45,9 +44,8 @@ pub struct WebClient {
 }
 
 /// A client that waits in the line.
+#[derive(Default)]
 struct Waiting {
-    /// The hash of the world that it waits for: the world itself is kept once, in the line.
-    world: u64,
     /// The seconds until its turn, as last sent.
     estimate: Option<u32>,
 }
@@ -114,10 +112,7 @@ impl WebClient {
             Ok(world) => world,
             Err(failure) => return Self::refuse(&failure, request.wants_reason, ctx),
         };
-        self.waiting = Some(Waiting {
-            world: hash(&world),
-            estimate: None,
-        });
+        self.waiting = Some(Waiting::default());
         let wait = Wait {
             world,
             ticket: ticket.and_then(|text| Ticket::read(text, &self.server.key, now())),
@@ -166,12 +161,6 @@ impl WebClient {
 fn now() -> u64 {
     let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
     since.map_or(0, |since| u64::try_from(since.as_millis()).unwrap_or(u64::MAX))
-}
-
-fn hash(world: &ProjectUrl) -> u64 {
-    let mut hasher = DefaultHasher::new();
-    world.hash(&mut hasher);
-    hasher.finish()
 }
 
 /// What a client's text requests.
@@ -265,15 +254,14 @@ impl Handler<LineEvent> for WebClient {
                 }
                 waiting.estimate = estimate;
             }
-            // It has asked for another world meanwhile.
-            LineEvent::Turn(turn) if hash(&turn.world) != waiting.world => {}
             LineEvent::Turn(turn) => {
                 if let Some(pass) = turn.pass {
                     ctx.text(format!("pass: {}", pass.write(&self.server.key, &turn.world)));
                 }
                 ctx.text(self.server.client_urls.websocket_url(&turn.server));
                 self.server.picks.with_label_values(&[PLACED]).inc();
-                self.waiting = None;
+                // It may have asked for another world meanwhile.
+                self.stop_waiting();
             }
             LineEvent::TakenOver => {
                 ctx.text("Error: another connection has this place in the line.");

@@ -49,6 +49,12 @@ impl Pass {
         })
     }
 
+    /// The server that has given a pass, as the pass says, which is not verified.
+    pub fn server_of(text: &str) -> Option<ServerRun> {
+        let bytes = URL_SAFE_NO_PAD.decode(text).ok()?;
+        Some(ServerRun(u64::from_be_bytes(*bytes.first_chunk()?)))
+    }
+
     fn numbers(self) -> [u8; 2 * NUMBER] {
         let mut numbers = [0; 2 * NUMBER];
         numbers[..NUMBER].copy_from_slice(&self.server.0.to_be_bytes());
@@ -76,6 +82,7 @@ mod tests {
         };
         let text = pass.write(&key, &world("a"));
         assert_eq!(Pass::read(&text, &key, &world("a")), Some(pass));
+        assert_eq!(Pass::server_of(&text), Some(pass.server));
         assert_eq!(Pass::read(&text, &key, &world("b")), None);
         assert_eq!(Pass::read(&text, &FleetKey::random(), &world("a")), None);
         for wrong in ["", "x", text.strip_suffix(|_| true).unwrap(), &format!("{text}AAAA")] {

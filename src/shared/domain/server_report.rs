@@ -90,6 +90,20 @@ fn prefixes<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<Vec<Url
 }
 
 impl Instances {
+    /// Adds those that another process of the same server has.
+    pub fn add(&mut self, other: &Self) {
+        for (own, others) in [
+            (&mut self.queued, other.queued),
+            (&mut self.starting, other.starting),
+            (&mut self.idle, other.idle),
+            (&mut self.running, other.running),
+            (&mut self.reserved, other.reserved),
+            (&mut self.spare, other.spare),
+        ] {
+            *own = own.saturating_add(others);
+        }
+    }
+
     /// Clients that hold a slot or wait for one.
     pub fn present(&self) -> u32 {
         // Numbers that another server reports may be arbitrarily large.

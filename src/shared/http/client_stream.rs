@@ -6,16 +6,22 @@
 //! actix decodes all requests that it has read before it answers the first. Without this limit, a client that sends
 //! many requests and reads no answer would fill the memory.
 //!
+//! A [`Router`] may tell that a request is for another process of the server, or the first message on a WebSocket. Then
+//! that process gets the connection, with what was read and not answered, and here it has ended.
+//!
 //! Once a request was answered with 101 (Switching Protocols), the connection can be taken from actix, as
 //! `hyper::upgrade` does: bytes that are only copied need no HTTP parser.
 
 use std::cell::RefCell;
 use std::io;
+use std::path::PathBuf;
 use std::pin::Pin;
 use std::rc::Rc;
+use std::sync::Arc;
 use std::task::{Context, Poll, ready};
 
 use actix_http::Extensions;
+use actix_http::ws::Frame;
 use actix_web::HttpRequest;
 use actix_web::rt::net::TcpStream;
 use actix_web::web::{Buf, Bytes, BytesMut};
@@ -24,7 +30,9 @@ use tokio::sync::oneshot;
 use tokio_util::io::poll_read_buf;
 
 use super::limits::ConnectionPermit;
+use super::passing::{self, Owner, Progress, Router};
 use super::routing::MAX_BODY;
+use super::websocket::FrameReader;
 
 /// Size of one read from the socket, in bytes.
 const READ_AT_ONCE: usize = 4 * 1024;
@@ -83,7 +91,6 @@ pub fn upgrade(request: &HttpRequest) -> oneshot::Receiver<Upgraded> {
 }
 
 /// A client's TCP connection.
-#[derive(Debug)]
 pub struct ClientStream {
     /// The connection and its count. `None` once it was handed over.
     connection: Option<(TcpStream, ConnectionPermit)>,
@@ -96,13 +103,31 @@ pub struct ClientStream {
     /// Whether the socket's send buffer is full, because the client does not read.
     is_blocked: bool,
     state: State,
+    router: Option<Arc<dyn Router>>,
+    /// The head of the request for a WebSocket, until its first message tells whose it is.
+    handshake: Option<BytesMut>,
+    /// Whether the client has the answer to its request for a WebSocket from another process.
+    is_answered: bool,
+}
+
+/// What the first message on a WebSocket tells.
+enum First {
+    /// These bytes come before it.
+    After(usize),
+    /// It is for this process.
+    Here,
+    /// It is for another process, which gets the connection.
+    Passed,
 }
 
 impl ClientStream {
     /// A connection that `permit` counts.
-    pub fn new(tcp: TcpStream, permit: ConnectionPermit) -> Self {
+    pub fn new(tcp: TcpStream, permit: ConnectionPermit, router: Option<Arc<dyn Router>>) -> Self {
         Self {
             connection: Some((tcp, permit)),
+            router,
+            handshake: None,
+            is_answered: false,
             upgrade: UpgradeSlot::default(),
             unread: BytesMut::new(),
             heads: HeadFinder::default(),
@@ -110,6 +135,13 @@ impl ClientStream {
             is_blocked: false,
             state: State::Request,
         }
+    }
+
+    /// Goes on with a connection that another process has passed.
+    pub(super) fn going_on(mut self, progress: Progress) -> Self {
+        self.unread = progress.unread;
+        self.is_answered = progress.is_answered;
+        self
     }
 
     /// Called by actix for each new connection, so that its requests find its upgrade slot.
@@ -142,6 +174,91 @@ impl ClientStream {
             }
         }
     }
+}
+
+impl ClientStream {
+    /// Passes the connection on if the request at the start of the unread bytes, with a head of this length, is for another
+    /// process.
+    fn is_passed(&mut self, length: usize) -> bool {
+        let Some(router) = &self.router else { return false };
+        let owner = path(&self.unread).map_or(Owner::This, |path| router.request(path));
+        self.handshake = None;
+        match owner {
+            Owner::This => false,
+            Owner::OfFirstMessage => {
+                self.handshake = self.unread.get(..length).map(BytesMut::from);
+                false
+            }
+            Owner::Other(folder) => {
+                let unread = self.unread.split();
+                self.pass(folder, unread, self.is_answered);
+                true
+            }
+        }
+    }
+
+    fn pass(&mut self, folder: PathBuf, unread: BytesMut, is_answered: bool) {
+        let Some((tcp, permit)) = self.connection.take() else {
+            return;
+        };
+        let progress = Progress { unread, is_answered };
+        actix_web::rt::spawn(async move {
+            if let Err(error) = passing::pass(&folder, &tcp, &progress).await {
+                log::warn!("a connection is lost, the process that serves it has ended: {error}");
+            }
+            drop(permit);
+        });
+    }
+
+    /// Reads the first message on a WebSocket, and passes the connection on if it is for another process.
+    fn poll_first_message(&mut self, context: &mut Context<'_>) -> Poll<io::Result<First>> {
+        loop {
+            let mut frames = FrameReader::default();
+            frames.add(&self.unread);
+            let mut before = 0;
+            loop {
+                match frames.take() {
+                    Ok(Some(Frame::Ping(_) | Frame::Pong(_))) => before = self.unread.len() - frames.unread(),
+                    Ok(Some(Frame::Text(text))) => {
+                        let text = std::str::from_utf8(&text).unwrap_or_default();
+                        let other = self.router.as_ref().and_then(|router| router.message(text));
+                        let Some((folder, mut head)) = other.zip(self.handshake.take()) else {
+                            return Poll::Ready(Ok(First::Here));
+                        };
+                        head.extend_from_slice(&self.unread.split());
+                        self.pass(folder, head, true);
+                        return Poll::Ready(Ok(First::Passed));
+                    }
+                    Ok(None) => break,
+                    // Whoever serves it answers that.
+                    Ok(Some(_)) | Err(_) => return Poll::Ready(Ok(First::Here)),
+                }
+            }
+            if before > 0 {
+                return Poll::Ready(Ok(First::After(before)));
+            }
+            if ready!(self.poll_fill(context))? == 0 {
+                return Poll::Ready(Ok(First::Here));
+            }
+        }
+    }
+
+    /// Passes the answer to a WebSocket that the client has already by, and returns its length.
+    fn skip_answer(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let end = bytes.windows(4).position(|four| four == b"\r\n\r\n");
+        let end = end.filter(|_| bytes.starts_with(SWITCHING_PROTOCOLS));
+        // It is refused here: the client has its WebSocket, and connects again.
+        let end = end.ok_or(io::ErrorKind::ConnectionAborted)?;
+        self.is_answered = false;
+        self.state = State::WebSocket;
+        Ok(end + 4)
+    }
+}
+
+/// The path of the request at the start of these bytes.
+fn path(bytes: &[u8]) -> Option<&str> {
+    let line = bytes.split(|byte| *byte == b'\n').next()?;
+    std::str::from_utf8(line).ok()?.split(' ').nth(1)
 }
 
 /// Finds the head of a request at the start of bytes that arrive piece by piece.
@@ -231,6 +348,9 @@ impl AsyncRead for ClientStream {
                 State::Ended => return Poll::Ready(Ok(())),
                 State::Request => match ready!(self.poll_head(context))? {
                     None => return Poll::Ready(Ok(())),
+                    Some(Front::Request(length) | Front::Last(length)) if self.is_passed(length) => {
+                        return Poll::Ready(Ok(()));
+                    }
                     Some(Front::Request(length)) => {
                         self.left = length;
                         self.state = State::Answer;
@@ -238,6 +358,14 @@ impl AsyncRead for ClientStream {
                     Some(Front::Last(length)) => {
                         self.left = length;
                         self.state = State::Ended;
+                    }
+                },
+                State::WebSocket if self.handshake.is_some() => match ready!(self.poll_first_message(context))? {
+                    First::Passed => return Poll::Ready(Ok(())),
+                    First::After(length) => self.left = length,
+                    First::Here => {
+                        self.handshake = None;
+                        self.left = self.unread.len();
                     }
                 },
                 State::WebSocket if self.unread.is_empty() => return self.tcp()?.poll_read(context, buffer),
@@ -256,6 +384,10 @@ impl AsyncRead for ClientStream {
 
 impl AsyncWrite for ClientStream {
     fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+        if self.is_answered && self.state == State::Answer {
+            context.waker().wake_by_ref();
+            return Poll::Ready(self.skip_answer(bytes));
+        }
         let written = self.tcp()?.poll_write(context, bytes);
         self.is_blocked = written.is_pending();
         if self.state == State::Answer && written.is_ready() {
@@ -264,6 +396,8 @@ impl AsyncWrite for ClientStream {
                 self.state = State::WebSocket;
                 // Thousands of WebSockets are open at a time, and most of them are idle.
                 self.unread = BytesMut::from(&*self.unread);
+            } else {
+                self.handshake = None;
             }
             context.waker().wake_by_ref();
         }

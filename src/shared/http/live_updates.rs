@@ -17,7 +17,7 @@ use serde::Serialize;
 use tokio::sync::{Mutex, watch};
 
 use super::limits::ConnectionPermit;
-use crate::shared::run::{Phase, closing};
+use crate::shared::run::{Phase, leaving};
 
 /// Interval between two renderings.
 const PERIOD: Duration = Duration::from_secs(1);
@@ -93,7 +93,7 @@ impl LiveUpdates {
             .insert_header((header::CACHE_CONTROL, "no-store"))
             // A reverse proxy must not buffer events.
             .insert_header(("X-Accel-Buffering", "no"))
-            .streaming(stream::unfold(page, EventStream::next).take_until(Box::pin(closing(phase))))
+            .streaming(stream::unfold(page, EventStream::next).take_until(Box::pin(leaving(phase))))
     }
 
     /// Returns the latest event, after rendering it again if it is old.

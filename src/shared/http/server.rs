@@ -8,6 +8,8 @@ use std::fmt::Debug;
 use std::future::ready;
 use std::io;
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr, TcpListener};
+use std::os::unix::net::UnixListener;
+use std::sync::Arc;
 use std::thread::available_parallelism;
 use std::time::Duration;
 
@@ -16,12 +18,14 @@ use actix_http::error::DispatchError;
 use actix_http::{HttpService, Request, Response};
 use actix_service::{IntoServiceFactory, ServiceFactory, ServiceFactoryExt, fn_service, map_config};
 use actix_web::dev::{AppConfig, Server};
-use actix_web::rt::net::TcpStream;
+use actix_web::rt::net::{TcpStream, UnixStream};
 use actix_web::rt::task::JoinError;
+use actix_web::rt::time::timeout;
 use socket2::{Domain, SockRef, Socket, TcpKeepalive, Type};
 
 use super::client_stream::ClientStream;
 use super::limits::{ConnectionKind, ConnectionLimiter};
+use super::passing::{self, Router};
 use super::peer::TrustedProxies;
 
 /// Backlog of connections to be accepted. The kernel's own limit applies if it is smaller.
@@ -50,7 +54,7 @@ pub fn listen(address: SocketAddr) -> io::Result<TcpListener> {
 }
 
 /// Options of a server's connections.
-#[derive(Debug, Clone)]
+#[derive(Clone)]
 pub struct HttpServerOptions {
     /// Limit of connections; further ones wait in the kernel's queue, where they need no open files.
     pub max_connections: usize,
@@ -60,14 +64,27 @@ pub struct HttpServerOptions {
     pub stop: Duration,
     /// Proxies, to which the limits per address do not apply.
     pub trusted_proxies: TrustedProxies,
+    /// Tells which connections are for other processes.
+    pub router: Option<Arc<dyn Router>>,
 }
 
-/// Serves an app on a port.
+/// Where connections come from.
+pub enum Source {
+    /// Clients open them.
+    Port(TcpListener),
+    /// Other processes of the server pass them on.
+    Door(UnixListener),
+}
+
+/// Time for which another process may take to pass a connection.
+const PASSING: Duration = Duration::from_secs(10);
+
+/// Serves an app.
 ///
 /// # Errors
 /// When the system does not let the port be used.
 pub fn serve<F, I, S, B>(
-    port: TcpListener,
+    source: Source,
     connections: ConnectionLimiter,
     options: HttpServerOptions,
     app: F,
@@ -81,27 +98,38 @@ where
     S::Response: Into<Response<B>>,
     B: MessageBody + 'static,
 {
-    let threads = available_parallelism().map_or(1, usize::from);
+    let threads = match source {
+        Source::Port(_) => available_parallelism().map_or(1, usize::from),
+        Source::Door(_) => 1,
+    };
     let server = Server::build()
         .workers(threads)
         .max_concurrent_connections((options.max_connections / threads).max(1));
     let server = server.disable_signals().shutdown_timeout(options.stop.as_secs());
     let stops = server.graceful_shutdown_signal();
-    let server = server.listen("http", port, move || {
+    let http = move || {
         let app = app().into_factory().map_err(|error| error.into().error_response());
-        let connections = connections.clone();
-        let options = options.clone();
         let stops = stops.clone();
-        let http = HttpService::build()
+        HttpService::build()
             // When the server stops, idle connections end at once.
             .graceful_shutdown_signal(move || {
                 let stops = stops.clone();
                 async move { stops.notified().await }
             })
             .on_connect_ext(ClientStream::on_connect)
-            .h1(map_config(app, |()| AppConfig::default()));
-        fn_service(move |tcp| ready(accept(tcp, &connections, &options))).and_then(http)
-    })?;
+            .h1(map_config(app, |()| AppConfig::default()))
+    };
+    let server = match source {
+        Source::Port(port) => server.listen("http", port, move || {
+            let (connections, options) = (connections.clone(), options.clone());
+            fn_service(move |tcp| ready(accept(tcp, &connections, &options))).and_then(http())
+        })?,
+        Source::Door(door) => server.listen_uds("door", door, move || {
+            let (connections, options) = (connections.clone(), options.clone());
+            let accept = move |from| accept_passed(from, connections.clone(), options.clone());
+            fn_service(accept).and_then(http())
+        })?,
+    };
     Ok(server.run())
 }
 
@@ -133,5 +161,17 @@ fn accept(
     let seconds = options.silence.as_secs().clamp(1, 3600);
     let probes = TcpKeepalive::new().with_time(Duration::from_secs(seconds));
     socket.set_tcp_keepalive(&probes.with_interval(Duration::from_secs(seconds.div_ceil(3))))?;
-    Ok((ClientStream::new(tcp, permit), Some(address)))
+    Ok((ClientStream::new(tcp, permit, options.router.clone()), Some(address)))
+}
+
+/// Accepts a connection from another process.
+async fn accept_passed(
+    from: UnixStream,
+    connections: ConnectionLimiter,
+    options: HttpServerOptions,
+) -> Result<(ClientStream, Option<SocketAddr>), DispatchError> {
+    let taken = timeout(PASSING, passing::take(from)).await;
+    let (tcp, progress) = taken.map_err(io::Error::other)??;
+    let (stream, address) = accept(tcp, &connections, &options)?;
+    Ok((stream.going_on(progress), address))
 }

@@ -2,6 +2,7 @@
 
 mod logging;
 mod open_files;
+pub mod passing;
 pub mod permanent;
 mod rotated_file;
 pub mod service_manager;
@@ -12,6 +13,6 @@ mod timestamp;
 
 pub use open_files::{limit_clients, raise_open_files};
 pub use rotated_file::RotatedFile;
-pub use signals::{Phase, ServerCommand, Signals, closing};
+pub use signals::{Phase, ServerCommand, Signals, closing, leaving};
 pub use start::AppError;
 pub use timestamp::{seconds_since_1970, timestamp, timestamp_in_milliseconds};

@@ -13,6 +13,11 @@ pub fn ready(port: u16) {
     ]);
 }
 
+/// Reports that this process is the server's main one from now on. Only the one that was so far may.
+pub fn main_process(pid: u32) {
+    send(&[NotifyState::MainPid(pid)]);
+}
+
 /// Reports that the server stops in an orderly way, and why.
 pub fn stopping(why: &str) {
     send(&[NotifyState::Stopping, NotifyState::Status(why)]);

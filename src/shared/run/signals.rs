@@ -59,8 +59,16 @@ pub enum Phase {
     Open,
     /// It keeps its clients, and accepts no new ones.
     Draining,
+    /// The same, and another process of this server has its port.
+    Superseded,
     /// It stops: connections are closed.
     Closing,
+}
+
+/// Waits until a server is closing, or another process has its port: whoever connects again finds a server.
+pub async fn leaving(mut phase: tokio::sync::watch::Receiver<Phase>) {
+    let is_leaving = |phase: &Phase| matches!(phase, Phase::Superseded | Phase::Closing);
+    phase.wait_for(is_leaving).await.ok();
 }
 
 /// Waits until a server is closing.

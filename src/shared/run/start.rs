@@ -3,6 +3,7 @@
 use std::fs::{File, TryLockError};
 use std::io::{self, Read, Write};
 use std::mem::ManuallyDrop;
+use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -73,18 +74,18 @@ pub fn conclude<C: Configuration>(loaded: &LoadedConfig<C>) -> ExitCode {
     }
 }
 
-/// Writes the PID file if requested, starts the log (without a file on standard output), and runs a server to its end.
-pub fn serve(
-    log: Option<&Path>,
-    options: &CommonArgs,
-    warnings: &[String],
-    server: impl Future<Output = Result<(), AppError>>,
-) -> ExitCode {
-    // The file is locked until the end of the process.
-    let _pid_file = match options.pid_file.as_deref().map(write_pid).transpose() {
-        Ok(file) => file,
-        Err(error) => return failed(&format!("the process id can't be written: {error}")),
-    };
+/// Writes the PID file if requested, and locks it (`flock`) until the returned file is closed. The kernel closes it when
+/// the process ends for any reason.
+///
+/// # Errors
+/// The exit code, when it can't be written, or another server holds it.
+pub fn claim_pid_file(options: &CommonArgs) -> Result<Option<File>, ExitCode> {
+    let claimed = options.pid_file.as_deref().map(claim).transpose();
+    claimed.map_err(|error| failed(&format!("the process id can't be written: {error}")))
+}
+
+/// Starts the log (without a file on standard output), and runs a server to its end.
+pub fn serve(log: Option<&Path>, warnings: &[String], server: impl Future<Output = Result<(), AppError>>) -> ExitCode {
     if let Err(error) = logging::start(log) {
         let log = log.unwrap_or(Path::new("to standard output"));
         return failed(&format!("the log {} can't be written: {error}", log.display()));
@@ -105,9 +106,7 @@ pub fn serve(
     }
 }
 
-/// Writes the process id to a file, and locks the file (`flock`) until the returned file is closed. The kernel closes
-/// it when the process ends for any reason.
-fn write_pid(path: &Path) -> io::Result<File> {
+fn claim(path: &Path) -> io::Result<File> {
     let mut file = File::options()
         .read(true)
         .write(true)
@@ -126,9 +125,17 @@ fn write_pid(path: &Path) -> io::Result<File> {
         }
         Err(TryLockError::Error(error)) => return Err(error),
     }
-    file.set_len(0)?;
-    writeln!(file, "{}", std::process::id())?;
+    write_pid(&file)?;
     Ok(file)
+}
+
+/// Writes the process id to a PID file.
+///
+/// # Errors
+/// When the disk is full or broken.
+pub fn write_pid(file: &File) -> io::Result<()> {
+    file.set_len(0)?;
+    file.write_all_at(format!("{}\n", std::process::id()).as_bytes(), 0)
 }
 
 /// Reports to the log, standard output and the service manager that a server is reachable: its HTTP URL and its
@@ -140,7 +147,8 @@ pub fn announce(server: &str, http: &str, websocket: &str, port: u16) {
     service_manager::ready(port);
 }
 
-fn failed(why: &str) -> ExitCode {
+/// Prints why a program has failed. Returns its exit code.
+pub fn failed(why: &str) -> ExitCode {
     eprintln!("error: {why}");
     ExitCode::from(FAILED)
 }

@@ -16,7 +16,7 @@ use super::commit_resolver::CommitResolver;
 use super::git::{Git, timed_out};
 use super::project::Project;
 use super::repository::{CheckoutError, Repository, Unreadable, failed};
-use super::repository_cache::{CacheDir, RepositoryCache};
+use super::repository_cache::RepositoryCache;
 use super::revision::Tip;
 use super::{file_restore, redirect, steps, work_tree};
 use crate::shared::domain::{AdmissionRules, Failure, ProjectUrl, Reason};
@@ -53,14 +53,14 @@ pub struct Tips {
 const COPIES: usize = 16;
 
 impl CheckoutService {
-    /// Prepares checkouts, which run on the current runtime. `run` is the directory of this run of the server; `rules`
+    /// Prepares checkouts below `cacheDir`, which run on the current runtime. `run` is the directory of this run of the server; `rules`
     /// limit redirects of Git hosts.
     ///
     /// # Errors
     /// When the cache can't be created.
-    pub fn open(dir: CacheDir, run: &Path, config: Arc<SimulationConfig>, rules: AdmissionRules) -> io::Result<Self> {
+    pub fn open(cache: &Path, run: &Path, config: Arc<SimulationConfig>, rules: AdmissionRules) -> io::Result<Self> {
         let git = Arc::new(Git::new(run, Arc::clone(&config)));
-        let cache = RepositoryCache::open(dir, git)?;
+        let cache = RepositoryCache::open(cache, git)?;
         let resolver = Arc::new(CommitResolver::new(cache, Arc::clone(&config), rules));
         let runtime = Handle::current();
         let copies = Semaphore::new(COPIES);

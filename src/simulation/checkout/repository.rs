@@ -4,13 +4,16 @@
 //! What git prints is passed on to the client, and decides nothing: it contains names that projects choose.
 
 use std::ffi::OsStr;
+use std::fs::{File, TryLockError};
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 use std::sync::{Arc, mpsc};
+use std::time::Duration;
 
 use parking_lot::Mutex;
 use rustix::process::Resource;
+use sha2::{Digest, Sha256};
 use tokio::sync::Semaphore;
 
 use super::disk::{has_unfinished_pack, remove_leftovers, spawn_blocking_io};
@@ -78,6 +81,30 @@ pub const REMOTE: &str = "origin";
 const ANY: [&str; 5] = ["ls-remote", "--quiet", "--", REMOTE, "HEAD"];
 /// Number of concurrent queries of a remote for one repository.
 const MAX_QUERIES: usize = 4;
+
+/// Interval between two attempts to get a lock that another process has.
+const BETWEEN_ATTEMPTS: Duration = Duration::from_millis(50);
+
+/// Waits until no other process of this server fetches into the repository at this path, and keeps them from it until
+/// the returned file is closed. There are 256 locks; repositories that share one wait for each other.
+async fn lock_among_processes(path: &Path) -> io::Result<File> {
+    let hash = Sha256::digest(path.as_os_str().as_encoded_bytes());
+    let name = hex::encode(hash.first_chunk::<1>().unwrap_or(&[0]));
+    let folder = path.ancestors().nth(2).unwrap_or(path).join("locks");
+    std::fs::create_dir_all(&folder)?;
+    let file = File::options()
+        .write(true)
+        .create(true)
+        .truncate(false)
+        .open(folder.join(name))?;
+    loop {
+        match file.try_lock() {
+            Ok(()) => return Ok(file),
+            Err(TryLockError::WouldBlock) => actix_rt::time::sleep(BETWEEN_ATTEMPTS).await,
+            Err(TryLockError::Error(error)) => return Err(error),
+        }
+    }
+}
 
 impl Repository {
     /// The repository at `path`, which need not exist yet, for commits of `remote`.
@@ -155,6 +182,7 @@ impl Repository {
                 lines.send("waiting for another fetch".to_owned());
                 Arc::clone(&this.lock).lock_owned().await
             };
+            let among_processes = lock_among_processes(&this.path).await?;
             this.has_grown.store(true, Relaxed);
             let on_line = |line: &str| {
                 if line.contains('%') {
@@ -164,7 +192,7 @@ impl Repository {
             this.fetch_now(&arguments, on_line).await?;
             // Packs the repository, within a timeout. Only the next fetch waits for that.
             tokio::spawn(async move {
-                let _guard = guard;
+                let _guards = (guard, among_processes);
                 let call = Run {
                     time: stall_timeout(&this.git.config),
                     ..this.call(&["gc", "--auto", "--quiet"])
@@ -335,7 +363,7 @@ impl Repository {
     /// # Errors
     /// When it can't be moved aside.
     pub async fn discard(&self, generation: u64) -> io::Result<u64> {
-        let guard = self.lock.lock().await;
+        let guard = (self.lock.lock().await, lock_among_processes(&self.path).await?);
         let current = self.generation();
         if current != generation {
             return Ok(current);

@@ -5,6 +5,7 @@
 use std::collections::HashMap;
 use std::fs::File;
 use std::io;
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Weak, mpsc};
 use std::time::{Duration, Instant, SystemTime};
@@ -16,13 +17,14 @@ use super::disk::{spawn_blocking_io, sum};
 use super::git::Git;
 use super::repository::Repository;
 use crate::simulation::config::Remote;
-use crate::simulation::process::{disk_usage, remove_tree};
+use crate::simulation::process::{disk_usage, has_several_runs, remove_tree};
 
-/// The directory `cacheDir`, which only one server may use: locked until this is dropped or the process exits.
+/// The directory `cacheDir`, which only one server may use.
 pub struct CacheDir {
     /// Its canonical path.
     pub folder: PathBuf,
-    _lock: File,
+    /// Locks it until this is closed, here and where it was passed to.
+    pub lock: File,
 }
 
 /// The cached repositories of a server.
@@ -33,9 +35,10 @@ pub struct RepositoryCache {
     in_use: Mutex<HashMap<PathBuf, Weak<Repository>>>,
     /// Signals that a repository has grown, and is no longer in use.
     growth: mpsc::Sender<()>,
-    _dir: CacheDir,
 }
 
+/// The file that is locked.
+const LOCK: &str = "lock";
 /// Contents of a repository: single commits.
 pub const COMMITS: &str = "";
 /// Contents of a repository: the commits of all branches and tags, without files if the remote supports that.
@@ -47,18 +50,28 @@ const LOCK_WAIT: Duration = Duration::from_secs(1);
 const RETRY_INTERVAL: Duration = Duration::from_millis(20);
 
 impl CacheDir {
-    /// Creates the directory if necessary, and locks it. Blocks for up to a second, which is acceptable during start.
+    /// Creates the directory if necessary, and locks it, unless the process before has passed its lock (`passed`). Blocks
+    /// for up to a second, which is acceptable during start.
     ///
     /// # Errors
-    /// When the directory can't be created, or another server uses it.
-    pub fn claim(folder: &Path) -> io::Result<Self> {
+    /// When the directory can't be created, or another server uses it, or the lock is that of another directory.
+    pub fn claim(folder: &Path, passed: Option<File>) -> io::Result<Self> {
         std::fs::create_dir_all(folder)?;
         let folder = folder.canonicalize()?;
+        if let Some(lock) = passed {
+            let here = std::fs::metadata(folder.join(LOCK))?;
+            let of_lock = lock.metadata()?;
+            return if (here.dev(), here.ino()) == (of_lock.dev(), of_lock.ino()) {
+                Ok(Self { folder, lock })
+            } else {
+                Err(io::Error::other("it has changed, which needs a stop and a start"))
+            };
+        }
         let lock = File::options()
             .write(true)
             .create(true)
             .truncate(false)
-            .open(folder.join("lock"))?;
+            .open(folder.join(LOCK))?;
         let deadline = Instant::now() + LOCK_WAIT;
         while let Err(error) = lock.try_lock() {
             if Instant::now() > deadline {
@@ -67,17 +80,17 @@ impl CacheDir {
             }
             std::thread::sleep(RETRY_INTERVAL);
         }
-        Ok(Self { folder, _lock: lock })
+        Ok(Self { folder, lock })
     }
 }
 
 impl RepositoryCache {
-    /// Opens the cache in `dir`, and starts the thread that keeps it within its budget.
+    /// Opens the cache in `cacheDir`, and starts the thread that keeps it within its budget.
     ///
     /// # Errors
     /// When its directory can't be created, or there is no thread.
-    pub fn open(dir: CacheDir, git: Arc<Git>) -> io::Result<Arc<Self>> {
-        let folder = dir.folder.join("git");
+    pub fn open(cache: &Path, git: Arc<Git>) -> io::Result<Arc<Self>> {
+        let folder = cache.join("git");
         std::fs::create_dir_all(&folder)?;
         let (growth, grown) = mpsc::channel();
         let cache = Arc::new(Self {
@@ -85,7 +98,6 @@ impl RepositoryCache {
             git,
             in_use: Mutex::default(),
             growth,
-            _dir: dir,
         });
         let kept = Arc::downgrade(&cache);
         let keep = move || keep_within_budget(&kept, &grown);
@@ -127,6 +139,9 @@ impl RepositoryCache {
 
     /// Evicts unused repositories until the others fit into the budget. Blocks.
     fn shrink(&self) {
+        if self.folder.parent().is_some_and(has_several_runs) {
+            return;
+        }
         let mut all: Vec<(SystemTime, u64, PathBuf)> = Vec::new();
         for entry in std::fs::read_dir(&self.folder).into_iter().flatten().flatten() {
             if let Ok(used) = entry.metadata().and_then(|about| about.modified()) {

@@ -15,7 +15,7 @@ use super::docker::{Docker, SHORT_TIMEOUT, daemon_fault};
 use super::failures::{of_project, on_thread, refused_by_docker};
 use super::image::Images;
 use super::network;
-use super::owned_resources::{ProjectGuard, ResourceOwner, sweep_all};
+use super::owned_resources::{ProjectGuard, ResourceOwner, sweep_except};
 use super::packet_filter;
 use super::simulation_containers::SimulationContainers;
 use super::webots_yml::ProjectKind;
@@ -23,6 +23,7 @@ use crate::shared::domain::Failure;
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::process::process_tree::is_connected;
 use crate::simulation::progress::{OnProgress, Progress, Step};
+use crate::simulation::run_id::RunId;
 
 /// Creates the containers of simulations.
 pub struct ContainerService {
@@ -45,14 +46,14 @@ const CREATE_TIMEOUT: Duration = Duration::from_mins(2);
 
 impl ContainerService {
     /// Opens the service on the current runtime. `run` is the directory of this run of the server. Removes what
-    /// an earlier run has left. Blocks for a moment.
+    /// earlier runs have left, except those that live. Blocks for a moment.
     ///
     /// # Errors
     /// When Docker or compose is not installed, as text for an administrator.
-    pub fn open(config: Arc<SimulationConfig>, run: &Path) -> Result<Self, String> {
+    pub fn open(config: Arc<SimulationConfig>, run: &Path, living: &[RunId]) -> Result<Self, String> {
         let docker = Docker::find(run)?;
         let owner = ResourceOwner::of(&config.cache_dir.0);
-        sweep_all(&owner);
+        sweep_except(&owner, living);
         let shortcoming = packet_filter::missing();
         if let Some(why) = &shortcoming {
             log::warn!("{why}");

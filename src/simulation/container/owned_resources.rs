@@ -11,6 +11,7 @@ use sha2::{Digest, Sha256};
 use tokio::runtime::Handle;
 
 use super::docker::{DockerError, SHORT_TIMEOUT, docker_output};
+use crate::simulation::run_id::RunId;
 
 /// The owner of compose projects and images: a server, or one run of it. Their names contain the owner:
 /// 12 hexadecimal digits for a server, and `-` and 8 more for a run.
@@ -45,9 +46,13 @@ impl ResourceOwner {
         Self(name)
     }
 
-    /// One run of this server: resources of the next run have another owner.
+    fn of_run(&self, run: RunId) -> Self {
+        Self(format!("{}-{run}", self.0))
+    }
+
+    /// This run of this server: resources of the next run have another owner.
     pub fn run(&self) -> Self {
-        Self(format!("{}-{:08x}", self.0, rand::random::<u32>()))
+        self.of_run(RunId::own())
     }
 
     /// A new name for the compose project of a simulation on this port.
@@ -108,11 +113,22 @@ impl Drop for ProjectGuard {
 
 /// Removes all containers of an owner. The next start removes what is left. Blocks.
 pub fn sweep_all(owner: &ResourceOwner) {
-    sweep(&owner.prefix()).ok();
+    sweep_except(owner, &[]);
+}
+
+/// Removes all containers of a server, except those of these runs. The next start removes what is left. Blocks.
+pub fn sweep_except(server: &ResourceOwner, living: &[RunId]) {
+    let kept: Vec<String> = living.iter().map(|run| server.of_run(*run).prefix()).collect();
+    let prefix = server.prefix();
+    remove(|name| name.starts_with(&prefix) && !kept.iter().any(|kept| name.starts_with(kept))).ok();
 }
 
 /// Removes the containers whose names begin like this. Blocks.
 fn sweep(prefix: &str) -> Result<(), DockerError> {
+    remove(|name| name.starts_with(prefix))
+}
+
+fn remove(is_chosen: impl Fn(&str) -> bool) -> Result<(), DockerError> {
     let list = docker_output(
         &[
             "ps",
@@ -124,7 +140,7 @@ fn sweep(prefix: &str) -> Result<(), DockerError> {
         ],
         SHORT_TIMEOUT,
     )?;
-    let names: Vec<&str> = list.lines().filter(|name| name.starts_with(prefix)).collect();
+    let names: Vec<&str> = list.lines().filter(|name| is_chosen(name)).collect();
     if !names.is_empty() {
         docker_output(&[&REMOVE, names.as_slice()].concat(), SHORT_TIMEOUT)?;
     }

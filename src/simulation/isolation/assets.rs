@@ -22,6 +22,7 @@ use parking_lot::Mutex;
 use sha2::{Digest, Sha256};
 
 use crate::simulation::process::disk_usage::DiskRoom;
+use crate::simulation::process::has_several_runs;
 
 /// The assets of all repositories.
 pub struct AssetCache {
@@ -129,6 +130,9 @@ impl AssetCache {
 
     /// Evicts the assets of repositories not in use, least recently used first, until the others fit into the limit.
     fn shrink(&self) {
+        if self.folder.parent().is_some_and(has_several_runs) {
+            return;
+        }
         let mut all: Vec<(SystemTime, u64, PathBuf)> = Vec::new();
         for entry in fs::read_dir(&self.folder).into_iter().flatten().flatten() {
             if let Ok(used) = entry.metadata().and_then(|about| about.modified()) {

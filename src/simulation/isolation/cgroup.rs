@@ -177,6 +177,12 @@ fn own_folder() -> Option<PathBuf> {
         .ok()
         .filter(|path| !path.as_os_str().is_empty())?;
     let folder = mount.mount_point.join(below);
+    // A process that takes over from another is in the group that that has made for itself, and divides no other.
+    if let Some(parent) = folder.parent().filter(|_| folder.ends_with(OWN))
+        && std::fs::read_to_string(parent.join("cgroup.subtree_control")).is_ok_and(|all| !all.trim().is_empty())
+    {
+        return Some(parent.to_owned());
+    }
     let inside = std::fs::read_to_string(folder.join("cgroup.procs")).ok()?;
     let is_alone = inside.lines().eq(std::iter::once(me.pid().to_string().as_str()));
     is_alone.then_some(folder)

@@ -8,7 +8,6 @@
 //! the longer a tick takes, the longer the pause after it.
 
 use std::io;
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::time::{Duration, Instant};
@@ -49,13 +48,7 @@ impl DiskMonitor {
         };
         std::thread::Builder::new()
             .name("disk-monitor".to_owned())
-            .spawn(move || {
-                // Without this thread no limit of the disk would hold: the server aborts, and the service manager restarts it.
-                let run = AssertUnwindSafe(|| table.run(&receiver));
-                if catch_unwind(run).is_err() {
-                    std::process::abort();
-                }
-            })?;
+            .spawn(move || table.run(&receiver))?;
         Ok(Self(watches))
     }
 

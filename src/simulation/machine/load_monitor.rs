@@ -164,7 +164,10 @@ impl LoadMonitor {
             gpu: &gpu,
         };
         let values = COLUMNS.map(|column| column.rounded(&sample)).to_vec();
-        if let Some(path) = &self.csv {
+        // Once another process has the port, that writes them.
+        if let Some(path) = &self.csv
+            && !self.slots.is_superseded()
+        {
             // On a full disk, only these lines are lost.
             append(path, &values).ok();
         }

@@ -3,7 +3,9 @@
 //! there before the first of them, and needs no other thread on a machine that has none to spare.
 
 use std::ffi::OsString;
+use std::fs::{DirBuilder, File, TryLockError};
 use std::io;
+use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc;
 use std::time::Duration;
@@ -11,10 +13,13 @@ use std::time::Duration;
 use super::process_group::ExitReason;
 use super::process_tree;
 use super::runner::Run;
+use crate::simulation::run_id::RunId;
 
-/// The directory of one run of the server: `runs/run-*` in `cacheDir`. It contains a directory for each simulation.
+/// The directory of one run of the server: `runs/run-*` in `cacheDir`. It contains a directory for each simulation. Its
+/// process holds a lock on it (`flock`), which the kernel releases when that ends.
 pub struct RunDir {
     path: PathBuf,
+    _lock: File,
     /// The thread that removes the directories of simulations.
     remover: mpsc::Sender<PathBuf>,
 }
@@ -34,18 +39,24 @@ const PAUSE: Duration = Duration::from_secs(1);
 const LIMIT: Duration = Duration::from_mins(10);
 
 impl RunDir {
-    /// Creates the directory of this run below `cache`, and removes what earlier runs have left there. Only for the
-    /// server that owns `cache`: the processes of every other run are killed.
+    /// Creates the directory of this run below `cache`, and removes what runs have left there whose process has ended.
+    /// Returns also the runs that live. Only for the server that owns `cache`: the processes of dead runs are killed.
     ///
     /// # Errors
     /// When the directory can't be created, or there is no thread.
-    pub fn open(cache: &Path) -> io::Result<Self> {
-        let runs = cache.join("runs");
+    pub fn open(cache: &Path) -> io::Result<(Self, Vec<RunId>)> {
+        let runs = runs_in(cache);
         std::fs::create_dir_all(&runs)?;
         // Marks of processes are compared with this path, so it must be canonical.
         let runs = runs.canonicalize()?;
         let mut dead = 0;
+        let mut living = Vec::new();
         for run in std::fs::read_dir(&runs)?.flatten() {
+            let id = run.file_name().to_str().and_then(RunId::with_folder);
+            if let Some(id) = id.filter(|_| is_alive(&run.path())) {
+                living.push(id);
+                continue;
+            }
             dead += 1;
             process_tree::kill_marked(&run.path());
             remove(&run.path());
@@ -55,8 +66,16 @@ impl RunDir {
         }
         let (remover, folders) = mpsc::channel();
         std::thread::Builder::new().spawn(move || remove_each(&folders))?;
-        let path = tempfile::Builder::new().prefix("run-").tempdir_in(&runs)?.keep();
-        Ok(Self { path, remover })
+        let path = runs.join(RunId::own().folder());
+        DirBuilder::new().mode(0o700).create(&path)?;
+        let lock = File::open(&path)?;
+        lock.lock()?;
+        let run = Self {
+            path,
+            _lock: lock,
+            remover,
+        };
+        Ok((run, living))
     }
 
     /// Creates a directory for a simulation, with the directory of its project inside.
@@ -109,6 +128,23 @@ impl Drop for InstanceDir {
         // A project may contain many files, and this may run on an actor's thread. The receiver lives as long as senders.
         self.remover.send(std::mem::take(&mut self.path)).ok();
     }
+}
+
+/// The directory with those of all runs.
+pub fn runs_in(cache: &Path) -> PathBuf {
+    cache.join("runs")
+}
+
+/// Whether the process of the run with this directory lives.
+pub fn is_alive(run: &Path) -> bool {
+    File::open(run).is_ok_and(|folder| matches!(folder.try_lock(), Err(TryLockError::WouldBlock)))
+}
+
+/// Whether more than one process of the server with this cache lives. Then none evicts anything from it: each knows only
+/// what it uses itself.
+pub fn has_several_runs(cache: &Path) -> bool {
+    let runs = std::fs::read_dir(runs_in(cache)).into_iter().flatten().flatten();
+    runs.filter(|run| is_alive(&run.path())).nth(1).is_some()
 }
 
 /// Removes each of these directories, until the last sender is gone.

@@ -11,7 +11,7 @@ mod runner;
 
 pub use disk_usage::DiskRoom;
 pub use guardian::Guardian;
-pub use instance_dir::{InstanceDir, RunDir, remove_tree};
+pub use instance_dir::{InstanceDir, RunDir, has_several_runs, is_alive, remove, remove_tree, runs_in};
 pub use lines::Lines;
 pub use own_fault::{disk_fault, own_call_failed, start_fault};
 pub use process_group::{ExitReason, ProcessGroup, SpawnSpec};

@@ -4,7 +4,7 @@
 //! receives its position in the queue until a port is granted. Dropping the lease leaves the queue or frees the port, so
 //! that neither leaks in any state or after any panic.
 
-use std::collections::{BTreeMap, HashMap, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::net::IpAddr;
 use std::ops::RangeInclusive;
 use std::sync::Arc;
@@ -20,7 +20,7 @@ use super::simulation_record::{Party, SimulationRecord, SlotEvent, SpareKind};
 use crate::shared::domain::{Failure, Instances, Reason, ReservationId, Stage, View, Wish, Wishes};
 use crate::simulation::ends::Ends;
 use crate::simulation::simulation_id::SimulationId;
-use crate::simulation::snapshot::{Simulation, Snapshot};
+use crate::simulation::snapshot::{Holdings, Simulation, Snapshot};
 
 /// The slots of this server, and the simulations that have one or wait for one.
 pub struct SlotPool(pub(super) Mutex<Slots>);
@@ -43,6 +43,10 @@ pub(super) struct Slots {
     /// All simulations in the order in which they were requested. Those without a port are the queue.
     pub(super) records: BTreeMap<SimulationId, SimulationRecord>,
     ends: Ends,
+    /// What processes of this server have that serve their last clients.
+    others: Holdings,
+    /// The ports that are left once another process has all others.
+    left: Option<BTreeSet<u16>>,
 }
 
 /// Interval between two checks of reservations.
@@ -75,6 +79,8 @@ impl SlotPool {
             real_time: RealTimePlaces::default(),
             records: BTreeMap::new(),
             ends,
+            others: Holdings::default(),
+            left: None,
         })))
     }
 
@@ -91,6 +97,54 @@ impl SlotPool {
                 slots.serve();
             }
         }
+    }
+
+    /// Other processes of this server have these ports and simulations, and no others.
+    pub fn set_others(&self, others: Holdings) {
+        let mut slots = self.0.lock();
+        slots.others = others;
+        slots.serve();
+    }
+
+    /// Another process has all ports from now on, except those that are taken here, until they are free. Returns what is
+    /// left here.
+    pub fn supersede(&self) -> Holdings {
+        {
+            let mut slots = self.0.lock();
+            slots.left = Some(slots.taken().collect());
+            slots.others = Holdings::default();
+        }
+        self.holdings()
+    }
+
+    /// Whether another process has the ports that become free.
+    pub fn is_superseded(&self) -> bool {
+        self.0.lock().left.is_some()
+    }
+
+    /// What this process has.
+    pub fn holdings(&self) -> Holdings {
+        let mut slots = self.0.lock();
+        if slots.left.is_some() && slots.queue().next().is_none() {
+            // Nobody here needs those that have become free.
+            slots.left = Some(slots.taken().collect());
+        }
+        Holdings {
+            ports: slots.left.clone().unwrap_or_else(|| slots.taken().collect()),
+            instances: slots.own_instances(),
+            simulations: slots.of_clients().cloned().collect(),
+        }
+    }
+
+    /// Whether this process has no simulation, none waits, and no slot is reserved.
+    pub fn is_empty(&self) -> bool {
+        let slots = self.0.lock();
+        slots.records.is_empty() && slots.reservations.reserved.is_empty()
+    }
+
+    /// Whether this process has the simulation with this id.
+    pub fn has(&self, id: &str) -> bool {
+        self.0.lock().of_clients().any(|one| one.id.to_string() == id)
     }
 
     /// A session server has connected, for whose line slots are reserved.
@@ -220,21 +274,29 @@ impl SlotPool {
         self.0.lock().instances()
     }
 
-    /// All simulations at this moment.
+    /// All simulations at this moment, those of processes that serve their last clients first.
     pub fn snapshot(&self) -> Snapshot {
         let slots = self.0.lock();
-        let (spares, of_clients): (Vec<_>, Vec<_>) =
-            slots.records.values().partition(|record| record.spare().is_some());
-        let simulations = of_clients.into_iter().map(|record| record.simulation.clone()).collect();
         Snapshot {
             instances: slots.instances(),
-            simulations,
-            spares: spares.len(),
+            simulations: slots
+                .others
+                .simulations
+                .iter()
+                .chain(slots.of_clients())
+                .cloned()
+                .collect(),
         }
     }
 }
 
 impl Slots {
+    /// The simulations that have a client.
+    fn of_clients(&self) -> impl Iterator<Item = &Simulation> {
+        let of_clients = self.records.values().filter(|record| record.spare().is_none());
+        of_clients.map(|record| &record.simulation)
+    }
+
     fn queue(&self) -> impl Iterator<Item = &SimulationRecord> {
         self.records.values().filter(|record| record.simulation.port.is_none())
     }
@@ -339,14 +401,14 @@ impl Slots {
         self.real_time.places().map_or(all, |places| places.min(all))
     }
 
-    /// The slots that clients have, or that are reserved for them. That of a simulation without a client is as good as free,
+    /// The slots that clients have, or that are reserved for them, or that other processes of this server have. That of a simulation without a client is as good as free,
     /// unless it is promised.
     pub(super) fn used(&self) -> usize {
         let of_clients = self
             .records
             .values()
             .filter(|record| record.simulation.port.is_some() && record.spare().is_none());
-        of_clients.count() + self.reservations.reserved.len()
+        of_clients.count() + self.reservations.reserved.len() + self.others.ports.len()
     }
 
     /// Whether another client may have a slot, which may be that of a simulation without a client.
@@ -451,15 +513,26 @@ impl Slots {
         leased.chain(reserved)
     }
 
-    /// The lowest port that is neither leased nor reserved nor used by another program.
+    /// The lowest port that is neither leased nor reserved nor that of another process of this server, nor used by another
+    /// program.
     pub(super) fn free_port(&self) -> Option<u16> {
         let taken: HashSet<u16> = self.taken().collect();
+        let is_others = |port: &u16| {
+            let has_left = self.left.as_ref().is_some_and(|left| !left.contains(port));
+            has_left || self.others.ports.contains(port)
+        };
         self.ports
             .clone()
-            .find(|port| !taken.contains(port) && port::is_free(*port))
+            .find(|port| !taken.contains(port) && !is_others(port) && port::is_free(*port))
     }
 
     fn instances(&self) -> Instances {
+        let mut instances = self.own_instances();
+        instances.add(&self.others.instances);
+        instances
+    }
+
+    fn own_instances(&self) -> Instances {
         let count = |stages: &[Stage]| {
             let matching = self
                 .records
