@@ -11,7 +11,8 @@ readonly USAGE='usage: ./server.sh start|stop|restart|status [NAME]
 
   start    builds the programs if needed, starts the servers of NAME that do not run and waits until they answer
   stop     ends the servers of NAME; without NAME, all that run
-  restart  stops and starts the servers of NAME; without NAME, all that run
+  restart  starts the servers of NAME anew; without NAME, all that run. No simulation ends: the simulation server before
+           serves its simulations until their clients leave. A changed port, bind or cacheDir needs stop and start
   status   tells what runs, and where: exit code 0 if it does, 3 if not
 
 NAME stands for config/simulation/NAME.json and config/session/NAME.json; without it, start takes local.'
@@ -130,8 +131,11 @@ start() { # NAME
             missing+=("$server")
         fi
     done
-    ((${#missing[@]} > 0)) || fail 1 "${others%$'\n'}; './server.sh restart $1' starts it anew"
-    printf %s "${others-}"
+    if ((${#missing[@]} == 0)); then
+        [[ $action != restart ]] || return 0
+        fail 1 "${others%$'\n'}; './server.sh restart $1' starts it anew"
+    fi
+    [[ $action == restart ]] || printf %s "${others-}"
     publish "$1" || fail 1 "no git repository could be made of config/$1"
     for server in "${missing[@]}"; do
         started=("$server" "${started[@]}")
@@ -163,6 +167,16 @@ stop() { # NAME [SERVER...]; without SERVER, all of NAME
     ! $nothing || echo "nothing of $1 runs"
 }
 
+# Has a running simulation server hand over to a new process, and stops the session server.
+renew() { # NAME
+    local said
+    if pid_of "simulation/$1" >/dev/null; then
+        said=$("$BIN/simulation-server" upgrade "config/simulation/$1.json") || return
+        echo "the simulation server of $1 runs anew: $said"
+    fi
+    ! pid_of "session/$1" >/dev/null || stop "$1" "session/$1"
+}
+
 status() { # NAME
     local server pid code=0
     for server in $(servers "$1"); do
@@ -187,6 +201,7 @@ for_each() { # ACTION
 if (($# < 1 || $# > 2)) || [[ $1 != @(start|stop|restart|status) ]]; then
     fail 2 "$USAGE"
 fi
+readonly action=$1
 cd "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")" || exit 1
 [[ ! -x bin/session-server ]] || FLEET_BIN=${FLEET_BIN:-$PWD/bin}
 readonly BIN=${FLEET_BIN:-$PWD/target/release}
@@ -202,5 +217,5 @@ fi
 exec 9<server.sh
 flock --nonblock 9 || echo 'waiting for another ./server.sh that is at work'
 flock --timeout 120 9 || fail 1 'another ./server.sh is still at work'
-[[ $1 != restart ]] || for_each stop
-for_each "${1#re}"
+[[ $action != restart ]] || for_each renew || exit
+for_each "${action#re}"

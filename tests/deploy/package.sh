@@ -25,6 +25,11 @@ filters() {
     in_machine nft list table inet webots_fleet >/dev/null 2>&1
 }
 
+# How many processes of the simulation server have control groups for their simulations.
+control_groups() {
+    in_machine grep --count 'each simulation gets a control group' /var/log/webots-simulation/simulation/output.log || true
+}
+
 user_property() { # UNIT NAME
     as_lab systemctl --user show --property="$2" --value "$1"
 }
@@ -128,53 +133,54 @@ main() {
     echo 'upgrades: configurations are kept, simulations run on'
     in_machine sed -i 's/"maxConnections": 20/"maxConnections": 7/' /etc/webots-fleet/simulation/main.json
     old=$(property webots-simulation@main MainPID)
-    local old_session
+    local old_session groups
+    groups=$(control_groups)
+    ((groups > 0)) || fail 'simulations have no control groups'
     old_session=$(property webots-session@main MainPID)
     spared_by_needrestart_begins
     install_package 2 -o Dpkg::Options::=--force-confold >"$WORK/install.log" || fail "$(<"$WORK/install.log")"
     [[ $(in_machine dpkg-query --show webots-fleet) == *999.0.0-2 ]] || fail 'it is not upgraded'
     is_later /usr/share/webots-fleet/nginx.conf || fail 'the examples are the old ones'
     in_machine grep --quiet '"maxConnections": 19' /etc/webots-fleet/simulation/main.json.dpkg-dist || fail 'the new example is not there'
-    grep --quiet 'webots-simulation@main.service runs on as it was' "$WORK/install.log" || fail "$(<"$WORK/install.log")"
+    grep --quiet 'webots-simulation@main.service runs anew' "$WORK/install.log" || fail "$(<"$WORK/install.log")"
     in_machine grep --quiet '"maxConnections": 7' /etc/webots-fleet/simulation/main.json || fail 'the configuration is lost'
-    [[ $(property webots-simulation@main MainPID) == "$old" ]] || fail 'the simulation server was restarted'
+    local new
+    new=$(property webots-simulation@main MainPID)
+    [[ $new != "$old" ]] || fail 'the simulation server has not handed over'
+    is_later "/proc/$new/exe" || fail 'it is the old program'
+    (($(control_groups) == groups + 1)) || fail 'the simulations of the new process have no control groups'
     [[ $(property webots-session@main MainPID) != "$old_session" ]] || fail 'the session server was not restarted'
     is_later "/proc/$(property webots-session@main MainPID)/exe" || fail 'the session server is the old one'
     ! is_later "/proc/$old/exe" || fail 'the packages do not differ'
-    spared_by_needrestart_ends "$old"
+    spared_by_needrestart_ends "$new"
     filters || fail 'the packet filter is gone'
     runs demo-simulator || fail 'the simulation is gone'
     eventually hears_more "$(stat --format=%s "$WORK/client.log")"
 
-    echo 'renews the simulation server when its last simulation has ended'
-    in_machine webots-fleet-renew main >"$WORK/renew.log" &
-    local renewal=$!
-    eventually drains
-    sleep 2
-    runs demo-simulator || fail 'the simulation was lost'
-    eventually hears_more "$(stat --format=%s "$WORK/client.log")"
-    leave
-    wait "$renewal" || fail "it was not renewed: $(<"$WORK/renew.log")"
-    [[ $(property webots-simulation@main MainPID) != "$old" ]] || fail 'it is the old one'
-    is_later "/proc/$(property webots-simulation@main MainPID)/exe" || fail 'it is the old program'
+    echo 'serves the simulation by the old process until its client leaves, and others by the new one'
     answers 2000 /status '"places":7' || fail 'it has not read its configuration'
+    answers 2000 /status '"stage":"\(idle\|running\)"' || fail 'the simulation is not shown'
     # A machine that is busy otherwise makes it full.
     eventually answers 1999 /status '"state":"\(up\|full\)"'
+    in_machine webots-fleet-renew main >"$WORK/renew.log" 2>&1 || fail "it was not renewed: $(<"$WORK/renew.log")"
+    eventually is_another webots-simulation@main "$new"
+    eventually hears_more "$(stat --format=%s "$WORK/client.log")"
+    in_machine test -e "/proc/$old" || fail 'the old process has ended before its client'
+    leave
+    eventually in_machine test ! -e "/proc/$old"
+    [[ $(property webots-simulation@main ActiveState) == active ]] || fail 'the server has ended with its old process'
 
-    echo 'leaves alone what an administrator does during a renewal'
-    for act in stop restart; do
-        simulate https://github.com/cyberbotics/demo/blob/main/worlds/a.wbt &
-        eventually runs demo-simulator
-        in_machine webots-fleet-renew main >"$WORK/renew.log" 2>&1 &
-        renewal=$!
-        eventually drains
-        in_machine systemctl "$act" webots-simulation@main
-        old=$(property webots-simulation@main MainPID)
-        wait "$renewal" || fail "it has failed: $(<"$WORK/renew.log")"
-        [[ $(property webots-simulation@main MainPID) == "$old" ]] || fail "a server was started after '$act'"
-        [[ $act != stop ]] || grep --quiet 'was stopped meanwhile' "$WORK/renew.log" || fail "$(<"$WORK/renew.log")"
-        in_machine systemctl start webots-simulation@main
-    done
+    echo 'ends all its processes when it is stopped'
+    simulate https://github.com/cyberbotics/demo/blob/main/worlds/a.wbt &
+    eventually runs demo-simulator
+    old=$(property webots-simulation@main MainPID)
+    in_machine systemctl reload webots-simulation@main
+    eventually is_another webots-simulation@main "$old"
+    in_machine test -e "/proc/$old" || fail 'the old process has ended'
+    in_machine systemctl stop webots-simulation@main
+    in_machine test ! -e "/proc/$old" || fail 'the old process lives on'
+    ! runs demo-simulator || fail 'a simulation lives on'
+    in_machine systemctl start webots-simulation@main
 
     echo 'renews nothing whose configuration is wrong'
     old=$(property webots-simulation@main MainPID)

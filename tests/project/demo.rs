@@ -96,11 +96,29 @@ async fn the_demo_runs_from_its_start_to_its_stop() {
             .await
             .contains("demo: the session server runs")
     );
-    let before = project.pid("session", "demo");
-    project.done(&["restart"]).await;
-    assert_ne!(before, project.pid("session", "demo"));
+    let before = ["session", "simulation"].map(|kind| project.pid(kind, "demo"));
+    let (mut client, url) = simulate(&project).await;
+    let mut viewer = Client::connect(&url).await.with_running_scene().await;
+    let told = project.done(&["restart"]).await;
+    let after = ["session", "simulation"].map(|kind| project.pid(kind, "demo"));
+    assert!(before[0] != after[0] && before[1] != after[1], "{before:?} {after:?}");
+    let words = format!(
+        "process {} serves its 1 simulations until their clients leave",
+        before[1]
+    );
+    assert!(told.contains(&words), "{told}");
+    // The simulation goes on, and is stopped with the server.
+    let time = viewer.time().await;
+    while viewer.time().await <= time {}
+    project.configure("simulation/demo", |config| config["port"] = 1.into());
+    let refused = project.server_sh(&["restart", "demo"]).await;
+    assert_eq!(refused.code, Some(1), "{refused:#?}");
+    assert!(refused.errors.contains("needs a stop and a start"), "{refused:#?}");
+    assert_eq!(after, ["session", "simulation"].map(|kind| project.pid(kind, "demo")));
+    project.configure("simulation/demo", |config| config["port"] = simulation.into());
     let stopped = project.done(&["stop"]).await;
     assert!(stopped.contains("stopped the session server") && stopped.contains("stopped the simulation server"));
+    assert_eq!(client.closed().await, Some(1001));
     nothing_is_left(&project).await;
     assert_eq!(project.server_sh(&["status"]).await.code, Some(3));
     assert_eq!(project.server_sh(&["status", "demo"]).await.code, Some(3));
