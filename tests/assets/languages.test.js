@@ -67,6 +67,7 @@ test('the pages and the element have the English words that they name, and no ot
   const used = new Set();
   for (const path of [
     'page.html',
+    'name_field.html',
     'session/viewer.html',
     'session/embedded.html',
     'simulation/watch.html',

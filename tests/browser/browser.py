@@ -87,18 +87,20 @@ class Page:
         parts = (urllib.parse.urlsplit(url) for url in self.asked)
         return {part.hostname for part in parts if part.scheme not in ("data", "blob", "about")}
 
-    def faults(self):
-        """The serious and critical violations that axe-core finds."""
+    def faults(self, frame=None):
+        """The serious and critical violations that axe-core finds, in the page or in a frame of it."""
         # Console messages of axe-core itself are not errors of the page.
         complaints = list(self.complaints)
-        violations = Axe().run(self.tab).response["violations"]
+        violations = Axe().run(frame or self.tab).response["violations"]
         self.complaints[:] = complaints
         grave = [one for one in violations if one["impact"] in ("serious", "critical")]
         return [f"{one['id']}: {node['html'][:200]} {node['failureSummary']}" for one in grave for node in one["nodes"]]
 
-    def overflow(self):
-        """The number of pixels by which the page is wider than the window."""
-        return self.tab.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
+    def overflow(self, frame=None):
+        """The number of pixels by which the page, or a frame of it, is wider than its window."""
+        return (frame or self.tab).evaluate(
+            "document.documentElement.scrollWidth - document.documentElement.clientWidth"
+        )
 
     def look(self, scheme, width):
         """Changes the colour scheme and the width of the window."""

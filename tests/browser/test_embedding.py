@@ -1,6 +1,5 @@
 """The pages that docs/embedding.md prints, served from another site."""
 
-import itertools
 import os
 import re
 import sys
@@ -9,12 +8,50 @@ import urllib.request
 
 from case import BrowserTest
 from firefox import MISSING, Firefox
-from fleet import SOON, WORLD, Fleet, free_ports, until
+from fleet import SOON, WORLD, free_ports, until
 from playwright.sync_api import expect
 from site_of_others import Site, printed
 
 SHOWN = "[data-step=simulation].done"
+# A phone, a page at 200 %, and a phone at 200 %, in turns: each language has another size in the other scheme.
+SIZES = [
+    {"width": 390, "height": 800},
+    {"width": 640, "height": 450, "device_scale_factor": 2},
+    {"width": 195, "height": 400, "device_scale_factor": 2},
+]
+LANGUAGES = ["en", "de", "fr", "es", "zh", "ja"]
+LOOKS = [
+    (SIZES[(number + turn) % 3], language, scheme)
+    for turn, scheme in enumerate(["light", "dark"])
+    for number, language in enumerate(LANGUAGES)
+]
 in_firefox = unittest.skipIf(MISSING, MISSING)
+
+
+class Network:
+    """What is between a page and the WebSockets `/client` of simulation servers."""
+
+    def __init__(self, page):
+        self.is_broken, self.sockets = False, []
+        page.tab.route_web_socket(re.compile("/client$"), self.take)
+
+    def take(self, socket):
+        self.sockets.append((socket, None if self.is_broken else socket.connect_to_server()))
+
+    def breaks(self):
+        """Closes all connections; new ones are opened and carry nothing."""
+        self.is_broken = True
+        self.close()
+
+    def works(self):
+        self.is_broken = False
+        self.close()
+
+    def close(self):
+        for socket, server in self.sockets:
+            for end in filter(None, (socket, server)):
+                end.close(code=4000)
+        self.sockets.clear()
 
 
 class Embedding(BrowserTest):
@@ -39,6 +76,10 @@ class Embedding(BrowserTest):
         self.addCleanup(lambda: self.may_complain or self.assertEqual(tab.complaints, [], "the console"))
         tab.goto(self.site.put(name, text))
         return tab, lambda name, selector: f"document.getElementById('{name}')?.shadowRoot?.querySelector('{selector}')"
+
+    def in_order(self, page, frame=None):
+        self.assertEqual(page.faults(frame), [])
+        self.assertLessEqual(page.overflow(frame), 0, "pixels too wide")
 
     def simulations(self):
         """The simulations of all servers."""
@@ -190,31 +231,27 @@ class PrintedPages(Embedding):
         until("all have ended", lambda: not self.simulations())
 
     def test_the_element_is_in_order_in_all_languages_and_both_schemes_narrow_and_enlarged(self):
-        languages = ["en", "de", "fr", "es", "zh", "ja"]
-        for number, (language, scheme) in enumerate(itertools.product(languages, ["light", "dark"])):
+        for size, language, scheme in LOOKS:
             with self.subTest(language, scheme=scheme):
                 text = printed("A page").replace('id="robot"', f'id="robot" lang="{language}"')
-                # Every second one as a phone, the others at 200 %.
-                options = (
-                    {"width": 390, "height": 800}
-                    if number % 2
-                    else {"width": 640, "height": 450, "device_scale_factor": 2}
-                )
-                page = self.visit("page", text, scheme=scheme, **options)
+                page = self.open("about:blank", scheme=scheme, **size)
+                network = Network(page)
+                page.tab.goto(self.site.put("page", text))
                 expect(page.tab.locator("#availability.on")).to_be_visible()
                 self.in_order(page)
                 page.tab.locator("[part=start]").click()
                 expect(page.tab.locator(SHOWN)).to_be_visible()
                 self.in_order(page)
+                network.breaks()
+                expect(page.tab.locator("[data-is=lost]")).to_be_visible()
+                self.in_order(page)
+                network.works()
+                expect(page.tab.locator("[data-is=running]")).to_be_visible()
                 page.tab.locator("[part=leave]").click()
                 expect(page.tab.locator("[part=start]")).to_be_focused()
                 page.tab.evaluate(f"document.getElementById('robot').start('{WORLD.format('missing')}')")
                 expect(page.tab.locator("#problem")).to_be_visible()
                 self.in_order(page)
-
-    def in_order(self, page):
-        self.assertEqual(page.faults(), [])
-        self.assertLessEqual(page.overflow(), 0, "pixels too wide")
 
     def test_all_that_a_page_loads_has_40_kib_compressed(self):
         text = printed("A page").replace('id="robot"', 'id="robot" lang="ja"')
@@ -352,31 +389,32 @@ class Refused(Embedding):
 
 class InAFrame(Embedding):
     @classmethod
-    def make_fleet(cls):
-        # The port of the site is known only later.
-        return Fleet()
+    def setUpClass(cls):
+        super().setUpClass()
+        # The port of the site is known only now.
+        cls.framed = cls.framing("framed")
+
+    @classmethod
+    def framing(cls, name, **config):
+        """A session server that the site may frame."""
+        servers = {"simulationServers": [cls.fleet.simulation.address], "loadRefresh": 0.2, "loadThreshold": 1000}
+        named = {"port": free_ports(1), "frameAncestors": [cls.site.origin]}
+        return cls.fleet.start("session-server", name, {**servers, **named, **config})
+
+    def course(self, server, query="", **options):
+        """A page with the printed frame, of this server, and its frame once it is there."""
+        text = f"<!DOCTYPE html><html lang='en'><title>Course</title><main><h1>Course</h1>{printed('A frame')}</main>"
+        text = text.replace("https://simulations.example.org", server.url("").rstrip("/"))
+        page = self.visit("course", text.replace("embed=1", f"embed=1{query}"), **options)
+        expect(page.tab.frame_locator("iframe").locator("#availability.on")).to_be_visible()
+        return page, page.tab.frames[1]
 
     def test_only_a_site_that_is_listed_may_frame_the_viewer(self):
-        page = printed("A frame")
-        text = f"<!DOCTYPE html><html lang='en'><title>Course</title><main><h1>Course</h1>{page}</main>"
         self.may_complain = True
+        text = f"<!DOCTYPE html><html lang='en'><title>Course</title><main>{printed('A frame')}</main>"
         refused = self.visit("course", text)
         until("the browser says why", lambda: any("frame-ancestors" in one for one in refused.complaints))
-        allowed = self.fleet.start(
-            "session-server",
-            "framed",
-            {
-                "port": free_ports(1),
-                "simulationServers": [self.fleet.simulation.address],
-                "loadRefresh": 0.2,
-                "loadThreshold": 1000,
-                "frameAncestors": [self.site.origin],
-            },
-        )
-        text = text.replace("https://simulations.example.org", allowed.url("").rstrip("/"))
-        page = self.visit("course", text)
-        frame = page.tab.frame_locator("iframe")
-        expect(frame.locator("#availability.on")).to_be_visible()
+        page, frame = self.course(self.framed)
         self.assertEqual(page.faults(), [])
         frame.get_by_role("button", name="Connect").click()
         expect(frame.locator(SHOWN)).to_be_visible()
@@ -385,6 +423,36 @@ class InAFrame(Embedding):
         frame.get_by_role("button", name="Disconnect").click()
         until("it is gone", lambda: not self.simulations())
         self.assertEqual(page.complaints, [])
+
+    def test_the_frame_is_in_order_in_all_languages_and_both_schemes_narrow_and_enlarged(self):
+        for size, language, scheme in LOOKS:
+            with self.subTest(language, scheme=scheme):
+                page, frame = self.course(self.framed, f"&amp;lang={language}", scheme=scheme, **size)
+                self.in_order(page, frame)
+                frame.locator("[part=start]").click()
+                expect(frame.locator(SHOWN)).to_be_visible()
+                self.in_order(page, frame)
+                frame.locator("[part=leave]").click()
+                expect(frame.locator("[part=start]")).to_be_focused()
+                frame.evaluate(f"document.getElementById('simulation').start('{WORLD.format('missing')}')")
+                expect(frame.locator("#problem")).to_be_visible()
+                self.in_order(page, frame)
+
+    def test_the_frame_asks_for_a_name_and_starts_nothing_without_where_one_is_required(self):
+        page, frame = self.course(self.framing("naming", askName="required"), "&amp;start=1")
+        name = frame.get_by_label("Your name")
+        name.fill(" ")
+        frame.locator("[part=start]").click()
+        expect(name).to_be_focused()
+        self.assertFalse(name.evaluate("(field) => field.validity.valid"))
+        self.assertEqual(self.simulations(), [])
+        name.fill("Anna")
+        frame.locator("[part=start]").click()
+        expect(frame.locator(SHOWN)).to_be_visible()
+        self.assertIn('calls itself "Anna"', self.fleet.simulation.log.read_text())
+        frame.locator("[part=leave]").click()
+        until("it is gone", lambda: not self.simulations())
+        self.in_order(page, frame)
 
 
 if __name__ == "__main__":
