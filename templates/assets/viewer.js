@@ -103,6 +103,27 @@ if (form instanceof HTMLFormElement) {
   simulation.addEventListener('ready', () => simulation.scrollIntoView({ block: 'nearest' }));
 }
 
+/* the field for the name, which stands above the element in such a frame */
+
+if (!form && nameField instanceof HTMLInputElement) {
+  nameField.addEventListener('change', () => {
+    keepName(nameField.value.trim());
+    simulation.setAttribute('name', nameField.value.trim());
+  });
+  // Before the button of the element does it.
+  place.addEventListener('click', startsWithName, { capture: true });
+}
+
+/** @param {Event} event */
+function startsWithName(event) {
+  const isStart = event.composedPath().some((part) => part instanceof Element && part.part.contains('start'));
+  if (isStart && nameField instanceof HTMLInputElement && lacksName()) {
+    nameField.value = '';
+    nameField.reportValidity();
+    event.stopPropagation();
+  }
+}
+
 /**
  * While a simulation runs, links open in a new tab, because leaving the page could end it.
  * @param {boolean} opensTabs

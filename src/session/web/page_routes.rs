@@ -101,7 +101,12 @@ async fn viewer(request: HttpRequest, server: web::Data<AppState>) -> HttpRespon
     let script = server.config.viewer_script.as_ref().map(url::Url::as_str);
     if request.query_string().split('&').any(|one| one == "embed=1") {
         let policy = framed_by(VIEWER, &server.config.frame_ancestors);
-        return html(Embedded { script }.render(), &policy);
+        let page = Embedded {
+            asks_name: user.is_none(),
+            needs_name: config.ask_name == AskName::Required,
+            script,
+        };
+        return html(page.render(), &policy);
     }
     html(
         Viewer {

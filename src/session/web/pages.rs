@@ -90,6 +90,10 @@ pub struct Viewer<'config> {
 #[derive(Template)]
 #[template(path = "session/embedded.html")]
 pub struct Embedded<'config> {
+    /// Whether it asks for the visitor's name.
+    pub asks_name: bool,
+    /// Whether the visitor must give one.
+    pub needs_name: bool,
     /// URL of Webots' own viewer, if `viewerScript` is set.
     pub script: Option<&'config str>,
 }
