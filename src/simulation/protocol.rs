@@ -42,21 +42,32 @@ use crate::simulation::attachment::Token;
 use crate::simulation::progress::{Progress, Step};
 use crate::simulation::snapshot::SceneKind;
 
-/// The requests in a message, of which only one takes effect; unknown fields are ignored.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Deserialize)]
+/// What a message requests.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum ClientRequest {
+    /// To restore this file below `controllers/`.
+    ResetController(String),
+    /// To resume the simulation of this token.
+    Resume(String),
+    /// To start a simulation.
+    Start(Start),
+    /// To restart the idle timeout of a paused simulation.
+    Keep,
+    /// Nothing that is known.
+    Nothing,
+}
+
+/// The known fields of a message, of which the first one takes effect; unknown ones are ignored.
+#[derive(Default, Deserialize)]
 #[serde(default)]
-pub struct ClientRequest {
-    /// Restore this file below `controllers/`.
+struct Fields {
     #[serde(rename = "reset controller", deserialize_with = "value")]
-    pub reset_controller: Option<String>,
-    /// Resume the simulation of this token.
+    reset_controller: Option<String>,
     #[serde(deserialize_with = "value")]
-    pub resume: Option<String>,
-    /// Restart the idle timeout of a paused simulation.
-    pub keep: bool,
-    /// Start a simulation.
+    resume: Option<String>,
     #[serde(deserialize_with = "value")]
-    pub start: Option<Start>,
+    start: Option<Start>,
+    keep: bool,
 }
 
 /// A simulation that a client requests.
@@ -119,9 +130,14 @@ impl ClientRequest {
     pub fn parse(text: &str) -> Result<Self, ClientRequestError> {
         let message: Value = serde_json::from_str(text).map_err(|_| ClientRequestError("it is no JSON".to_owned()))?;
         if !message.is_object() {
-            return Ok(Self::default());
+            return Ok(Self::Nothing);
         }
-        serde_path_to_error::deserialize(message).map_err(|error| ClientRequestError(error.to_string()))
+        let fields: Result<Fields, _> = serde_path_to_error::deserialize(message);
+        let fields = fields.map_err(|error| ClientRequestError(error.to_string()))?;
+        let reset = fields.reset_controller.map(Self::ResetController);
+        let named = reset.or(fields.resume.map(Self::Resume));
+        let named = named.or(fields.start.map(Self::Start));
+        Ok(named.unwrap_or(if fields.keep { Self::Keep } else { Self::Nothing }))
     }
 }
 
@@ -348,13 +364,8 @@ mod tests {
                 name: name.map(str::to_owned),
                 pass: None,
             };
-            ClientRequest {
-                start: Some(start),
-                ..ClientRequest::default()
-            }
+            ClientRequest::Start(start)
         };
-        let nothing = ClientRequest::default();
-        let file = Some("a/a.py".to_owned());
         let table = [
             (r#"{"start":{"url":"https://x"}}"#, start(None, None, None)),
             (
@@ -373,26 +384,11 @@ mod tests {
                 r#"{"start":{"url":"https://x","name":"Anna"}}"#,
                 start(None, None, Some("Anna")),
             ),
-            (
-                r#"{"resume":"any text"}"#,
-                ClientRequest {
-                    resume: Some("any text".to_owned()),
-                    ..nothing.clone()
-                },
-            ),
-            (
-                r#"{"keep":true}"#,
-                ClientRequest {
-                    keep: true,
-                    ..nothing.clone()
-                },
-            ),
+            (r#"{"resume":"any text"}"#, ClientRequest::Resume("any text".to_owned())),
+            (r#"{"keep":true}"#, ClientRequest::Keep),
             (
                 r#"{ "reset controller" : "a/a.py" }"#,
-                ClientRequest {
-                    reset_controller: file,
-                    ..nothing
-                },
+                ClientRequest::ResetController("a/a.py".to_owned()),
             ),
         ];
         for (text, request) in table {
@@ -407,7 +403,7 @@ mod tests {
             r#""start""#,
             r#"{"keep":false}"#,
         ] {
-            assert_eq!(ClientRequest::parse(text), Ok(ClientRequest::default()), "{text}");
+            assert_eq!(ClientRequest::parse(text), Ok(ClientRequest::Nothing), "{text}");
         }
     }
 

@@ -146,6 +146,7 @@ export const words = {
   },
   scene: {
     'no-frame': '无法显示 Webots 视图：其服务器不允许本网站的页面嵌入它（配置项 frameAncestors）。',
+    'not-loaded': '无法显示场景：此页面的一部分无法加载。请重新加载页面。',
     'no-webgl': '无法显示场景：此浏览器没有 WebGL，不能绘图。',
     unreadable: '无法显示场景：仿真器发送的场景无法读取。',
   },

@@ -174,6 +174,7 @@ export const words = {
   /** Why a scene can't be shown. */
   scene: {
     'no-frame': 'Webots’ viewer can’t be shown: its server lets no pages of this site frame it (key frameAncestors).',
+    'not-loaded': 'The scene can’t be shown: a part of this page could not be loaded. Load the page again.',
     'no-webgl': 'The scene can’t be shown: this browser offers no WebGL, so that nothing can be drawn.',
     unreadable: 'The scene can’t be shown: the simulator has sent a scene that can’t be read.',
   },

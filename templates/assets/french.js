@@ -155,6 +155,8 @@ export const words = {
   scene: {
     'no-frame':
       'La vue de Webots ne peut pas être affichée : son serveur n’accepte pas de cadre dans les pages de ce site (clé frameAncestors).',
+    'not-loaded':
+      'La scène ne peut pas être affichée : une partie de cette page n’a pas été chargée. Rechargez la page.',
     'no-webgl': 'La scène ne peut pas être affichée : ce navigateur n’a pas WebGL et ne peut rien dessiner.',
     unreadable: 'La scène ne peut pas être affichée : le simulateur a envoyé une scène illisible.',
   },

@@ -156,6 +156,8 @@ export const words = {
   scene: {
     'no-frame':
       'Die Ansicht von Webots kann nicht gezeigt werden: Ihr Server erlaubt keine Rahmen auf Seiten dieser Website (Schlüssel frameAncestors).',
+    'not-loaded':
+      'Die Szene lässt sich nicht zeigen: Ein Teil dieser Seite war nicht zu laden. Laden Sie die Seite neu.',
     'no-webgl': 'Die Szene lässt sich nicht zeigen: Dieser Browser hat kein WebGL und kann nichts zeichnen.',
     unreadable: 'Die Szene lässt sich nicht zeigen: Der Simulator hat eine unlesbare Szene gesendet.',
   },

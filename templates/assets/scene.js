@@ -14,7 +14,7 @@ import { shape } from './shapes.js';
 /** @typedef {{ position: number[], orientation: number[], angle?: number }} Viewpoint */
 
 /** Why a scene can't be shown.
- * @typedef {'no-webgl' | 'unreadable' | 'no-frame'} SceneProblem
+ * @typedef {'no-webgl' | 'unreadable' | 'no-frame' | 'not-loaded'} SceneProblem
  */
 
 export class SceneError extends Error {

@@ -155,6 +155,8 @@ export const words = {
   scene: {
     'no-frame':
       'No se puede mostrar la vista de Webots: su servidor no admite marcos en páginas de este sitio (clave frameAncestors).',
+    'not-loaded':
+      'No se puede mostrar la escena: no se ha cargado una parte de esta página. Vuelva a cargar la página.',
     'no-webgl': 'No se puede mostrar la escena: este navegador no tiene WebGL y no puede dibujar nada.',
     unreadable: 'No se puede mostrar la escena: el simulador ha enviado una escena ilegible.',
   },

@@ -9,6 +9,8 @@ const REPORT = 2000;
 const HERE = 'webots-viewer';
 /** Least time between two signs of life that are passed on, in milliseconds. */
 const HEARD = 500;
+/** How long a simulation server may take to say whether it has Webots' viewer, in ms. */
+const ANSWER = 3000;
 
 /** @typedef {import('./visit.js').Event} VisitEvent */
 /** @typedef {Extract<import('./visit.js').Effect, { do: 'show' }>} Show */
@@ -209,7 +211,7 @@ export class Stage {
 async function ownViewer(server) {
   const base = server.startsWith('ws') ? `http${server.slice('ws'.length)}` : server;
   try {
-    const { viewer } = await (await fetch(`${base}/status`)).json();
+    const { viewer } = await (await fetch(`${base}/status`, { signal: AbortSignal.timeout(ANSWER) })).json();
     return viewer ? `${base}/${viewer}` : undefined;
   } catch {
     // Another kind of server, without a viewer.

@@ -118,7 +118,10 @@ export class VisitRunner {
       case 'store':
         return this.#store.keep(effect.kept);
       case 'show':
-        stage.show(effect, { ...this.#choices(), say: (text) => this.#panel.say(text) });
+        // A module that is not there yet could not be loaded: the session server may be restarting.
+        stage
+          .show(effect, { ...this.#choices(), say: (text) => this.#panel.say(text) })
+          .catch(() => this.take({ type: 'sceneFailed', why: 'not-loaded' }));
         return undefined;
       case 'freeze':
         return stage.freeze();

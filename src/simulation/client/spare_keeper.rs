@@ -132,7 +132,11 @@ impl SpareKeeper {
             }
         }
         if memory(&readings) >= limit + SCARCE
-            && let Some(one) = spares.values().flatten().max_by_key(|one| (!one.is_ready, one.id))
+            && let Some(one) = spares
+                .values()
+                .flatten()
+                .filter(|one| !one.is_reserved)
+                .max_by_key(|one| (!one.is_ready, one.id))
         {
             self.server.slots.end_spare(one.id);
         }
@@ -175,7 +179,7 @@ impl SpareKeeper {
     /// Asks the remote of each repository whose turn it is. One that is not wanted now is only kept in the cache.
     fn ask_remotes(&mut self, wanted: &BTreeMap<SpareKind, u32>, ctx: &mut Context<Self>) {
         let interval = self.server.config.timing.branches;
-        let limit = self.server.load();
+        let load = self.server.load();
         for (repository, watched) in &mut self.repositories {
             if watched.asked.is_some_and(|asked| asked.elapsed() < interval) {
                 continue;
@@ -186,7 +190,7 @@ impl SpareKeeper {
             let is_due = of_repository.clone().any(|(_, count)| *count > 0);
             let refused = worlds
                 .iter()
-                .find_map(|world| self.server.rules.admit(world, limit).err());
+                .find_map(|world| self.server.rules.admit(world, load).err());
             if let Some(refused) = refused {
                 for (kind, _) in of_repository {
                     self.server
@@ -253,7 +257,7 @@ impl SpareKeeper {
         }
     }
 
-    /// Counts a failed start, and tells it if it is the first in a row.
+    /// Counts a failed start, and logs the first one until failures are forgotten.
     fn failed(&mut self, kind: &SpareKind, failure: &Failure) {
         let Some(world) = self.worlds.get_mut(kind) else { return };
         let now = Instant::now();

@@ -117,34 +117,15 @@ impl WebClient {
             Err(wrong) => return self.reject(&wrong.into(), CloseCode::Normal, ctx),
         };
         match (request, &self.session) {
-            (
-                ClientRequest {
-                    reset_controller: Some(file),
-                    ..
-                },
-                Some(_),
-            ) => {
-                self.send(ClientAction::ResetController(file));
-            }
-            (
-                ClientRequest {
-                    reset_controller: Some(_),
-                    ..
-                },
-                _,
-            ) => {
+            (ClientRequest::ResetController(file), Some(_)) => self.send(ClientAction::ResetController(file)),
+            (ClientRequest::ResetController(_), None) => {
                 for text in protocol::failure(&protocol::nothing_to_reset()) {
                     ctx.text(text);
                 }
             }
-            (
-                ClientRequest {
-                    resume: Some(token), ..
-                },
-                None,
-            ) => self.resume(&token, ctx),
-            (ClientRequest { keep: true, .. }, Some(_)) => self.send(ClientAction::Keep),
-            (ClientRequest { start: Some(start), .. }, None) => {
+            (ClientRequest::Resume(token), None) => self.resume(&token, ctx),
+            (ClientRequest::Keep, Some(_)) => self.send(ClientAction::Keep),
+            (ClientRequest::Start(start), None) => {
                 let identity = ClientIdentity::new(self.user.as_deref(), start.name.as_deref());
                 // Sent only if the session panics: otherwise it sends an end itself.
                 let connection = self.attach(lost(), ctx);

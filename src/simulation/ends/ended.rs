@@ -8,7 +8,7 @@ use crate::simulation::snapshot::Simulation;
 
 /// The resources that a simulation has used, as far as they are known.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Taken {
+pub struct ResourceUsage {
     /// Its peak memory, in bytes.
     pub memory: Option<u64>,
     /// Its processor time.
@@ -21,7 +21,7 @@ pub struct End {
     /// Why it has ended.
     pub failure: Failure,
     /// The resources that it has used.
-    pub taken: Taken,
+    pub taken: ResourceUsage,
 }
 
 /// A simulation that has ended.
@@ -44,7 +44,7 @@ impl From<Failure> for End {
     fn from(failure: Failure) -> Self {
         Self {
             failure,
-            taken: Taken::default(),
+            taken: ResourceUsage::default(),
         }
     }
 }

@@ -6,7 +6,7 @@ mod ends;
 mod kept_output;
 mod stop_reason;
 
-pub use ended::{End, Ended, Taken};
+pub use ended::{End, Ended, ResourceUsage};
 pub use ends::Ends;
 pub use kept_output::{FOLDER_OF_RUNNING, last_lines, output_file};
 pub use stop_reason::{StopReason, lost};

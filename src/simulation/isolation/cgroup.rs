@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use procfs::process::Process;
 
 use crate::simulation::config::ResourceLimits;
-use crate::simulation::ends::Taken;
+use crate::simulation::ends::ResourceUsage;
 
 /// The control groups below this server's own.
 pub struct Cgroups(PathBuf);
@@ -108,12 +108,12 @@ impl Cgroup {
 
     /// Kills all processes inside. Returns whether the kernel had killed one because of the memory limit, and the
     /// resources that they have used. Blocks until they have exited, for two seconds at most.
-    pub fn end(&self) -> (bool, Taken) {
+    pub fn end(&self) -> (bool, ResourceUsage) {
         kill(&self.0);
         let events = std::fs::read_to_string(self.0.join("memory.events")).unwrap_or_default();
         let kills = events.lines().find_map(|line| line.strip_prefix("oom_kill "));
         // `memory.peak` exists since Linux 5.19.
-        let taken = Taken {
+        let taken = ResourceUsage {
             memory: number_in(&self.0.join("memory.peak")),
             time: cgroup_time(&self.0),
         };

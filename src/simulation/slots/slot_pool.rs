@@ -198,7 +198,7 @@ impl SlotPool {
                 match reservation.held {
                     Held::Port(port) => record.lend(port),
                     // It is of another kind than the client: the client gets its port.
-                    Held::Spare(spare) => slots.end_least(spare),
+                    Held::Spare(spare) => slots.end_now(spare),
                 }
                 slots.records.insert(id, record);
                 slots.serve();
@@ -471,7 +471,7 @@ impl Slots {
         for _ in leaving.count()..waiting {
             // Where no slot is offered, theirs would help nobody.
             if offers_slot && let Some(spare) = self.least_spare() {
-                self.end_least(spare);
+                self.end_now(spare);
                 continue;
             }
             let Some(longest_away) = self.longest_away() else {

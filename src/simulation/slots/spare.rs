@@ -207,7 +207,7 @@ impl Slots {
     }
 
     /// Ends a simulation without a client.
-    pub(super) fn end_least(&mut self, id: SimulationId) {
+    pub(super) fn end_now(&mut self, id: SimulationId) {
         if let Some(record) = self.records.get_mut(&id) {
             record.yield_slot();
         }

@@ -10,7 +10,7 @@ use super::output::{self, OutputEvent, Tail};
 use crate::shared::domain::{Failure, Reason};
 use crate::shared::run::RotatedFile;
 use crate::simulation::container::{Cause, SimulationContainers};
-use crate::simulation::ends::{FOLDER_OF_RUNNING, Taken};
+use crate::simulation::ends::{FOLDER_OF_RUNNING, ResourceUsage};
 use crate::simulation::process::{ExitReason, ProcessGroup};
 
 /// How the processes of a Webots have ended.
@@ -21,7 +21,7 @@ pub struct Exit {
     /// The cause, if control groups or Docker report one.
     pub cause: Option<Cause>,
     /// The resources that it has used.
-    pub taken: Taken,
+    pub taken: ResourceUsage,
 }
 
 /// A Webots that was launched.
@@ -90,7 +90,7 @@ pub fn launch(
             Some(cgroup) => actix_rt::task::spawn_blocking(move || cgroup.end())
                 .await
                 .unwrap_or_default(),
-            None => (false, Taken::default()),
+            None => (false, ResourceUsage::default()),
         };
         // The last output shows the cause. A process that can't be killed may keep the pipe open.
         actix_rt::time::timeout(LAST_OUTPUT, all_read).await.ok();
@@ -195,7 +195,7 @@ mod tests {
             let exit = Exit {
                 status,
                 cause,
-                taken: Taken::default(),
+                taken: ResourceUsage::default(),
             };
             assert_eq!(exit.failure(reached), Failure::new(reason, words), "{exit:?}");
         }
