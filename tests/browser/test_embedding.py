@@ -1,16 +1,19 @@
 """The pages that docs/embedding.md prints, served from another site."""
 
 import os
+import pathlib
 import re
+import subprocess
 import sys
+import tempfile
 import unittest
 import urllib.request
 
 from case import BrowserTest
 from firefox import MISSING, Firefox
-from fleet import SOON, WORLD, free_ports, until
+from fleet import ROOT, SOON, WORLD, free_ports, until
 from playwright.sync_api import expect
-from site_of_others import Site, printed
+from site_of_others import PRINTED, Site, printed
 
 SHOWN = "[data-step=simulation].done"
 # A phone, a page at 200 %, and a phone at 200 %, in turns: each language has another size in the other scheme.
@@ -25,6 +28,25 @@ LOOKS = [
     for turn, scheme in enumerate(["light", "dark"])
     for number, language in enumerate(LANGUAGES)
 ]
+TOOLS = ROOT / "tests/assets/node_modules"
+REACT_PAGE = f"""
+import {{ useState }} from 'react';
+import {{ createRoot }} from 'react-dom/client';
+import {{ Simulation }} from './simulation.jsx';
+
+function Page() {{
+  const [isThere, setThere] = useState(true);
+  const [end, setEnd] = useState();
+  return (
+    <>
+      {{isThere && <Simulation autostart world="{PRINTED}" onEnded={{setEnd}} />}}
+      <p id="told">{{end?.message}}</p>
+      <button onClick={{() => setThere(false)}}>Close</button>
+    </>
+  );
+}}
+createRoot(document.querySelector('main')).render(<Page />);
+"""
 in_firefox = unittest.skipIf(MISSING, MISSING)
 
 
@@ -150,6 +172,29 @@ class PrintedPages(Embedding):
         self.assertEqual(tab.evaluate("document.getElementById('left').state"), "running")
         tab.evaluate("document.getElementById('left').remove()")
         until("the other has ended", lambda: not self.simulations())
+
+    @unittest.skipUnless((TOOLS / "esbuild").exists(), "tests/lint.sh fetches React")
+    def test_a_component_of_react_starts_tells_its_end_and_ends_with_its_page(self):
+        with tempfile.TemporaryDirectory() as folder:
+            sources = pathlib.Path(folder)
+            (sources / "simulation.jsx").write_text(printed("React", "jsx"))
+            (sources / "page.jsx").write_text(REACT_PAGE)
+            options = ["--bundle", "--format=esm", "--jsx=automatic", "--log-level=error"]
+            command = [TOOLS / ".bin/esbuild", sources / "page.jsx", *options, "--define:process.env.NODE_ENV='test'"]
+            environment = {**os.environ, "NODE_PATH": str(TOOLS)}
+            bundle = subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout
+        self.site.put("page.js", bundle)
+        main = "<main></main><script type='module' src='page.js'></script>"
+        page = self.visit("react", f"<!DOCTYPE html><html lang='en'><title>React</title>{main}")
+        expect(page.tab.locator(SHOWN)).to_be_visible()
+        self.assertEqual(page.faults(), [])
+        page.tab.get_by_role("button", name="Disconnect").click()
+        expect(page.tab.locator("#told")).to_contain_text("ended")
+        until("it is gone", lambda: not self.simulations())
+        page.tab.get_by_role("button", name="Connect").click()
+        expect(page.tab.locator(SHOWN)).to_be_visible()
+        page.tab.get_by_role("button", name="Close").click()
+        until("it is gone again", lambda: not self.simulations())
 
     def test_a_page_whose_policy_allows_what_the_guide_names(self):
         fleet = self.fleet.session.url("").rstrip("/")
