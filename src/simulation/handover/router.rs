@@ -65,12 +65,13 @@ impl Router for ConnectionRouter {
     }
 
     fn message(&self, text: &str) -> Option<PathBuf> {
-        let request = ClientRequest::parse(text).ok()?;
-        if let Some(token) = request.resume {
-            return self.other(Token::parse(&token)?.run());
-        }
-        let pass = request.start.and_then(|start| Pass::server_of(&start.pass?));
-        match pass.map(|server| RunId::of(server.0)) {
+        let pass = match ClientRequest::parse(text).ok()? {
+            ClientRequest::Resume(token) => return self.other(Token::parse(&token)?.run()),
+            ClientRequest::Start(start) => start.pass,
+            _ => None,
+        };
+        let server = pass.and_then(|pass| Pass::server_of(&pass));
+        match server.map(|server| RunId::of(server.0)) {
             Some(run) if run == RunId::own() => None,
             Some(run) => self.other(run).or_else(|| self.newest()),
             None => self.newest(),
