@@ -38,7 +38,7 @@ int nvmlDeviceGetUtilizationRates(void *device, rates *out) {
 int nvmlDeviceGetMemoryInfo_v2(void *device, memory *out) {
   if (number(device) == atoi(at("NVML_LOST_INDEX")) && marked("NVML_LOST")) return 15;
   out->total = 8ULL << 30;
-  out->used = device == (void *)1 ? 6ULL << 30 : 1ULL << 30;
+  out->used = /* far beyond what readyLoad may be */ marked("NVML_FULL") ? 160ULL << 30 : device == (void *)1 ? 6ULL << 30 : 1ULL << 30;
   out->reserved = 0;
   out->free = out->total - out->used;
   return 0;

@@ -1,17 +1,20 @@
 //! Simulations that are kept ready: clients take them at once, they take nothing from clients, and nothing of them stays.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use serde_json::{Value, json};
 
 use super::life::quick;
+use super::readings::gpu_driver;
 use super::scene::nothing_left;
 use crate::support::clock::Clock;
+use crate::support::disk::{self, Full};
+use crate::support::wrapper::Wrapper;
 use crate::support::{
     Builder, Client, DEMO, Server, WORLD, Webots, arm, demo_server, http, instance_folders_in, instances_below,
-    server_of, until, world,
+    server_of, skip, until, world,
 };
 
 /// A server that keeps this many of the world of [`arm`] ready, however busy the machine is.
@@ -361,4 +364,157 @@ async fn a_remote_is_asked_at_once_for_a_world_that_is_wanted_from_now_on() {
         let text = std::fs::read_to_string(folder.join("project/worlds/a.wbt")).unwrap();
         assert!(text.contains("Changed"), "{text}");
     }
+}
+
+#[actix_rt::test]
+async fn what_is_kept_ready_gives_way_to_memory() {
+    let library = gpu_driver();
+    let mark = library.path().join("mark");
+    let server = keeping(demo_server(3), 2)
+        .env("LD_LIBRARY_PATH", library.path().to_str().unwrap())
+        .env("NVML_FULL", mark.to_str().unwrap())
+        .start()
+        .await;
+    until_ready(&server, 2).await;
+    std::fs::write(&mark, "").unwrap();
+    until("none is left", async || {
+        server.status().await["instances"]["spare"] == 0
+    })
+    .await;
+    let starts = || server.log().matches(": is kept ready with").count();
+    let before = starts();
+    actix_rt::time::sleep(Duration::from_secs(3)).await;
+    assert_eq!(starts(), before, "none is started only to end");
+    // A person is served.
+    let client = Client::ready(&server).await;
+    std::fs::remove_file(&mark).unwrap();
+    until_ready(&server, 2).await;
+    client.leave().await;
+}
+
+#[actix_rt::test]
+async fn on_a_full_disk_what_is_ready_stays_and_none_is_started() {
+    disk::hide_mounts_from_others();
+    let folder = tempfile::tempdir().unwrap();
+    let small = folder.path().join("small");
+    if !disk::small_disk(&small, 64) {
+        return skip("only root may mount one");
+    }
+    let server = keeping(demo_server(3), 2)
+        .set("diskReserve", 8)
+        .set("isolation", "none")
+        .folder(&small)
+        .start()
+        .await;
+    until_ready(&server, 2).await;
+    let filler = Full::at(&small);
+    until("the disk is full", async || server.health().await.0 == 503).await;
+    let ended = pids(&server)[0];
+    kill(Pid::from_raw(ended), Signal::SIGKILL).unwrap();
+    until_ready(&server, 1).await;
+    actix_rt::time::sleep(Duration::from_secs(3)).await;
+    let one = kept(&server).await;
+    assert_eq!((&one["ready"], &one["starting"]), (&json!(1), &json!(0)), "{one}");
+    drop(filler);
+    until_ready(&server, 2).await;
+}
+
+#[actix_rt::test]
+async fn a_remote_is_asked_once_in_each_interval_for_all_its_worlds_and_clients() {
+    let git = Wrapper::git("");
+    let builder = keeping(demo_server(6), 1)
+        .set("timing.branches", 3)
+        .env("PATH", &git.path());
+    builder.forge().commit("lab/arm", "main", &[("worlds/b.wbt", WORLD)]);
+    let entry = |world: String| json!({"world": world, "count": 2});
+    let list = [entry(arm()), entry(world("lab/arm", "main", "worlds/b.wbt"))];
+    let server = builder.set("ready", json!(list)).start().await;
+    let begin = Instant::now();
+    until("all are ready", async || {
+        let ready = server.status().await["ready"].clone();
+        ready[0]["ready"] == 2 && ready[1]["ready"] == 2
+    })
+    .await;
+    // Those that are taken are replaced.
+    for _ in 0..4 {
+        Client::ready(&server).await.leave().await;
+        until_ready(&server, 2).await;
+    }
+    until("it is asked again", async || git.count("ls-remote") >= 3).await;
+    let intervals = usize::try_from(begin.elapsed().as_secs() / 3).unwrap();
+    let count = git.count("ls-remote");
+    assert!(
+        count <= 2 + intervals,
+        "{count} in {intervals} intervals: {:?}",
+        git.calls()
+    );
+}
+
+/// How long clients of another world wait for their simulations, all at once, in the mean; `count` are kept ready.
+async fn start_of_another_world(count: u32) -> Duration {
+    let options = "#VRML_SIM R2025a utf8\n#demo-simulator: load=2\nWorldInfo { }\n";
+    let builder = keeping(demo_server(4), count);
+    builder.forge().commit("lab/arm", "main", &[("worlds/b.wbt", options)]);
+    let server = builder.start().await;
+    until("they are ready", async || kept(&server).await["ready"] == count).await;
+    let other = world("lab/arm", "main", "worlds/b.wbt");
+    // So that the repository is there in both cases.
+    Client::start(&server, &other).await.until("loading: ").await;
+    until("nothing else runs", async || {
+        server.simulations().await.is_empty() && kept(&server).await["ready"] == count
+    })
+    .await;
+    let begin = Instant::now();
+    let clients = (0..4).map(|_| async {
+        let mut client = Client::start(&server, &other).await;
+        client.until("webots:").await;
+        (begin.elapsed(), client)
+    });
+    let all = futures_util::future::join_all(clients).await;
+    all.iter().map(|(time, _)| *time).sum::<Duration>() / 4
+}
+
+#[actix_rt::test]
+async fn on_a_quiet_machine_a_class_of_another_world_starts_as_if_none_were_ready() {
+    let (with, without) = (start_of_another_world(4).await, start_of_another_world(0).await);
+    println!("all slots taken by ready ones: {with:.2?}, none: {without:.2?}");
+    assert!(with <= without.mul_f64(1.2), "{with:?}, without {without:?}");
+}
+
+/// The processor time of a server and its simulations in ten seconds, in seconds.
+async fn cost(server: &Server) -> f64 {
+    let used = || {
+        let of_simulations = instances_below(&server.cache()).into_iter().map(|(pid, _)| pid);
+        let ticks = of_simulations.chain([server.pid()]).filter_map(|pid| {
+            let stat = procfs::process::Process::new(pid).ok()?.stat().ok()?;
+            Some(stat.utime + stat.stime)
+        });
+        ticks.sum::<u64>()
+    };
+    let before = used();
+    actix_rt::time::sleep(Duration::from_secs(10)).await;
+    #[expect(clippy::cast_precision_loss, reason = "a few ticks")]
+    let ticks = (used() - before) as f64;
+    ticks / procfs::ticks_per_second() as f64
+}
+
+#[actix_rt::test]
+async fn on_a_quiet_machine_those_that_are_ready_cost_what_idle_simulations_cost() {
+    const COUNT: u16 = 30;
+    let server = keeping(demo_server(COUNT), COUNT.into()).start().await;
+    let begin = Instant::now();
+    while kept(&server).await["ready"] != COUNT {
+        assert!(begin.elapsed() < Duration::from_mins(2), "{}", kept(&server).await);
+        actix_rt::time::sleep(Duration::from_millis(200)).await;
+    }
+    let ready = cost(&server).await;
+    let mut clients = Vec::new();
+    for _ in 0..COUNT {
+        clients.push(Client::ready(&server).await);
+    }
+    let idle = cost(&server).await;
+    println!(
+        "{COUNT} that are ready: {ready:.2} s of processor time in 10 s, idle simulations of clients: {idle:.2} s"
+    );
+    assert!(ready <= 1.2 * idle + 0.1, "{ready}, idle {idle}");
 }

@@ -106,7 +106,8 @@ impl SpareKeeper {
         self.ask_remotes(&wanted, ctx);
         let readings = self.server.readings.borrow().clone();
         let limit = self.server.config.ready_load;
-        let is_open = !self.server.takes_nobody() && readings.load.is_some_and(|load| load.percent() < limit);
+        let has_room = readings.load.is_some_and(|load| load.percent() < limit) && memory(&readings) < limit;
+        let is_open = has_room && !self.server.takes_nobody();
         let starting = spares.values().flatten().filter(|one| !one.is_ready).count();
         let mut starts = STARTS.saturating_sub(starting);
         let mut has_slot = self.server.slots.has_room_for_spare();

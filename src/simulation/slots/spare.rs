@@ -112,7 +112,7 @@ impl SlotPool {
     /// Adds a simulation without a client, if a slot is free that no client waits for. Returns whether it was added.
     pub(super) fn add_spare(&self, mut record: SimulationRecord) -> bool {
         let mut slots = self.0.lock();
-        let Some(port) = slots.free_port().filter(|_| slots.waiting() == 0) else {
+        let Some(port) = slots.free_port().filter(|_| slots.has_room_for_spare()) else {
             return false;
         };
         record.lend(port);
@@ -124,7 +124,7 @@ impl SlotPool {
     /// Whether there is a free slot that no client waits for.
     pub fn has_room_for_spare(&self) -> bool {
         let slots = self.0.lock();
-        slots.waiting() == 0 && slots.free_port().is_some()
+        slots.has_room_for_spare() && slots.free_port().is_some()
     }
 
     /// The simulations without a client that are not ending, by what they are kept ready for.
@@ -182,6 +182,11 @@ impl SlotPool {
 }
 
 impl Slots {
+    /// Whether no client waits, and those that are there run in real time.
+    fn has_room_for_spare(&self) -> bool {
+        self.offers_slot() && self.waiting() == 0
+    }
+
     /// Whether a simulation is kept ready for this, and no other client has a better right to it.
     fn is_for(&self, id: SimulationId, kind: &SpareKind) -> bool {
         let record = self.records.get(&id);
