@@ -21,6 +21,10 @@ const FILES: (u64, u64) = (4, 64);
 /// 130: Ctrl-C or SIGTERM.
 #[derive(Parser, Debug, Clone)]
 #[command(version)]
+#[expect(
+    clippy::struct_excessive_bools,
+    reason = "each is an independent switch of the command line"
+)]
 pub(crate) struct Arguments {
     /// The session server
     #[arg(value_name = "http://HOST:PORT", value_parser = fleet)]
@@ -65,6 +69,9 @@ pub(crate) struct Arguments {
     /// Take one client through all steps, and compare each message with what a fleet and Webots should send
     #[arg(long, conflicts_with_all = ["clients", "over", "stay", "line", "real_time", "misbehave", "soak", "expect", "json"])]
     pub(crate) explain: bool,
+    /// Let the clients come one after the other and stay, until simulations are slower than real time: how many fit on each server
+    #[arg(long, conflicts_with_all = ["over", "stay", "line", "misbehave", "soak", "json", "explain"])]
+    pub(crate) find: bool,
     /// Allow a fleet that is not on this machine
     #[arg(long)]
     pub(crate) yes: bool,
@@ -107,6 +114,9 @@ impl Arguments {
     pub(crate) fn summary(&self) -> String {
         if self.explain {
             return "one client".to_owned();
+        }
+        if self.find {
+            return format!("up to {} clients, one after the other", self.clients);
         }
         let words = |time| humantime::format_duration(time).to_string();
         let how_long = self

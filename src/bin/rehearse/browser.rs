@@ -9,6 +9,7 @@ use crate::arguments::Arguments;
 use crate::behaviour::Behaviour;
 use crate::board::{Board, Stage};
 use crate::connection::{Connection, Ended, simulated_time, unless_error};
+use crate::find::Paces;
 use crate::returning::WayBack;
 use crate::session_server::{NoServer, SessionServer};
 use crate::visit::{Outcome, Pace, Steps, Visit};
@@ -31,6 +32,7 @@ pub(crate) struct Browser<'class> {
     visit: Visit,
     /// Receives the visit at its end.
     visits: &'class RefCell<Vec<Visit>>,
+    paces: &'class Paces,
     /// The session server's last message that no slot was available, although one was just before.
     full: Option<String>,
 }
@@ -67,13 +69,13 @@ impl From<Ended> for StartError {
 }
 
 impl<'class> Browser<'class> {
-    /// A client that requests a simulation now. Its visit is added to `visits` on drop, even if that interrupts the
-    /// visit.
+    /// A client that requests a simulation now. Its paces are added to `paces`; its visit to `visits` on drop, even if that
+    /// interrupts the visit.
     pub(crate) fn new(
         arguments: &'class Arguments,
         board: &'class Board,
         session_server: &'class SessionServer,
-        visits: &'class RefCell<Vec<Visit>>,
+        (visits, paces): (&'class RefCell<Vec<Visit>>, &'class Paces),
         (client, behaviour, stay): (u32, Behaviour, Duration),
     ) -> Self {
         let asked = board.now();
@@ -97,6 +99,7 @@ impl<'class> Browser<'class> {
             stay,
             visit,
             visits,
+            paces,
             full: None,
         }
     }
@@ -331,6 +334,7 @@ impl<'class> Browser<'class> {
                     let simulated = first.zip(last).map_or(0.0, |(first, last): (f64, f64)| last - first) / 1000.0;
                     let factor = simulated / wall;
                     self.visit.pace.push(Pace { at: self.board.now(), factor });
+                    self.paces.add(&self.visit);
                     (since, first) = (Instant::now(), last);
                 }
             }
@@ -341,6 +345,7 @@ impl<'class> Browser<'class> {
 impl Drop for Browser<'_> {
     fn drop(&mut self) {
         self.visit.ended = self.board.now();
+        self.paces.remove(self.visit.client);
         if let Outcome::BrokeOff(why) | Outcome::Refused(why) | Outcome::Failed(why) = &mut self.visit.outcome {
             *why = line(why);
         }

@@ -10,6 +10,7 @@ use crate::arguments::Arguments;
 use crate::behaviour::{Behaviour, Draw};
 use crate::board::Board;
 use crate::browser::Browser;
+use crate::find::Paces;
 use crate::interruption::interruption;
 use crate::servers::Servers;
 use crate::session_server::SessionServer;
@@ -37,6 +38,7 @@ pub(crate) async fn play(arguments: &Arguments) -> Played {
         servers: Servers::default(),
         draw: RefCell::new(Draw::new(arguments.misbehave.clone())),
         visits: RefCell::default(),
+        paces: Paces::default(),
     };
     let clients = join_all((0..arguments.clients).map(|client| class.come(client)));
     let aside = futures_util::future::join(class.board.show(), class.servers.watch());
@@ -62,6 +64,7 @@ struct Class<'arguments> {
     servers: Servers,
     draw: RefCell<Draw>,
     visits: RefCell<Vec<Visit>>,
+    paces: Paces,
 }
 
 impl Class<'_> {
@@ -86,7 +89,13 @@ impl Class<'_> {
     async fn visit(&self, client: u32, behaviour: Behaviour) {
         let stay = self.draw.borrow_mut().stay(self.arguments.stay);
         let who = (client, behaviour, stay);
-        let browser = Browser::new(self.arguments, &self.board, &self.session_server, &self.visits, who);
+        let browser = Browser::new(
+            self.arguments,
+            &self.board,
+            &self.session_server,
+            (&self.visits, &self.paces),
+            who,
+        );
         browser.visit(|server| self.servers.met(server)).await;
     }
 }

@@ -4,6 +4,7 @@
 //! line; `class` starts the clients, each of which is a `browser` that goes through the steps of Webots' web page and
 //! records a `visit`; `servers` monitors the load; `report` and `table` show the result, with `real_time_factors` and
 //! `line`.
+//! `find` grows a class until simulations are slower than real time.
 //! `explain` goes through the steps with one client and compares the results with the expected ones; `step_log` prints
 //! the steps, `words` the texts.
 
@@ -14,6 +15,7 @@ mod browser;
 mod class;
 mod connection;
 mod explain;
+mod find;
 mod http;
 mod interruption;
 mod line;
@@ -56,6 +58,8 @@ fn main() -> ExitCode {
     let ended = actix_rt::System::new().block_on(async {
         if arguments.explain {
             explain(&arguments).await
+        } else if arguments.find {
+            find(&arguments).await
         } else {
             rehearse(&arguments).await
         }
@@ -82,6 +86,22 @@ async fn explain(arguments: &Arguments) -> Result<u8, String> {
             Ok(INTERRUPTED)
         }
     }
+}
+
+/// Grows the class, and prints how many fit. Returns the exit code.
+///
+/// # Errors
+/// When the fleet does not answer at all.
+async fn find(arguments: &Arguments) -> Result<u8, String> {
+    session_server::SessionServer::new(&arguments.fleet).answers().await?;
+    let found = find::find(arguments).await;
+    writeln!(std::io::stdout(), "{}", found.text()).ok();
+    let expected = usize::try_from(arguments.expect.unwrap_or(1)).unwrap_or(usize::MAX);
+    Ok(if found.interrupted {
+        INTERRUPTED
+    } else {
+        code(found.fit() >= expected)
+    })
 }
 
 /// Plays the class and prints the result. Returns the exit code.
