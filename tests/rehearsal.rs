@@ -10,7 +10,7 @@ use tokio::process::{Child, Command};
 
 use crate::support::authority::Authority;
 use crate::support::stand_in::{Script, StandIn};
-use crate::support::{SOON, Server, arm, demo_server, ports, session_server, until};
+use crate::support::{SOON, Server, WORLD, arm, demo_server, ports, session_server, until};
 
 /// Timeout of a rehearsal.
 const BOUND: Duration = Duration::from_secs(90);
@@ -328,6 +328,160 @@ async fn an_acceptance_run_ends_at_the_step_that_fails() {
         assert!(step != "| scene |" || said.contains("steps differ: "), "{said}");
     });
     futures_util::future::join_all(all).await;
+}
+
+/// A simulation server whose simulations share one processor, a twenty-fifth of which each needs at least, and its session
+/// server.
+async fn fleet_on_one_processor(target: f64) -> Fleet {
+    let builder = demo_server(60)
+        .before("taskset -pc 0 $$ > /dev/null")
+        .set("streaming", "relay")
+        .set("isolation", "none")
+        .set("realTime.target", target);
+    let (first, rest) = WORLD.split_once('\n').unwrap();
+    let world = format!("{first}\n#demo-simulator: work=0.04\n{rest}");
+    builder.forge().commit("lab/arm", "main", &[("worlds/a.wbt", &world)]);
+    let simulation = builder.start().await;
+    let session = session_server(&[simulation.address()])
+        .before("taskset -pc 1 $$ > /dev/null")
+        // Half of the machine is idle, so that its load is no limit. Other programs must not be one.
+        .set("loadThreshold", 1000)
+        .start()
+        .await;
+    Fleet { session, simulation }
+}
+
+/// The mean pace of each client of a rehearsal, in the order in which they got their places, and the mean of what the
+/// server has recorded for it.
+async fn paces(fleet: &Fleet, report: &Value) -> Vec<(f64, f64)> {
+    let visits = report["visits"].as_array().unwrap().iter();
+    let mut seen: Vec<(f64, f64)> = visits
+        .filter(|visit| visit["outcome"]["outcome"] == "ran")
+        .map(|visit| {
+            let pace = visit["pace"].as_array().unwrap()[1..].iter();
+            let pace: Vec<f64> = pace.map(|pace| pace["factor"].as_f64().unwrap()).collect();
+            let granted = visit["asked"].as_f64().unwrap() + visit["steps"]["waiting"].as_f64().unwrap();
+            #[expect(clippy::cast_precision_loss, reason = "a few numbers")]
+            (granted, pace.iter().sum::<f64>() / pace.len() as f64)
+        })
+        .collect();
+    seen.sort_by(|one, other| one.0.total_cmp(&other.0));
+    let file = fleet.simulation.folder.join("log/simulation/simulations.csv");
+    let read = || std::fs::read_to_string(&file).unwrap_or_default();
+    until("all are recorded", async || read().lines().count() > seen.len()).await;
+    let mut recorded: Vec<(u32, f64)> = read()
+        .lines()
+        .skip(1)
+        .map(|line| {
+            let number = line.split(',').next().unwrap().rsplit('-').next().unwrap();
+            (
+                number.parse().unwrap(),
+                line.rsplit(',').nth(1).unwrap().parse().unwrap(),
+            )
+        })
+        .collect();
+    recorded.sort_by_key(|(number, _)| *number);
+    let recorded = recorded.into_iter().map(|(_, percent)| percent / 100.0);
+    seen.into_iter().map(|(_, pace)| pace).zip(recorded).collect()
+}
+
+/// Plays a class on one processor. Returns the share of the simulations that kept 0.9 of real time, and their number.
+async fn class_on_one_processor(target: f64) -> (f64, f64) {
+    let fleet = fleet_on_one_processor(target).await;
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("class.json");
+    let url = fleet.session.url("");
+    let mut command = Command::new("taskset");
+    command
+        .args(["-c", "1", env!("CARGO_BIN_EXE_rehearse"), &url, "--world", &arm()])
+        .args(["--clients", "40", "--over", "60s", "--stay", "45s", "--json"])
+        .arg(&file);
+    let said = of(actix_rt::time::timeout(4 * BOUND, command.output())
+        .await
+        .expect("it ends")
+        .unwrap());
+    println!("realTime.target {target}:\n{}", said.out);
+    let report: Value = serde_json::from_str(&std::fs::read_to_string(file).unwrap()).unwrap();
+    let paces = paces(&fleet, &report).await;
+    let differences = paces.iter().map(|(seen, recorded)| ((recorded - seen) / seen).abs());
+    #[expect(clippy::cast_precision_loss, reason = "a few numbers")]
+    let difference = differences.sum::<f64>() / paces.len() as f64;
+    println!(
+        "the server's factor and that of rehearse differ by {:.1} % in the mean",
+        100.0 * difference
+    );
+    assert!(difference < 0.02, "{paces:.3?}");
+    let number = |what: &str| report["seats"][what].as_f64().unwrap();
+    (number("fit") / number("given"), number("given"))
+}
+
+#[actix_rt::test]
+async fn on_a_quiet_machine_places_by_real_time_keep_it_where_the_load_does_not() {
+    let (kept, given) = class_on_one_processor(0.9).await;
+    let (by_load, _) = class_on_one_processor(0.0).await;
+    println!(
+        "of {given} clients {:.0} % keep real time, by load {:.0} %",
+        100.0 * kept,
+        100.0 * by_load
+    );
+    assert!(
+        kept >= 0.95 && by_load < 0.95 && given > 10.0,
+        "{kept} of {given}, {by_load} by load"
+    );
+}
+
+#[actix_rt::test]
+async fn a_class_grows_until_simulations_are_slower_than_real_time() {
+    // Each needs more than a third of a processor, of which all share one.
+    let builder = demo_server(10)
+        .before("taskset -pc 0 $$ > /dev/null")
+        .set("streaming", "relay")
+        .set("isolation", "none")
+        .set("realTime.target", 0);
+    let (first, rest) = WORLD.split_once('\n').unwrap();
+    let world = format!("{first}\n#demo-simulator: work=0.4\n{rest}");
+    builder.forge().commit("lab/arm", "main", &[("worlds/a.wbt", &world)]);
+    let simulation = builder.start().await;
+    let session = session_server(&[simulation.address()])
+        .set("loadThreshold", 1000)
+        .start()
+        .await;
+    let fleet = Fleet { session, simulation };
+    let said = fleet.rehearse(&["--find", "--clients", "8", "--expect", "9"]).await;
+    let address = fleet.simulation.address();
+    let line = said.out.lines().find(|line| line.starts_with(&address));
+    let line = line.unwrap_or_else(|| panic!("{said:?}"));
+    let fit: u32 = line.rsplit("\"maxConnections\": ").next().unwrap().parse().unwrap();
+    // On a busy machine not even two fit.
+    assert!(fit <= 2, "{said:?}");
+    assert!(
+        line.contains(&format!("{fit} fit, with {} real time is 0.", fit + 1)),
+        "{said:?}"
+    );
+    assert!(
+        said.out
+            .contains("Clients are sent only to servers on which no more fit. "),
+        "{said:?}"
+    );
+    assert_eq!(said.code, Some(1), "nine had to fit: {said:?}");
+}
+
+#[actix_rt::test]
+async fn a_class_that_finds_no_more_places_says_so() {
+    let fleet = Fleet::with_places(2).await;
+    let said = fleet
+        .rehearse(&["--find", "--real-time", "0", "--patience", "5s"])
+        .await;
+    assert!(
+        said.out.contains("2 fit, perhaps more; \"maxConnections\": 2\n"),
+        "{said:?}"
+    );
+    assert!(
+        said.out
+            .contains("Client 3 got no simulation that runs: no simulation within 5s"),
+        "{said:?}"
+    );
+    assert_eq!(said.code, Some(0), "{said:?}");
 }
 
 fn signal(child: &Child, signal: Signal) {

@@ -151,7 +151,7 @@ impl Brake {
         let stopped = pids.clone();
         let task = actix_rt::spawn(async move {
             loop {
-                for (signal, time) in [(Signal::SIGSTOP, 1000), (Signal::SIGCONT, 500)] {
+                for (signal, time) in [(Signal::SIGSTOP, 1500), (Signal::SIGCONT, 300)] {
                     for pid in &stopped {
                         kill(Pid::from_raw(*pid), signal).ok();
                     }
@@ -212,7 +212,7 @@ async fn a_server_whose_simulations_are_slow_offers_fewer_places_until_they_are_
     .await;
     // Who comes anyway waits.
     let mut next = Client::start(&server, &arm()).await;
-    assert_eq!(next.until("queue: ").await, "queue: 0");
+    assert_eq!(next.within("queue: ", SOON).await, "queue: 0");
     drop(brake);
     until("those that are there have shown that they fit", async || {
         places(&server).await == 4
@@ -220,7 +220,7 @@ async fn a_server_whose_simulations_are_slow_offers_fewer_places_until_they_are_
     .await;
     assert!(next.heard.iter().all(|text| !text.starts_with("webots:")));
     seats.pop().unwrap().leave().await;
-    next.until("webots:").await;
+    next.within("webots:", SOON).await;
 }
 
 #[actix_rt::test]
