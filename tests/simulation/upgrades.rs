@@ -8,7 +8,7 @@ use std::time::Duration;
 use futures_util::future::join_all;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
 use tokio::net::TcpStream;
 
 use super::life::quick;
@@ -38,26 +38,16 @@ impl Traffic {
         }
     }
 
-    /// The same, always on the same connection.
+    /// Requests `/status` as often, always on the same connection: it never says that the server drains.
     async fn poll_on_one_connection(&self, server: &Server) {
-        let mut socket = TcpStream::connect(server.address()).await.unwrap();
-        let mut bytes = [0; 4096];
+        let mut socket = BufReader::new(TcpStream::connect(server.address()).await.unwrap());
         while !self.is_over.get() {
-            socket
-                .write_all(b"GET /load HTTP/1.1\r\nHost: x\r\n\r\n")
-                .await
-                .unwrap();
-            let mut answer = String::new();
-            while !answer.contains("\r\n\r\n") || answer.ends_with("\r\n\r\n") {
-                let count = actix_rt::time::timeout(SOON, socket.read(&mut bytes))
-                    .await
-                    .unwrap()
-                    .unwrap();
-                assert!(count > 0, "the connection is closed after {answer:?}");
-                answer.push_str(std::str::from_utf8(&bytes[..count]).unwrap());
+            let request = b"GET /status HTTP/1.1\r\nHost: x\r\n\r\n";
+            socket.write_all(request).await.unwrap();
+            let answer = actix_rt::time::timeout(SOON, answer(&mut socket)).await.unwrap();
+            if !answer.contains("\"draining\":false") {
+                self.failures.borrow_mut().push(answer);
             }
-            let status = answer.split(' ').nth(1).unwrap().parse().unwrap();
-            self.check_load(status, answer.rsplit("\r\n").next().unwrap());
             actix_rt::time::sleep(Duration::from_millis(10)).await;
         }
     }
@@ -99,6 +89,27 @@ impl Traffic {
             self.served.set(self.served.get() + 1);
         }
     }
+}
+
+/// The body of an answer.
+async fn answer(socket: &mut BufReader<TcpStream>) -> String {
+    let mut length = 0;
+    loop {
+        let mut line = String::new();
+        assert!(
+            socket.read_line(&mut line).await.unwrap() > 0,
+            "the connection is closed"
+        );
+        if let Some(told) = line.to_lowercase().strip_prefix("content-length: ") {
+            length = told.trim().parse().unwrap();
+        }
+        if line == "\r\n" {
+            break;
+        }
+    }
+    let mut body = vec![0; length];
+    socket.read_exact(&mut body).await.unwrap();
+    String::from_utf8(body).unwrap()
 }
 
 /// A viewer of a client's simulation.
