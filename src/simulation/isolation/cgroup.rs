@@ -179,7 +179,7 @@ fn own_folder() -> Option<PathBuf> {
     let folder = mount.mount_point.join(below);
     // A process that takes over from another is in the group that that has made for itself, and divides no other.
     if let Some(parent) = folder.parent().filter(|_| folder.ends_with(OWN))
-        && std::fs::read_to_string(parent.join("cgroup.subtree_control")).is_ok_and(|all| !all.trim().is_empty())
+        && std::fs::read_to_string(parent.join("cgroup.procs")).is_ok_and(|inside| inside.is_empty())
     {
         return Some(parent.to_owned());
     }
