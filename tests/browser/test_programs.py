@@ -106,6 +106,13 @@ class Programs(BrowserTest):
         server = next(one for one in (simulation, self.fleet.other) if one.address == chloe["server"])
         path = f"simulations/{chloe['id']}/stop"
         check(json.loads(self.ask(server, path, {})), "/simulations/{id}/stop", "post", "202")
+        # A body that is too long is refused as the description says.
+        for path, methods in description["paths"].items():
+            if "requestBody" in methods.get("post", {}):
+                with self.assertRaises(urllib.error.HTTPError) as refused:
+                    self.ask(session, path.removeprefix("/").replace("{id}", "1-1"), {"reason": "x" * 10_000})
+                self.assertEqual(refused.exception.code, 413, path)
+                self.assertIn("413", methods["post"]["responses"], path)
         # Every path is there, and needs what the description says.
         for path, methods in description["paths"].items():
             for method, operation in methods.items():
