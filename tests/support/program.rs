@@ -1,5 +1,6 @@
 //! The built programs as child processes.
 
+use std::cell::Cell;
 use std::fs::File;
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
@@ -21,6 +22,8 @@ pub struct Server {
     /// Its port on the loopback.
     pub port: u16,
     name: &'static str,
+    /// Whether other processes may serve its configuration, which end with it.
+    is_upgraded: Cell<bool>,
     _temporary: Option<tempfile::TempDir>,
     _parts: Option<(Forge, Webots)>,
 }
@@ -203,6 +206,7 @@ impl Builder {
             folder,
             port: self.port,
             name: self.name,
+            is_upgraded: Cell::new(false),
             _temporary: temporary,
             _parts: self.parts,
         }
@@ -337,6 +341,7 @@ impl Server {
 
     /// Has a simulation server start its program anew. Returns whether it did, and what was printed.
     pub async fn upgrade(&self) -> (bool, String) {
+        self.is_upgraded.set(true);
         let mut command = tokio::process::Command::new(env!("CARGO_BIN_EXE_simulation-server"));
         let command = command.arg("upgrade").arg(self.folder.join("config.json"));
         let done = actix_rt::time::timeout(4 * super::SOON, command.output()).await;
@@ -399,8 +404,10 @@ impl Drop for Server {
     fn drop(&mut self) {
         self.child.kill().ok();
         self.child.wait().ok();
-        for later in self.processes() {
-            kill(Pid::from_raw(later), Signal::SIGKILL).ok();
+        if self.is_upgraded.get() {
+            for later in self.processes() {
+                kill(Pid::from_raw(later), Signal::SIGKILL).ok();
+            }
         }
         if std::thread::panicking() {
             eprintln!("--- {} on port {} ---\n{}---", self.name, self.port, self.log());
