@@ -21,12 +21,18 @@ struct Readings {
     is_running: bool,
     /// When the stream is looked at again.
     next: Option<Instant>,
+    /// The stream that is read: those of several viewers may lag by different times.
+    stream: Option<StreamId>,
     /// Those of the last seconds, the oldest first, without a pause between them.
     recent: VecDeque<Reading>,
     total: Total,
     /// The factor that another process of this server has told, whose simulation it is.
     told: Option<f64>,
 }
+
+/// Tells the streams of one simulation apart.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct StreamId(pub u64);
 
 /// A time that was read.
 #[derive(Debug, Clone, Copy)]
@@ -64,14 +70,17 @@ const GAP: Duration = Duration::from_secs(5);
 const LARGEST: f64 = 1000.0;
 
 impl SimulatedTime {
-    /// Looks for a time in a part of the stream, unless one was read just now.
-    pub fn read(&self, part: &[u8]) {
+    /// Looks for a time in a part of a stream, unless one was read just now, or another stream is read.
+    pub fn read(&self, stream: StreamId, part: &[u8]) {
         let mut readings = self.0.lock();
         if !readings.is_running || part.is_empty() {
             return;
         }
         let now = Instant::now();
         if readings.next.is_some_and(|next| now < next) {
+            return;
+        }
+        if !readings.choose(stream, now) {
             return;
         }
         let found = last_time(part);
@@ -84,9 +93,13 @@ impl SimulatedTime {
         }
     }
 
-    /// The viewer takes less than Webots sends, so that the stream says nothing about the speed of the simulation.
-    pub fn interrupt(&self) {
-        self.0.lock().recent.clear();
+    /// The viewer of a stream takes less than Webots sends, so that it says nothing about the speed of the simulation.
+    pub fn interrupt(&self, stream: StreamId) {
+        let mut readings = self.0.lock();
+        if readings.stream == Some(stream) {
+            readings.stream = None;
+            readings.recent.clear();
+        }
     }
 
     /// Notes whether time passes, or the simulation is paused.
@@ -137,6 +150,20 @@ impl Serialize for SimulatedTime {
 }
 
 impl Readings {
+    /// Whether this stream is read: it was read last, or that one has told nothing for a while.
+    fn choose(&mut self, stream: StreamId, now: Instant) -> bool {
+        if self.stream == Some(stream) {
+            return true;
+        }
+        let tells = |last: &Reading| now.saturating_duration_since(last.at) < GAP;
+        if self.stream.is_some() && self.recent.back().is_some_and(tells) {
+            return false;
+        }
+        self.stream = Some(stream);
+        self.recent.clear();
+        true
+    }
+
     fn add(&mut self, next: Reading) {
         if let Some(last) = self.recent.back() {
             let (simulated, real) = (next.simulated - last.simulated, next.at - last.at);
@@ -206,6 +233,30 @@ mod tests {
     }
 
     #[test]
+    fn of_several_streams_one_is_read_until_it_tells_nothing() {
+        let begin = Instant::now();
+        let at = |seconds: f64| begin + Duration::from_secs_f64(seconds);
+        let mut readings = Readings::default();
+        let mut told = |stream, seconds: f64, simulated| {
+            let is_read = readings.choose(StreamId(stream), at(seconds));
+            if is_read {
+                readings.add(Reading {
+                    at: at(seconds),
+                    simulated,
+                });
+            }
+            (is_read, readings.total.simulated)
+        };
+        assert_eq!(told(1, 0.0, 100.0), (true, 0.0));
+        // It lags by five seconds.
+        assert_eq!(told(2, 0.5, 95.5), (false, 0.0));
+        assert_eq!(told(1, 1.0, 101.0), (true, 1.0));
+        assert_eq!(told(2, 1.5, 96.5), (false, 1.0));
+        assert_eq!(told(2, 7.0, 102.0), (true, 1.0));
+        assert_eq!(told(2, 8.0, 103.0), (true, 2.0));
+    }
+
+    #[test]
     fn gaps_resets_and_forged_times_do_not_count() {
         let begin = Instant::now();
         let readings = read(
@@ -245,19 +296,20 @@ mod tests {
 
     #[test]
     fn while_it_is_paused_nothing_is_read() {
+        const STREAM: StreamId = StreamId(1);
         let time = SimulatedTime::default();
         let update = b"application/json:{\"time\":20}";
         let count = || time.0.lock().recent.len();
-        time.read(update);
+        time.read(STREAM, update);
         assert_eq!(count(), 0);
         time.set_running(true);
-        time.read(update);
-        time.read(update);
+        time.read(STREAM, update);
+        time.read(STREAM, update);
         assert_eq!(count(), 1, "once a second");
-        time.interrupt();
+        time.interrupt(STREAM);
         assert_eq!(count(), 0);
         time.0.lock().next = None;
-        time.read(update);
+        time.read(STREAM, update);
         time.set_running(false);
         assert_eq!(count(), 0);
     }

@@ -9,7 +9,7 @@ use std::sync::{Arc, OnceLock};
 use actix_web::web::Bytes;
 
 use super::last_frame::LastFrame;
-use crate::simulation::simulated_time::SimulatedTime;
+use crate::simulation::simulated_time::{SimulatedTime, StreamId};
 
 /// A stream.
 pub struct Stream {
@@ -21,6 +21,7 @@ pub struct Stream {
     ending: Arc<OnceLock<String>>,
     /// How fast the simulation runs, as what it sends tells.
     time: SimulatedTime,
+    id: StreamId,
     /// Dropped with the stream.
     _held: Box<dyn Send>,
 }
@@ -62,6 +63,7 @@ impl Stream {
             down,
             ending,
             time,
+            id: StreamId(rand::random()),
             _held: held,
         }
     }
@@ -72,9 +74,9 @@ impl Stream {
         let ending = self.ending.get().map(String::as_str);
         let (down, length) = self.down.copy(&self.up.from, ending, buffer);
         if self.down.pending.is_empty() {
-            self.time.read(buffer.get(..length).unwrap_or_default());
+            self.time.read(self.id, buffer.get(..length).unwrap_or_default());
         } else {
-            self.time.interrupt();
+            self.time.interrupt(self.id);
         }
         let (up, _) = self.up.copy(&self.down.from, None, buffer);
         up || down
