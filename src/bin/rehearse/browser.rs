@@ -9,7 +9,7 @@ use crate::arguments::Arguments;
 use crate::behaviour::Behaviour;
 use crate::board::{Board, Stage};
 use crate::connection::{Connection, Ended, simulated_time, unless_error};
-use crate::find::Paces;
+use crate::paces::Paces;
 use crate::returning::WayBack;
 use crate::session_server::{NoServer, SessionServer};
 use crate::visit::{Outcome, Pace, Steps, Visit};

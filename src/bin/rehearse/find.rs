@@ -2,7 +2,7 @@
 //! simulation server.
 
 use std::cell::RefCell;
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::time::Duration;
 
@@ -15,22 +15,11 @@ use crate::behaviour::Behaviour;
 use crate::board::Board;
 use crate::browser::Browser;
 use crate::interruption::interruption;
+use crate::paces::Paces;
 use crate::real_time_factors::sorted;
 use crate::session_server::SessionServer;
 use crate::visit::{Outcome, Visit};
 
-/// The paces of the last seconds of clients whose simulations run.
-#[derive(Default)]
-pub(crate) struct Paces(RefCell<BTreeMap<u32, Seat>>);
-
-/// A client whose simulation runs.
-struct Seat {
-    server: String,
-    last: VecDeque<f64>,
-}
-
-/// Number of seconds of which the pace of a client is the mean.
-const SECONDS: usize = 5;
 /// One client of this many may be slow: 95 % keep real time.
 const MAY_BE_SLOW: usize = 20;
 /// Number of clients in a row that are sent to servers on which no more fit, until the class does not grow any more.
@@ -64,49 +53,6 @@ pub(crate) struct Found {
 enum Settled {
     Runs(String),
     Ended(String),
-}
-
-impl Paces {
-    /// Adds the last pace of a client.
-    pub(crate) fn add(&self, visit: &Visit) {
-        let (Some(server), Some(pace)) = (&visit.server, visit.pace.last()) else {
-            return;
-        };
-        // The first second, in which it starts, does not count.
-        if visit.pace.len() < 2 {
-            return;
-        }
-        let mut seats = self.0.borrow_mut();
-        let seat = seats.entry(visit.client).or_insert_with(|| Seat {
-            server: server.clone(),
-            last: VecDeque::new(),
-        });
-        seat.last.push_back(pace.factor);
-        if seat.last.len() > SECONDS {
-            seat.last.pop_front();
-        }
-    }
-
-    /// Forgets a client that has left.
-    pub(crate) fn remove(&self, client: u32) {
-        self.0.borrow_mut().remove(&client);
-    }
-
-    /// The server of a client that has run for long enough.
-    fn settled(&self, client: u32) -> Option<String> {
-        let seats = self.0.borrow();
-        let seat = seats.get(&client).filter(|seat| seat.last.len() == SECONDS)?;
-        Some(seat.server.clone())
-    }
-
-    /// The pace of each client of a server.
-    fn of(&self, server: &str) -> Vec<f64> {
-        let seats = self.0.borrow();
-        let here = seats.values().filter(|seat| seat.server == server);
-        #[expect(clippy::cast_precision_loss, reason = "a few seconds")]
-        here.map(|seat| seat.last.iter().sum::<f64>() / seat.last.len() as f64)
-            .collect()
-    }
 }
 
 impl Capacity {

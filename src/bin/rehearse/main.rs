@@ -20,6 +20,7 @@ mod http;
 mod interruption;
 mod line;
 mod localhost;
+mod paces;
 mod real_time_factors;
 mod report;
 mod returning;
