@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 use futures_util::{SinkExt, StreamExt};
 use serde::Deserialize;
 use tokio::net::TcpStream;
+use tokio_tungstenite::tungstenite::http::StatusCode;
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::tungstenite::{Error, Message};
 use tokio_tungstenite::{Connector, MaybeTlsStream, WebSocketStream, connect_async_tls_with_config};
@@ -29,6 +30,9 @@ pub(crate) enum Ended {
     /// The connection can't be established.
     #[error("{0} can't be reached: {1}")]
     Unreachable(String, String),
+    /// It is refused, with this status of HTTP.
+    #[error("{0} can't be reached: HTTP error: {1}")]
+    Refused(String, StatusCode),
     /// The peer has closed it.
     #[error("closed with {0}")]
     Closed(String),
@@ -111,7 +115,10 @@ impl Connection {
         let connected = actix_rt::time::timeout(CONNECT, connecting)
             .await
             .map_err(|_| failed("too slow".to_owned()))?;
-        let (socket, _) = connected.map_err(|error| failed(error.to_string()))?;
+        let (socket, _) = connected.map_err(|error| match error {
+            Error::Http(answer) => Ended::Refused(url.to_owned(), answer.status()),
+            error => failed(error.to_string()),
+        })?;
         Ok(Self { socket })
     }
 

@@ -1,6 +1,7 @@
 //! The session server as a web page uses it.
 
 use awc::Client;
+use tokio_tungstenite::tungstenite::http::StatusCode;
 use url::Url;
 use webots_fleet::shared::domain::Blame;
 
@@ -47,9 +48,9 @@ impl SessionServer {
         // Simulation servers have a load too, but nothing at `/`.
         match Connection::open(&self.availability_url()).await {
             Ok(availability) => availability.close().await,
-            Err(Ended::Unreachable(url, why)) if why.contains("404") => {
+            Err(Ended::Refused(url, status)) if status == StatusCode::NOT_FOUND => {
                 return Err(format!(
-                    "{url} tells no availability ({why}): no session server, maybe a simulation server"
+                    "{url} tells no availability ({status}): no session server, maybe a simulation server"
                 ));
             }
             // Later steps report this error.

@@ -20,7 +20,7 @@ pub(crate) fn told(came: &Result<String, Ended>) -> String {
 pub(crate) fn over(ended: &Ended) -> String {
     match ended {
         Ended::Closed(_) | Ended::Broken(_) => format!("the connection was {ended}"),
-        Ended::Unreachable(..) | Ended::Late(_) => ended.to_string(),
+        Ended::Unreachable(..) | Ended::Refused(..) | Ended::Late(_) => ended.to_string(),
         Ended::Fault(text) => excerpt(text),
     }
 }
