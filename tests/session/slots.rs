@@ -90,3 +90,16 @@ async fn a_server_that_lies_and_floods_disturbs_no_other_and_no_turn() {
     assert_eq!(second.until("ws://").await, format!("ws://{}", honest.address()));
     assert_eq!(session.status().await["line"]["waiting"], 0);
 }
+
+#[actix_rt::test]
+async fn a_link_that_breaks_at_its_begin_is_opened_again_and_blames_no_key() {
+    let mut server = ReservingServer::start(1, 10.0).await;
+    server.break_next(3);
+    let session = session_server(&[server.address.clone()])
+        .set("fleetKey", SECRET)
+        .start()
+        .await;
+    server.link().await;
+    assert_eq!(server.breaks_left(), 0);
+    assert!(!session.log().contains("fleetKey is another one"), "{}", session.log());
+}

@@ -143,6 +143,21 @@ async fn a_ticket_keeps_the_place_over_a_reload_and_a_restart_of_the_session_ser
     assert_eq!(forged.position().await, "queue: 3");
 }
 
+#[actix_rt::test]
+async fn a_turn_is_for_the_world_that_was_asked_for() {
+    let key = |builder: Builder| builder.set("fleetKey", "a secret of this test");
+    let (server, session) = one_full_server(key).await;
+    let Waiting(mut client, ticket) = Waiting::enter(&session, "lab").await;
+    server.set(Manner::idle(1.0, 1));
+    client.until("ws://").await;
+    drop(client);
+    server.set(Manner::status(1.0, 1, 1));
+    until_states(&session, &["full"]).await;
+    // With the ticket of that turn for another world: it waits again, and does not hear a turn for the first.
+    let mut other = Waiting::come_back(&session, "other", &ticket).await;
+    assert_eq!(other.position().await, "queue: 0");
+}
+
 /// A WebSocket that can be cut like a cable.
 async fn bare(session: &Server) -> TcpStream {
     let mut socket = TcpStream::connect(session.address()).await.unwrap();

@@ -237,6 +237,12 @@ async fn only_a_server_with_the_key_gets_slots() {
     let (mut socket, _) = Link::challenged(&server).await;
     socket.send(r#"{"number": 1, "first": [], "all": 0}"#).await;
     assert_eq!(socket.closed().await, Some(1008));
+    // Who has not proved anything sends no long messages, and is not waited for.
+    let (mut socket, _) = Link::challenged(&server).await;
+    socket.send(&"x".repeat(9 * 1024)).await;
+    assert_eq!(socket.closed().await, Some(1008));
+    let (mut socket, _) = Link::challenged(&server).await;
+    assert_eq!(socket.closed().await, Some(1008));
     let plain = demo_server(1).start().await;
     assert_eq!(
         Client::with_headers(&plain.websocket("/slots"), &[]).await.unwrap_err(),

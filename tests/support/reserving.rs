@@ -1,6 +1,7 @@
 //! A stand-in for a simulation server that reserves slots for the line: it answers `/status`, and on `/slots` a test
 //! says what it does.
 
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 
 use futures_util::{SinkExt, StreamExt};
@@ -20,6 +21,7 @@ pub struct ReservingServer {
     pub address: String,
     status: Arc<Mutex<Value>>,
     links: UnboundedReceiver<SlotSocket>,
+    breaks: Arc<AtomicUsize>,
 }
 
 /// The connection of a session server, which has proved that it has the key.
@@ -36,14 +38,31 @@ impl ReservingServer {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = listener.local_addr().unwrap().to_string();
         let status = Arc::new(Mutex::new(status(0, slots)));
+        let breaks = Arc::new(AtomicUsize::new(0));
         let (sender, links) = unbounded_channel();
-        let shared = Arc::clone(&status);
+        let (shared, broken) = (Arc::clone(&status), Arc::clone(&breaks));
         actix_rt::spawn(async move {
             while let Ok((socket, _)) = listener.accept().await {
-                actix_rt::spawn(answer(socket, Arc::clone(&shared), sender.clone(), pass));
+                let answered = answer(socket, Arc::clone(&shared), Arc::clone(&broken), sender.clone(), pass);
+                actix_rt::spawn(answered);
             }
         });
-        Self { address, status, links }
+        Self {
+            address,
+            status,
+            links,
+            breaks,
+        }
+    }
+
+    /// The next so many connections break after the proof.
+    pub fn break_next(&self, count: usize) {
+        self.breaks.store(count, Ordering::Relaxed);
+    }
+
+    /// How many connections have yet to break.
+    pub fn breaks_left(&self) -> usize {
+        self.breaks.load(Ordering::Relaxed)
     }
 
     /// Reports these slots from now on.
@@ -123,6 +142,7 @@ impl SlotSocket {
 async fn answer(
     mut socket: TcpStream,
     status: Arc<Mutex<Value>>,
+    breaks: Arc<AtomicUsize>,
     links: UnboundedSender<SlotSocket>,
     pass: f64,
 ) -> Option<()> {
@@ -151,6 +171,11 @@ async fn answer(
     link.say(serde_json::to_string(&hello).unwrap()).await;
     // Its proof.
     link.0.next().await?.ok()?;
+    let left = breaks.load(Ordering::Relaxed);
+    if left > 0 {
+        breaks.store(left - 1, Ordering::Relaxed);
+        return None;
+    }
     link.offer(&Offers::default()).await;
     links.send(link).ok()
 }

@@ -233,13 +233,17 @@ impl Roster {
         }
     }
 
-    /// The server of the simulation with this id; `server` tells it from those of others with the same id.
-    pub fn server_of(&self, id: &str, server: Option<&str>) -> Option<PublicAddress> {
+    /// The servers of the simulations with this id: seldom more than one.
+    pub fn servers_of(&self, id: &str) -> Vec<PublicAddress> {
         let list = self.list.lock();
         let with_id = list.entries.keys().filter(|(_, one)| one == id);
-        let mut servers = with_id.filter_map(|(of, _)| of.as_ref());
-        let is_it = |of: &&PublicAddress| server.is_none_or(|server| of.to_string() == server);
-        servers.find(is_it).cloned()
+        with_id.filter_map(|(of, _)| of.clone()).collect()
+    }
+
+    /// The server of the simulation with this id; `server` tells it from those of others with the same id.
+    pub fn server_of(&self, id: &str, server: Option<&str>) -> Option<PublicAddress> {
+        let is_it = |of: &PublicAddress| server.is_none_or(|server| of.to_string() == server);
+        self.servers_of(id).into_iter().find(is_it)
     }
 
     /// A page shows the list from now on.

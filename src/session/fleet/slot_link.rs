@@ -14,7 +14,7 @@ use actix_codec::Framed;
 use awc::BoxedSocket;
 use awc::error::WsClientError;
 use awc::http::StatusCode;
-use awc::ws::{Codec, Frame, Message as Text};
+use awc::ws::{CloseCode, Codec, Frame, Message as Text};
 use futures_util::{SinkExt, StreamExt};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -86,6 +86,8 @@ enum LinkError {
     Unsupported,
     #[error("its fleetKey is another one")]
     WrongKey,
+    #[error("it refuses what it was sent")]
+    Refused,
     #[error("{0}")]
     Broken(String),
 }
@@ -122,7 +124,7 @@ impl SlotLink {
             .await;
             log::debug!("{}: no slots are reserved: {error}", self.server);
             let pause = match error {
-                LinkError::Broken(_) => PAUSE,
+                LinkError::Broken(_) | LinkError::Refused => PAUSE,
                 LinkError::Unsupported => LONG_PAUSE,
                 LinkError::WrongKey => {
                     if !is_warned {
@@ -148,9 +150,9 @@ impl SlotLink {
         })?;
         let hello: Hello = receive(&mut socket, CONNECT).await?;
         send(&mut socket, &hello.prove(&self.key)).await?;
-        // A server with another key closes the connection.
+        // A server with another key refuses the proof.
         let first: Offers = receive(&mut socket, CONNECT).await.map_err(|error| match error {
-            LinkError::Broken(_) => LinkError::WrongKey,
+            LinkError::Refused => LinkError::WrongKey,
             error => error,
         })?;
         // Those for an earlier link.
@@ -289,6 +291,7 @@ async fn receive<M: DeserializeOwned>(socket: &mut Socket, limit: Duration) -> R
                 sleep(BETWEEN_MESSAGES).await;
             }
             Some(Ok(Frame::Pong(_))) => sleep(BETWEEN_MESSAGES).await,
+            Some(Ok(Frame::Close(Some(why)))) if why.code == CloseCode::Policy => return Err(LinkError::Refused),
             Some(Ok(_)) | None => return Err(broken("it has ended")),
             Some(Err(error)) => return Err(broken(&error.to_string())),
         }

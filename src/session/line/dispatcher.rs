@@ -130,7 +130,8 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
     /// A client asks for a slot. With a valid ticket it has the place in that; `number` is that of a new ticket. `is_up`
     /// is whether a server answers, `terms` on what terms one takes a world by its last report.
     ///
-    /// A ticket whose turn has come is not valid any more, unless the server is gone that had to take its client.
+    /// A ticket whose turn has come is not valid any more, except to hear that turn again for the same world, or if the server
+    /// is gone that had to take its client.
     pub fn enter(
         &mut self,
         ticket: Option<Ticket>,
@@ -152,7 +153,10 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
                     place = ticket.place;
                     self.turns.remove(&place.number);
                 }
-                Some(past) if now.instant < past.until => return Entered::Again(past.turn.clone()),
+                // A pass is for one world.
+                Some(past) if now.instant < past.until && *past.turn.world == entry.world => {
+                    return Entered::Again(past.turn.clone());
+                }
                 Some(_) => {}
             }
         }

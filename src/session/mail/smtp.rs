@@ -4,6 +4,7 @@
 //! The trusted authorities are read from the system for each e-mail, so that a renewed file needs no restart.
 
 use std::error::Error;
+use std::io;
 
 use lettre::Message;
 use lettre::message::Mailbox;
@@ -12,6 +13,7 @@ use lettre::transport::smtp::Error as SmtpError;
 use lettre::transport::smtp::authentication::{Credentials, DEFAULT_MECHANISMS};
 use lettre::transport::smtp::client::{AsyncSmtpConnection, TlsParameters};
 use lettre::transport::smtp::extension::ClientId;
+use rustls::Error as TlsError;
 use rustls::pki_types::ServerName;
 use tokio::net::TcpStream;
 use tokio_rustls::TlsConnector;
@@ -134,15 +136,24 @@ impl SmtpRelay {
 
 /// Why an e-mail was not sent: the SMTP server's answer, or the innermost cause.
 fn reason(problem: &(dyn Error + 'static)) -> String {
-    let causes = std::iter::successors(Some(problem), |problem| (*problem).source());
-    let cause = causes.last().map(ToString::to_string).unwrap_or_default();
-    match problem.downcast_ref().and_then(SmtpError::status) {
-        Some(code) => format!("{code} {cause}"),
-        None if cause.starts_with("invalid peer certificate") => {
-            format!("its certificate is not trusted: {cause} (SSL_CERT_FILE may name another authority)")
+    let causes = || std::iter::successors(Some(problem), |problem| (*problem).source());
+    let cause = causes().last().map(ToString::to_string).unwrap_or_default();
+    match (
+        problem.downcast_ref().and_then(SmtpError::status),
+        causes().find_map(tls_error),
+    ) {
+        (Some(code), _) => format!("{code} {cause}"),
+        (None, Some(error @ TlsError::InvalidCertificate(_))) => {
+            format!("{} (SSL_CERT_FILE may name another authority)", tls::in_words(error))
         }
-        None => cause,
+        (None, _) => cause,
     }
+}
+
+/// The error of TLS that this is, or that it contains.
+fn tls_error<'error>(problem: &'error (dyn Error + 'static)) -> Option<&'error TlsError> {
+    let of_io = || problem.downcast_ref::<io::Error>()?.get_ref()?.downcast_ref();
+    problem.downcast_ref().or_else(of_io)
 }
 
 #[cfg(test)]

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use actix::Recipient;
 use actix_rt::time::sleep;
-use actix_web::error::{ErrorBadRequest, ErrorNotFound, ErrorServiceUnavailable};
+use actix_web::error::{ErrorBadRequest, ErrorConflict, ErrorNotFound, ErrorServiceUnavailable};
 use actix_web::http::header;
 use actix_web::web::Bytes;
 use actix_web::{HttpRequest, HttpResponse, Result, web};
@@ -173,8 +173,18 @@ async fn stop(
         Ok(order) => order,
         Err(refusal) => return Ok(refusal),
     };
+    let id = id.into_inner();
+    let servers = server.roster.servers_of(&id);
+    if servers.len() > 1 {
+        let servers: Vec<String> = servers.iter().map(ToString::to_string).collect();
+        return Err(ErrorConflict(format!(
+            "Error: several servers have a simulation with this id ({}); POST /simulations/stop with \"ids\" and \"server\" \
+             stops one.",
+            servers.join(", ")
+        )));
+    }
     let which = Matching {
-        ids: Some(vec![id.into_inner()]),
+        ids: Some(vec![id]),
         ..Matching::default()
     };
     let by = administrator.to_string();

@@ -4,6 +4,7 @@
 //! latest value, and never the same twice in a row. A text from the client requests a simulation server, at once or when
 //! it is its turn in the line.
 
+use std::hash::{DefaultHasher, Hash, Hasher};
 use std::sync::Arc;
 use std::time::SystemTime;
 
@@ -20,7 +21,7 @@ use super::refusal;
 use crate::session::fleet::{LineEvent, StopWaiting, Wait};
 use crate::session::line::{Place, Progress, Ticket};
 use crate::session::state::{AppState, PLACED, read_world};
-use crate::shared::domain::Failure;
+use crate::shared::domain::{Failure, ProjectUrl};
 use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::websocket::wrong_message;
 use crate::shared::http::{ConnectionPermit, Peer};
@@ -44,8 +45,9 @@ pub struct WebClient {
 }
 
 /// A client that waits in the line.
-#[derive(Default)]
 struct Waiting {
+    /// The hash of the world that it waits for: the world itself is kept once, in the line.
+    world: u64,
     /// The seconds until its turn, as last sent.
     estimate: Option<u32>,
 }
@@ -112,7 +114,10 @@ impl WebClient {
             Ok(world) => world,
             Err(failure) => return Self::refuse(&failure, request.wants_reason, ctx),
         };
-        self.waiting = Some(Waiting::default());
+        self.waiting = Some(Waiting {
+            world: hash(&world),
+            estimate: None,
+        });
         let wait = Wait {
             world,
             ticket: ticket.and_then(|text| Ticket::read(text, &self.server.key, now())),
@@ -161,6 +166,12 @@ impl WebClient {
 fn now() -> u64 {
     let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
     since.map_or(0, |since| u64::try_from(since.as_millis()).unwrap_or(u64::MAX))
+}
+
+fn hash(world: &ProjectUrl) -> u64 {
+    let mut hasher = DefaultHasher::new();
+    world.hash(&mut hasher);
+    hasher.finish()
 }
 
 /// What a client's text requests.
@@ -254,14 +265,15 @@ impl Handler<LineEvent> for WebClient {
                 }
                 waiting.estimate = estimate;
             }
+            // It has asked for another world meanwhile.
+            LineEvent::Turn(turn) if hash(&turn.world) != waiting.world => {}
             LineEvent::Turn(turn) => {
                 if let Some(pass) = turn.pass {
                     ctx.text(format!("pass: {}", pass.write(&self.server.key, &turn.world)));
                 }
                 ctx.text(self.server.client_urls.websocket_url(&turn.server));
                 self.server.picks.with_label_values(&[PLACED]).inc();
-                // It may have asked for another world meanwhile.
-                self.stop_waiting();
+                self.waiting = None;
             }
             LineEvent::TakenOver => {
                 ctx.text("Error: another connection has this place in the line.");

@@ -38,9 +38,16 @@ pub fn reason(error: &SendRequestError) -> Option<String> {
         return None;
     };
     let reason = match error.get_ref()?.downcast_ref::<Error>()? {
-        Error::InvalidCertificate(problem) => format!("its certificate is not trusted: {problem}"),
         Error::InvalidMessage(_) => "it does not speak https there".to_owned(),
-        other => format!("encryption failed: {other}"),
+        other => in_words(other),
     };
     Some(excerpt(&reason, MAX_REASON_LENGTH))
+}
+
+/// An error of TLS.
+pub fn in_words(error: &Error) -> String {
+    match error {
+        Error::InvalidCertificate(problem) => format!("its certificate is not trusted: {problem}"),
+        other => format!("encryption failed: {other}"),
+    }
 }

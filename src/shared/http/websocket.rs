@@ -1,5 +1,8 @@
 //! WebSockets: opens them, and joins messages of several frames.
 
+use std::cell::Cell;
+use std::rc::Rc;
+
 use actix::{Actor, AsyncContext, StreamHandler};
 use actix_http::ws::{Codec, Frame, Item};
 use actix_web::web::{Bytes, BytesMut, Payload};
@@ -10,6 +13,7 @@ use futures_util::stream::{self, Stream, StreamExt};
 use tokio_util::codec::Decoder;
 
 use super::routing::refuse_body;
+use crate::shared::domain::MAX_LINK_MESSAGE;
 
 /// Size limit of a client's message, in bytes.
 const MAX_MESSAGE: usize = 8 * 1024;
@@ -27,28 +31,49 @@ pub fn wrong_message(message: Result<Message, ProtocolError>) -> (String, CloseC
     (format!("Wrong message: {problem}"), code)
 }
 
+/// Size limit of the messages of a connection. Its actor raises it once it knows the peer.
+#[derive(Debug, Clone)]
+pub struct MessageLimit(Rc<Cell<usize>>);
+
+impl Default for MessageLimit {
+    fn default() -> Self {
+        Self(Rc::new(Cell::new(MAX_MESSAGE)))
+    }
+}
+
+impl MessageLimit {
+    /// Allows messages of up to [`MAX_LINK_MESSAGE`] from now on.
+    pub fn raise(&self) {
+        self.0.set(MAX_LINK_MESSAGE);
+    }
+}
+
 /// Splits the bytes of a client into frames.
 pub struct FrameReader {
     codec: Codec,
     /// The bytes of an incomplete frame.
     unread: BytesMut,
-    /// Size limit of a frame, in bytes.
-    max: usize,
+    limit: MessageLimit,
 }
 
 impl Default for FrameReader {
     fn default() -> Self {
-        Self::new(MAX_MESSAGE)
+        Self::new(MessageLimit::default())
     }
 }
 
 impl FrameReader {
-    fn new(max: usize) -> Self {
+    fn new(limit: MessageLimit) -> Self {
         Self {
-            codec: Codec::new().max_size(max),
+            codec: Codec::new().max_size(MAX_LINK_MESSAGE),
             unread: BytesMut::new(),
-            max,
+            limit,
         }
+    }
+
+    /// Size limit of a frame, in bytes.
+    fn max(&self) -> usize {
+        self.limit.0.get()
     }
 
     /// Adds bytes of the client.
@@ -67,11 +92,26 @@ impl FrameReader {
     /// When it is too large or breaks the rules of WebSockets.
     pub fn take(&mut self) -> Result<Option<Frame>, ProtocolError> {
         let frame = self.codec.decode(&mut self.unread)?;
-        // The codec reports a frame that is too large only once it is complete.
-        if frame.is_none() && self.unread.len() > self.max + FRAME_HEADER {
+        // The codec knows only the highest limit, and reports a frame that is too large only once it is complete.
+        let is_too_large = match &frame {
+            Some(frame) => length(frame) > self.max(),
+            None => self.unread.len() > self.max() + FRAME_HEADER,
+        };
+        if is_too_large {
             return Err(ProtocolError::Overflow);
         }
         Ok(frame)
+    }
+}
+
+/// The length of what a frame carries, in bytes.
+fn length(frame: &Frame) -> usize {
+    match frame {
+        Frame::Text(content) | Frame::Binary(content) | Frame::Ping(content) | Frame::Pong(content) => content.len(),
+        Frame::Continuation(
+            Item::FirstText(piece) | Item::FirstBinary(piece) | Item::Continue(piece) | Item::Last(piece),
+        ) => piece.len(),
+        Frame::Close(_) => 0,
     }
 }
 
@@ -79,13 +119,13 @@ impl FrameReader {
 ///
 /// Bytes are read only after all earlier messages were taken: actix's own stream reads on while messages wait, so that
 /// one client could fill the memory.
-fn messages(payload: Payload, max: usize) -> impl Stream<Item = Result<Message, ProtocolError>> {
-    let state = (payload, FrameReader::new(max), BytesMut::new());
+fn messages(payload: Payload, limit: MessageLimit) -> impl Stream<Item = Result<Message, ProtocolError>> {
+    let state = (payload, FrameReader::new(limit), BytesMut::new());
     stream::unfold(state, async |(mut payload, mut frames, mut partial)| {
         let message = loop {
             match frames.take() {
                 Ok(Some(frame)) => {
-                    if let Some(message) = complete(frame, &mut partial, frames.max).transpose() {
+                    if let Some(message) = complete(frame, &mut partial, frames.max()).transpose() {
                         break message;
                     }
                 }
@@ -145,11 +185,11 @@ pub fn open<A>(request: &HttpRequest, payload: Payload, actor: A) -> HttpRespons
 where
     A: Actor<Context = WebsocketContext<A>> + StreamHandler<Result<Message, ProtocolError>>,
 {
-    open_for(MAX_MESSAGE, request, payload, actor)
+    open_limited(MessageLimit::default(), request, payload, actor)
 }
 
-/// As [`open`], for messages of up to `max` bytes.
-pub fn open_for<A>(max: usize, request: &HttpRequest, payload: Payload, actor: A) -> HttpResponse
+/// As [`open`], for messages up to a limit that the actor can raise.
+pub fn open_limited<A>(limit: MessageLimit, request: &HttpRequest, payload: Payload, actor: A) -> HttpResponse
 where
     A: Actor<Context = WebsocketContext<A>> + StreamHandler<Result<Message, ProtocolError>>,
 {
@@ -158,7 +198,7 @@ where
     }
     match ws::handshake(request) {
         Ok(mut answer) => answer.streaming(WebsocketContext::with_factory(stream::pending(), move |ctx| {
-            ctx.add_stream(messages(payload, max));
+            ctx.add_stream(messages(payload, limit));
             actor
         })),
         Err(error) => refuse(&error),

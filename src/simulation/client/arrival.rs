@@ -56,11 +56,9 @@ impl Session {
 
     /// Ends the simulation if no viewer is there. A client that is away has its own time limit.
     fn check_arrival(&mut self, ctx: &mut Context<Self>) {
-        if self.awaited().is_none() || matches!(self.client, Client::Away(_)) {
-            return;
-        }
+        let Some(wait) = self.awaited() else { return };
         if !self.server.config.ports_are_public() {
-            return self.end_unviewed(ctx);
+            return self.end_unviewed(wait, ctx);
         }
         let State::Ready(ready) = &self.state else { return };
         let port = ready.port;
@@ -71,16 +69,17 @@ impl Session {
                 None => spawn_blocking(move || has_connection(port)).await.ok().flatten(),
             }
         };
-        let check = seen.into_actor(self).map(|is_viewed, this, ctx| match is_viewed {
-            Some(false) => this.end_unviewed(ctx),
+        let check = seen.into_actor(self).map(move |is_viewed, this, ctx| match is_viewed {
+            Some(false) => this.end_unviewed(wait, ctx),
             // What is not known is no reason to end a simulation.
             Some(true) | None => this.settle_arrival(ctx),
         });
         ctx.spawn(check);
     }
 
-    fn end_unviewed(&mut self, ctx: &mut Context<Self>) {
-        if self.awaited().is_some() {
+    /// Ends the simulation, unless its client is away, or has come back since this wait.
+    fn end_unviewed(&mut self, wait: SpawnHandle, ctx: &mut Context<Self>) {
+        if self.awaited() == Some(wait) && !matches!(self.client, Client::Away(_)) {
             self.report(StopReason::NoViewer);
             self.finish(StopReason::NoViewer.into(), ctx);
         }

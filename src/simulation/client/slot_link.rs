@@ -16,6 +16,7 @@ use crate::shared::domain::{
     FleetKey, Follow, Hello, KeepReady, Proof, Stopped, ToSessionServer, ToSimulationServer, Wishes,
 };
 use crate::shared::http::liveness::{self, Liveness};
+use crate::shared::http::websocket::MessageLimit;
 use crate::shared::http::{ConnectionPermit, Peer};
 use crate::shared::run::{Phase, leaving};
 use crate::shared::text::one_line;
@@ -28,8 +29,8 @@ pub struct SlotLink {
     peer: Peer,
     key: FleetKey,
     state: State,
-    /// What it was told of the simulations here, once it follows them.
-    roster: Option<RosterFeed>,
+    /// That of its messages.
+    limit: MessageLimit,
     liveness: Liveness,
     _permit: ConnectionPermit,
 }
@@ -39,17 +40,29 @@ enum State {
     /// It has to answer this.
     Challenged(Hello),
     /// It has the key.
-    Trusted(LinkId),
+    Trusted {
+        id: LinkId,
+        /// What it was told of the simulations here, once it follows them.
+        roster: Option<RosterFeed>,
+    },
 }
 
 type Context = WebsocketContext<SlotLink>;
 
 /// Interval between two looks at the simulations.
 const LOOK: Duration = Duration::from_millis(250);
+/// Time in which the peer must prove that it has the key.
+const PROOF: Duration = Duration::from_secs(5);
 
 impl SlotLink {
-    /// A session server that has just connected; `permit` counts it.
-    pub fn new(server: Arc<AppState>, peer: Peer, key: FleetKey, permit: ConnectionPermit) -> Self {
+    /// A session server that has just connected; `limit` is that of its messages, and `permit` counts it.
+    pub fn new(
+        server: Arc<AppState>,
+        peer: Peer,
+        key: FleetKey,
+        limit: MessageLimit,
+        permit: ConnectionPermit,
+    ) -> Self {
         let hello = Hello {
             challenge: rand::random(),
             server: server.server_run,
@@ -62,7 +75,7 @@ impl SlotLink {
             peer,
             key,
             state: State::Challenged(hello),
-            roster: None,
+            limit,
             liveness: Liveness::default(),
             _permit: permit,
         }
@@ -88,10 +101,11 @@ impl SlotLink {
                     self.peer
                 );
                 let id = LinkId(rand::random());
-                self.state = State::Trusted(id);
+                self.state = State::Trusted { id, roster: None };
+                self.limit.raise();
                 self.server.slots.open_link(id, ctx.address().recipient());
             }
-            State::Trusted(id) => match serde_json::from_str(text) {
+            State::Trusted { id, .. } => match serde_json::from_str(text) {
                 Ok(ToSimulationServer::Ready(KeepReady { keep_ready })) => {
                     self.server.spare_wishes.ask(*id, keep_ready);
                 }
@@ -125,15 +139,31 @@ impl SlotLink {
         self.server
             .class_page
             .send_replace(page.filter(|page| matches!(page.scheme(), "http" | "https")));
-        if self.roster.is_none() {
+        let State::Trusted { roster, .. } = &mut self.state else {
+            return;
+        };
+        if roster.is_none() {
             ctx.run_interval(LOOK, Self::tell_changes);
         }
-        self.roster.get_or_insert_default().has_figures = follow.figures;
+        roster.get_or_insert_default().has_figures = follow.figures;
         self.tell_changes(ctx);
     }
 
+    /// The list of the simulations here, if the peer follows it.
+    fn roster(&mut self) -> Option<&mut RosterFeed> {
+        match &mut self.state {
+            State::Challenged(_) => None,
+            State::Trusted { roster, .. } => roster.as_mut(),
+        }
+    }
+
     fn tell_changes(&mut self, ctx: &mut Context) {
-        let Some(roster) = &mut self.roster else { return };
+        let State::Trusted {
+            roster: Some(roster), ..
+        } = &mut self.state
+        else {
+            return;
+        };
         for update in roster.updates(&self.server.slots.snapshot().simulations) {
             Self::send(&ToSessionServer::Roster(update), ctx);
         }
@@ -144,14 +174,14 @@ impl SlotLink {
 
     /// Measures what simulations use. The figures follow with the next look at the simulations.
     fn measure(&mut self, ctx: &mut Context) {
-        if let Some(roster) = &mut self.roster {
+        if let Some(roster) = self.roster() {
             roster.begin();
         }
         let server = Arc::clone(&self.server);
         async move { server.usages(&server.slots.snapshot()).await }
             .into_actor(self)
             .map(|usages, link, _| {
-                if let Some(roster) = &mut link.roster {
+                if let Some(roster) = link.roster() {
                     roster.usages = usages;
                 }
             })
@@ -176,11 +206,16 @@ impl Actor for SlotLink {
         if let State::Challenged(hello) = &self.state {
             Self::send(hello, ctx);
         }
+        ctx.run_later(PROOF, |link, ctx| {
+            if let State::Challenged(_) = link.state {
+                Self::close(CloseCode::Policy, ctx);
+            }
+        });
         let mut phase = self.server.phase.subscribe();
         async move { phase.wait_for(|phase| *phase != Phase::Open).await.is_ok() }
             .into_actor(self)
             .map(|_, link, _| {
-                if let State::Trusted(id) = link.state {
+                if let State::Trusted { id, .. } = link.state {
                     link.server.slots.clear_wishes(id);
                 }
             })
@@ -192,7 +227,7 @@ impl Actor for SlotLink {
     }
 
     fn stopped(&mut self, _: &mut Self::Context) {
-        if let State::Trusted(id) = self.state {
+        if let State::Trusted { id, .. } = self.state {
             self.server.slots.close_link(id);
             self.server.spare_wishes.leave(id);
         }
@@ -211,7 +246,7 @@ impl StreamHandler<Result<Message, ProtocolError>> for SlotLink {
     fn handle(&mut self, message: Result<Message, ProtocolError>, ctx: &mut Self::Context) {
         match message {
             Ok(Message::Text(text)) => self.handle_text(&text, ctx),
-            Ok(Message::Ping(data)) => ctx.pong(&data),
+            Ok(Message::Ping(data)) if self.liveness.may_answer() => ctx.pong(&data),
             Ok(Message::Pong(content)) => self.liveness.pong(&content),
             Ok(Message::Close(reason)) => {
                 ctx.close(reason);

@@ -352,7 +352,7 @@ impl Images {
             }
         }
         let message = match missing {
-            Some(base) if step.contains(" : FROM ") => format!(
+            Some(base) if instruction(step).is_some_and(|(_, what)| what.starts_with("FROM ")) => format!(
                 "The image of this project can't be built: this simulation server can't fetch the image {base}, with \
                  which it begins"
             ),
@@ -401,7 +401,7 @@ impl Images {
 
 /// The step of a build, from Docker's line about it, in at most nine steps; `None` for any other line.
 fn scaled(line: &str) -> Option<Progress> {
-    let (numbers, instruction) = line.strip_prefix("Step ")?.split_once(" : ")?;
+    let (numbers, instruction) = instruction(line)?;
     let (step, of) = numbers.split_once('/')?;
     let (step, of): (u64, u64) = (step.parse().ok()?, of.parse().ok()?);
     let step = if of > MAX_STEPS {
@@ -410,6 +410,11 @@ fn scaled(line: &str) -> Option<Progress> {
         step
     };
     Some(numbered(step, of.min(MAX_STEPS), instruction.to_owned()))
+}
+
+/// The numbers and the instruction in Docker's line about a step.
+fn instruction(line: &str) -> Option<(&str, &str)> {
+    line.strip_prefix("Step ")?.split_once(" : ")
 }
 
 fn numbered(number: u64, of: u64, text: String) -> Progress {

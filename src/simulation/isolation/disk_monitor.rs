@@ -8,6 +8,7 @@
 //! the longer a tick takes, the longer the pause after it.
 
 use std::io;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::time::{Duration, Instant};
@@ -48,7 +49,13 @@ impl DiskMonitor {
         };
         std::thread::Builder::new()
             .name("disk-monitor".to_owned())
-            .spawn(move || table.run(&receiver))?;
+            .spawn(move || {
+                // Without this thread no limit of the disk would hold: the server aborts, and the service manager restarts it.
+                let run = AssertUnwindSafe(|| table.run(&receiver));
+                if catch_unwind(run).is_err() {
+                    std::process::abort();
+                }
+            })?;
         Ok(Self(watches))
     }
 

@@ -8,8 +8,8 @@ use actix_web::{HttpRequest, HttpResponse, web};
 use super::access::{Visitor, check_origin};
 use super::status::status_page;
 use super::{actions, metrics, page_routes, stream_routes};
-use crate::shared::domain::MAX_LINK_MESSAGE;
 use crate::shared::http::routing::{self, GET, READ, path};
+use crate::shared::http::websocket::MessageLimit;
 use crate::shared::http::{CONTENT_TYPE, ConnectionKind, openapi, sign_in, websocket};
 use crate::simulation::client::{SlotLink, WebClient};
 use crate::simulation::client_identity::ClientIdentity;
@@ -67,8 +67,9 @@ async fn slots(
     let peer = server.config.trusted_proxies.peer(&request);
     let permit = server.connections.admit(ConnectionKind::Page, peer)?;
     let server = Arc::clone(&server);
-    let link = SlotLink::new(server, peer, key, permit);
-    Ok(websocket::open_for(MAX_LINK_MESSAGE, &request, stream, link))
+    let limit = MessageLimit::default();
+    let link = SlotLink::new(server, peer, key, limit.clone(), permit);
+    Ok(websocket::open_limited(limit, &request, stream, link))
 }
 
 async fn load(server: web::Data<AppState>) -> HttpResponse {
