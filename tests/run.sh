@@ -110,9 +110,9 @@ for command in "${beside[@]}"; do
     # shellcheck disable=SC2086 # None of its words has a space.
     [[ -z ${jobs[$command]-} ]] || finish $command
 done
-# These depend on the speed of the machine: nothing runs beside them.
-start "${CARGO[@]}" --test integration --test faults on_a_quiet_machine
-finish "${CARGO[@]}" --test integration --test faults on_a_quiet_machine
+# These depend on the speed of the machine: nothing runs beside them, and each runs alone.
+start "${CARGO[@]}" --test integration --test faults on_a_quiet_machine -- --test-threads=1
+finish "${CARGO[@]}" --test integration --test faults on_a_quiet_machine -- --test-threads=1
 start tests/own_network.sh "${CARGO[@]}" --test containers on_a_quiet_machine
 finish tests/own_network.sh "${CARGO[@]}" --test containers on_a_quiet_machine
 rm "$logs/busy"
