@@ -14,6 +14,8 @@ pub struct ReadyWorlds<Id>(HashMap<ProjectUrl, HashMap<Id, Left>>);
 #[derive(Debug, Default)]
 struct Left {
     reported: u32,
+    /// What the report before said.
+    before: u32,
     /// When clients were sent that the report may not show.
     sent: Vec<Instant>,
 }
@@ -31,8 +33,7 @@ impl<Id: Clone + Eq + Hash> ReadyWorlds<Id> {
     /// Records what a server has reported.
     pub fn report(&mut self, id: &Id, now: Instant, report: &ServerReport) {
         for left in self.0.values_mut().filter_map(|servers| servers.get_mut(id)) {
-            left.reported = 0;
-            left.sent.retain(|at| now.saturating_duration_since(*at) < UNSEEN);
+            left.before = std::mem::take(&mut left.reported);
         }
         for one in report
             .ready
@@ -42,6 +43,12 @@ impl<Id: Clone + Eq + Hash> ReadyWorlds<Id> {
             let servers = self.0.entry(one.world.clone()).or_default();
             let left = servers.entry(id.clone()).or_default();
             left.reported = left.reported.saturating_add(one.ready);
+        }
+        for left in self.0.values_mut().filter_map(|servers| servers.get_mut(id)) {
+            // Those that are gone were taken by the first who were sent.
+            let taken = left.before.saturating_sub(left.reported) as usize;
+            left.sent.drain(..taken.min(left.sent.len()));
+            left.sent.retain(|at| now.saturating_duration_since(*at) < UNSEEN);
         }
         self.forget(id, |left| left.reported == 0);
     }
@@ -185,8 +192,11 @@ mod tests {
         assert_eq!(worlds.left(&1, &world("a")), 1);
         worlds.report(&1, now + UNSEEN / 2, &report(2));
         assert_eq!(worlds.left(&1, &world("a")), 1, "it is on its way");
+        worlds.report(&1, now + UNSEEN / 2, &report(1));
+        assert_eq!(worlds.left(&1, &world("a")), 1, "it has taken one");
+        worlds.place(&1, &world("a"), now);
         worlds.report(&1, now + UNSEEN, &report(1));
-        assert_eq!(worlds.left(&1, &world("a")), 1);
+        assert_eq!(worlds.left(&1, &world("a")), 1, "it was refused");
         worlds.report(&1, now + UNSEEN, &report(0));
         worlds.lose(&2);
         assert_eq!((worlds.left(&1, &world("a")), worlds.left(&2, &world("a"))), (0, 0));
