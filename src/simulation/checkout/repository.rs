@@ -86,10 +86,11 @@ const MAX_QUERIES: usize = 4;
 const BETWEEN_ATTEMPTS: Duration = Duration::from_millis(50);
 
 /// Waits until no other process of this server fetches into the repository at this path, and keeps them from it until
-/// the returned file is closed. There are 256 locks; repositories that share one wait for each other.
+/// the returned file is closed. Two bytes of a hash name the lock: there are never more than 65,536 files, and hardly two
+/// repositories that wait for each other.
 async fn lock_among_processes(path: &Path) -> io::Result<File> {
     let hash = Sha256::digest(path.as_os_str().as_encoded_bytes());
-    let name = hex::encode(hash.first_chunk::<1>().unwrap_or(&[0]));
+    let name = hex::encode(hash.first_chunk::<2>().unwrap_or(&[0; 2]));
     let folder = path.ancestors().nth(2).unwrap_or(path).join("locks");
     std::fs::create_dir_all(&folder)?;
     let file = File::options()

@@ -401,8 +401,8 @@ impl Slots {
         self.real_time.places().map_or(all, |places| places.min(all))
     }
 
-    /// The slots that clients have, or that are reserved for them, or that other processes of this server have. That of a simulation without a client is as good as free,
-    /// unless it is promised.
+    /// The slots that clients have, or that are reserved for them, or that other processes of this server have. That of a
+    /// simulation without a client is as good as free, unless it is promised.
     pub(super) fn used(&self) -> usize {
         let of_clients = self
             .records
