@@ -209,3 +209,30 @@ async fn a_container_that_nobody_views_ends() {
     until("one is left", async || server.simulations().await.len() == 1).await;
     assert_eq!(server.simulations().await[0]["id"], watched.id());
 }
+
+#[actix_rt::test]
+async fn an_upgrade_ends_no_container() {
+    let Some(_docker) = docker().await else { return };
+    let server = server(3).start().await;
+    let mut first = Client::start(&server, &arm()).await;
+    first.patiently("webots:").await;
+    let mut viewer = Client::connect(&format!("ws://127.0.0.1:{}/", server.port + 1))
+        .await
+        .with_running_scene()
+        .await;
+    let now = viewer.time().await;
+    let before = containers(&server);
+    let (succeeds, told) = server.upgrade().await;
+    assert!(succeeds, "{told}");
+    assert!(viewer.time().await >= now, "it began anew");
+    let mut second = Client::start(&server, &arm()).await;
+    second.patiently("webots:").await;
+    assert_eq!(containers(&server).len(), 2);
+    drop(viewer);
+    first.leave().await;
+    until("the older process has ended", async || server.processes().len() == 1).await;
+    until("its container is gone", async || containers(&server).len() == 1).await;
+    assert!(!before.contains(&containers(&server)[0]));
+    second.leave().await;
+    until("all containers are gone", async || containers(&server).is_empty()).await;
+}

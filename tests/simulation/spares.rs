@@ -518,3 +518,26 @@ async fn on_a_quiet_machine_those_that_are_ready_cost_what_idle_simulations_cost
     );
     assert!(ready <= 1.2 * idle + 0.1, "{ready}, idle {idle}");
 }
+
+#[actix_rt::test]
+async fn an_upgrade_starts_anew_what_is_ready_and_keeps_what_a_client_has() {
+    let server = keeping(demo_server(3), 2).start().await;
+    until_ready(&server, 2).await;
+    let (client, _) = Client::resumable(&server).await;
+    until_ready(&server, 2).await;
+    let before = pids(&server);
+    let of_three = before.len();
+    let (succeeds, told) = server.upgrade().await;
+    assert!(succeeds, "{told}");
+    until("those of the older process have ended", async || {
+        pids(&server).iter().filter(|pid| before.contains(pid)).count() == of_three / 3
+    })
+    .await;
+    until_ready(&server, 2).await;
+    assert_eq!(pids(&server).len(), of_three, "nothing is started twice");
+    assert_eq!(server.simulations().await[0]["id"], client.id());
+    client.close_with(1000).await;
+    until("one process is left", async || server.processes().len() == 1).await;
+    until("it is listed no more", async || server.simulations().await.is_empty()).await;
+    until_ready(&server, 2).await;
+}

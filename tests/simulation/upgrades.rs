@@ -13,6 +13,7 @@ use tokio::net::TcpStream;
 
 use super::life::quick;
 use crate::support::http::{self, PASSWORD, get_as_administrator, post};
+use crate::support::wrapper::Wrapper;
 use crate::support::{Builder, Client, SOON, Server, arm, demo_server, instances_below, until};
 
 /// What goes on while a server is upgraded.
@@ -401,4 +402,32 @@ async fn older_processes_outlive_a_crash_of_the_newest() {
     other.close_with(1000).await;
     ends_clean(&again, again.pid()).await;
     assert_eq!(client.closed().await, Some(1001));
+}
+
+#[actix_rt::test]
+async fn a_checkout_goes_on_and_a_new_process_waits_for_its_fetch() {
+    let folder = tempfile::tempdir().unwrap();
+    let held = folder.path().join("held");
+    std::fs::write(&held, "").unwrap();
+    let wrapper = Wrapper::git(&format!(
+        "case \"$*\" in *fetch*) while [ -e {} ]; do sleep 0.05; done;; esac",
+        held.display()
+    ));
+    let server = quick(demo_server(3)).env("PATH", &wrapper.path()).start().await;
+    let mut first = Client::start(&server, &arm()).await;
+    until("it fetches", async || wrapper.count("fetch") == 1).await;
+    let main = upgrade(&server).await;
+    let mut second = Client::start(&server, &arm()).await;
+    second
+        .until("loading: Step 2/9 : fetching https://github.com/lab/arm: waiting for another fetch")
+        .await;
+    assert!(second.is_silent(Duration::from_millis(500)).await, "{:?}", second.heard);
+    assert_eq!(wrapper.count("fetch"), 1, "one at a time: {:?}", wrapper.calls());
+    std::fs::remove_file(held).unwrap();
+    first.until("webots:").await;
+    second.until("webots:").await;
+    first.close_with(1000).await;
+    until("the older process has ended", async || server.processes() == [main]).await;
+    second.close_with(1000).await;
+    ends_clean(&server, main).await;
 }

@@ -14,7 +14,7 @@ use std::time::Duration;
 use parking_lot::Mutex;
 use rustix::process::Resource;
 use sha2::{Digest, Sha256};
-use tokio::sync::Semaphore;
+use tokio::sync::{OwnedMutexGuard, Semaphore};
 
 use super::disk::{has_unfinished_pack, remove_leftovers, spawn_blocking_io};
 use super::git::{Git, GitError, GitExit, LITTLE_MEMORY, stall_timeout};
@@ -85,26 +85,18 @@ const MAX_QUERIES: usize = 4;
 /// Interval between two attempts to get a lock that another process has.
 const BETWEEN_ATTEMPTS: Duration = Duration::from_millis(50);
 
-/// Waits until no other process of this server fetches into the repository at this path, and keeps them from it until
-/// the returned file is closed. Two bytes of a hash name the lock: there are never more than 65,536 files, and hardly two
-/// repositories that wait for each other.
-async fn lock_among_processes(path: &Path) -> io::Result<File> {
+/// What keeps other fetches from a repository until it is dropped: those of this process, and of others of this server.
+type FetchLock = (OwnedMutexGuard<()>, File);
+
+/// The file whose lock a process holds while it fetches into the repository at this path. Two bytes of a hash name it:
+/// there are never more than 65,536 files, and hardly two repositories that wait for each other.
+fn lock_file(path: &Path) -> io::Result<File> {
     let hash = Sha256::digest(path.as_os_str().as_encoded_bytes());
     let name = hex::encode(hash.first_chunk::<2>().unwrap_or(&[0; 2]));
     let folder = path.ancestors().nth(2).unwrap_or(path).join("locks");
     std::fs::create_dir_all(&folder)?;
-    let file = File::options()
-        .write(true)
-        .create(true)
-        .truncate(false)
-        .open(folder.join(name))?;
-    loop {
-        match file.try_lock() {
-            Ok(()) => return Ok(file),
-            Err(TryLockError::WouldBlock) => actix_rt::time::sleep(BETWEEN_ATTEMPTS).await,
-            Err(TryLockError::Error(error)) => return Err(error),
-        }
-    }
+    let mut options = File::options();
+    options.write(true).create(true).truncate(false).open(folder.join(name))
 }
 
 impl Repository {
@@ -164,6 +156,28 @@ impl Repository {
         self.git.run(call, |_| ()).await
     }
 
+    /// Waits until nobody else fetches, here or in another process of this server; calls `waits` if somebody does.
+    async fn lock(&self, waits: impl Fn()) -> io::Result<FetchLock> {
+        let here = Arc::clone(&self.lock);
+        let here = if let Ok(here) = Arc::clone(&here).try_lock_owned() {
+            here
+        } else {
+            waits();
+            here.lock_owned().await
+        };
+        let file = lock_file(&self.path)?;
+        let mut attempt = file.try_lock();
+        if matches!(attempt, Err(TryLockError::WouldBlock)) {
+            waits();
+        }
+        while matches!(attempt, Err(TryLockError::WouldBlock)) {
+            actix_rt::time::sleep(BETWEEN_ATTEMPTS).await;
+            attempt = file.try_lock();
+        }
+        attempt?;
+        Ok((here, file))
+    }
+
     /// Joins an identical fetch in progress, or starts one. Cancelled when the last waiter drops. `progress` receives
     /// git's progress lines.
     ///
@@ -177,13 +191,7 @@ impl Repository {
         let this = Arc::clone(self);
         let key = arguments.clone();
         let fetch = |lines: Steps<String>| async move {
-            let guard = if let Ok(guard) = Arc::clone(&this.lock).try_lock_owned() {
-                guard
-            } else {
-                lines.send("waiting for another fetch".to_owned());
-                Arc::clone(&this.lock).lock_owned().await
-            };
-            let among_processes = lock_among_processes(&this.path).await?;
+            let lock = this.lock(|| lines.send("waiting for another fetch".to_owned())).await?;
             this.has_grown.store(true, Relaxed);
             let on_line = |line: &str| {
                 if line.contains('%') {
@@ -193,7 +201,7 @@ impl Repository {
             this.fetch_now(&arguments, on_line).await?;
             // Packs the repository, within a timeout. Only the next fetch waits for that.
             tokio::spawn(async move {
-                let _guards = (guard, among_processes);
+                let _lock = lock;
                 let call = Run {
                     time: stall_timeout(&this.git.config),
                     ..this.call(&["gc", "--auto", "--quiet"])
@@ -364,7 +372,7 @@ impl Repository {
     /// # Errors
     /// When it can't be moved aside.
     pub async fn discard(&self, generation: u64) -> io::Result<u64> {
-        let guard = (self.lock.lock().await, lock_among_processes(&self.path).await?);
+        let lock = self.lock(|| {}).await?;
         let current = self.generation();
         if current != generation {
             return Ok(current);
@@ -374,7 +382,7 @@ impl Repository {
         let old = spawn_blocking_io(move || set_aside(&path, old.path()).map(|()| old)).await?;
         let next = next_generation();
         self.generation.store(next, Relaxed);
-        drop(guard);
+        drop(lock);
         // Others need not wait for this.
         spawn_blocking_io(move || remove_tree(old.path())).await?;
         Ok(next)

@@ -72,11 +72,13 @@ impl Inheritance {
     /// # Errors
     /// When the process before has another version, or is gone; as text for an administrator.
     pub fn receive() -> Result<Self, String> {
-        Self::try_receive().map_err(|error| format!("nothing can be taken over from the process before: {error}"))
+        let stdin = io::stdin().as_fd().try_clone_to_owned();
+        stdin
+            .and_then(|stdin| Self::receive_from(stdin.into()))
+            .map_err(|error| format!("nothing can be taken over from the process before: {error}"))
     }
 
-    fn try_receive() -> io::Result<Self> {
-        let channel = UnixStream::from(io::stdin().as_fd().try_clone_to_owned()?);
+    fn receive_from(channel: UnixStream) -> io::Result<Self> {
         let mut files = Vec::new();
         let mut line = vec![0];
         receive(&channel, &mut line, &mut files)?;
@@ -129,5 +131,36 @@ impl Inheritance {
         write(&mut channel, &ready).await?;
         let ToSuccessor(left) = read(&mut channel).await?;
         Ok(left)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::shared::run::passing::send;
+
+    #[test]
+    fn nothing_is_taken_over_from_another_version() {
+        for (protocol, is_taken) in [(PROTOCOL, true), (PROTOCOL + 1, false), (PROTOCOL - 1, false)] {
+            let (mut before, channel) = UnixStream::pair().unwrap();
+            let passed = Passed {
+                protocol,
+                run: RunId::own(),
+                sign_in: String::new(),
+            };
+            let line = serde_json::to_string(&passed).unwrap() + "\n";
+            let files: [std::os::fd::OwnedFd; 2] = [
+                TcpListener::bind("127.0.0.1:0").unwrap().into(),
+                tempfile::tempfile().unwrap().into(),
+            ];
+            send(&before, line.as_bytes(), &files.each_ref().map(AsFd::as_fd)).unwrap();
+            let taken = Inheritance::receive_from(channel);
+            assert_eq!(taken.is_ok(), is_taken, "{protocol}");
+            drop(taken);
+            let mut told = String::new();
+            before.read_to_string(&mut told).unwrap();
+            let why = format!("{{\"failed\":\"its version is {protocol}, and this one's {PROTOCOL}\"}}\n");
+            assert_eq!(told, if is_taken { String::new() } else { why });
+        }
     }
 }
