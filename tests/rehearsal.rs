@@ -79,6 +79,35 @@ fn of(output: Output) -> Said {
 const ONE: [&str; 8] = ["--clients", "1", "--over", "0s", "--stay", "1s", "--real-time", "0"];
 
 #[actix_rt::test]
+async fn a_class_notices_no_upgrade() {
+    let fleet = Fleet::with_places(8).await;
+    let class = [
+        "--clients",
+        "6",
+        "--over",
+        "4s",
+        "--stay",
+        "6s",
+        "--real-time",
+        "0.1",
+        "--misbehave",
+        "return=50",
+    ];
+    let upgrading = async {
+        for clients in [2, 4] {
+            until("clients run", async || {
+                fleet.simulation.simulations().await.len() >= clients
+            })
+            .await;
+            let (succeeds, told) = fleet.simulation.upgrade().await;
+            assert!(succeeds, "{told}");
+        }
+    };
+    let (said, ()) = tokio::join!(fleet.rehearse(&class), upgrading);
+    assert!(said.code == Some(0) && said.out.contains("All 6 fit."), "{said:?}");
+}
+
+#[actix_rt::test]
 async fn a_class_that_fits_is_told_so() {
     let fleet = Fleet::with_places(3).await;
     let folder = tempfile::tempdir().unwrap();
