@@ -1,6 +1,8 @@
 //! Connections of clients that another process of the server goes on with, after an upgrade: whoever serves what a
 //! request is for gets the connection itself (its descriptor), with what was read from it, and serves it until a request
 //! on it is for somebody else. Nothing is copied, and each process sees the client's own address.
+//! A client that sends a request before it has all of the answer to the one before, which browsers and proxies do not, may
+//! lose the rest of that answer.
 //!
 //! Each process takes such connections at its *door*, a Unix socket in a directory that only the server's user can open.
 
