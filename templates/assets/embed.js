@@ -5,7 +5,7 @@ import { firstOf, LANGUAGES } from './language.js';
 import { problemText } from './page_view.js';
 import { Panel } from './panel.js';
 import { styles } from './styles.js';
-import { isConnected, reasonOf } from './visit.js';
+import { isConnected, lineOf, reasonOf } from './visit.js';
 import { VisitRunner } from './visit_runner.js';
 
 /** @typedef {import('./visit.js').Event} VisitEvent */
@@ -243,7 +243,7 @@ export class WebotsSimulation extends HTMLElement {
     if (told.state !== last.state || told.ahead !== last.ahead || told.world !== last.world) {
       this.#dispatch('state', told);
     }
-    if (before.is === 'asking' && before.line && state.is === 'connecting') {
+    if (lineOf(before) && state.is === 'connecting') {
       this.#dispatch('turn', {});
     }
     if (isShown(state) && !this.#isReady) {
@@ -270,7 +270,7 @@ export class WebotsSimulation extends HTMLElement {
       case 'waiting':
         return state.is;
       case 'asking':
-        return state.line || state.waitsFor ? 'waiting' : 'starting';
+        return lineOf(state) || state.waitsFor ? 'waiting' : 'starting';
       case 'connecting':
         return state.place.is === 'queued' ? 'waiting' : 'starting';
       case 'running':
@@ -312,7 +312,7 @@ function isShown(state) {
 /** @param {State} state */
 function ahead(state) {
   if (state.is === 'asking') {
-    return state.line?.ahead;
+    return lineOf(state)?.ahead;
   }
   return state.is === 'connecting' && state.place.is === 'queued' ? state.place.ahead : undefined;
 }

@@ -1,7 +1,7 @@
 // What the viewer page shows during a visit, derived from its state alone. No DOM.
 
 import { adviceFor } from './reasons.js';
-import { isConnected, reasonOf, SHOWN_AFTER } from './visit.js';
+import { isConnected, lineOf, reasonOf, SHOWN_AFTER } from './visit.js';
 
 /** @typedef {import('./language.js').Words} Words */
 /** @typedef {import('./visit.js').Going} Going */
@@ -71,7 +71,7 @@ function leaveLabel(state, words) {
  * @returns {Notice | undefined}
  */
 export function waitingNotice(state, words) {
-  if (state.is === 'asking' && state.line) {
+  if (lineOf(state)) {
     return { text: words.waiting.general, advice: words.line.advice };
   }
   const why = state.is === 'waiting' ? state.why : state.is === 'asking' ? state.waitsFor : undefined;
@@ -192,15 +192,17 @@ function progress(state, now, words) {
     return connectedProgress(state, words);
   }
   switch (state.is) {
-    case 'asking':
-      if (state.line) {
-        return { at: 'session', is: 'doing', notes: { session: lineNote(state.line, now, words) } };
+    case 'asking': {
+      const line = lineOf(state);
+      if (line) {
+        return { at: 'session', is: 'doing', notes: { session: lineNote(line, now, words) } };
       }
       return {
         at: 'session',
         is: 'doing',
         notes: { session: state.goal.attempt ? words.steps.choosingAnother : words.steps.choosing },
       };
+    }
     case 'waiting':
       return { at: 'session', is: 'doing', notes: { session: words.steps.allBusy } };
     case 'redirected':

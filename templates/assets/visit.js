@@ -50,9 +50,19 @@ import { helpsToWait } from './reasons.js';
  * @typedef {{ ahead: number | undefined, turnAt?: number | undefined }} Line
  */
 
+/** A request to the session server. `until`: how long the page waits for an answer. `id`: its number on the connection.
+ * `early`: it is sent once the session server is there. `sent`: `line` is the place from before the connection broke.
+ * `inLine`: the answer is a place in the line. `held`: the connection to the session server is broken, or not there yet; it
+ * is sent again, for this place, whenever that is.
+ * @typedef {{ is: 'early', until: number }
+ *   | { is: 'sent', id: number, until: number, line: Line | undefined }
+ *   | { is: 'inLine', id: number, line: Line }
+ *   | { is: 'held', line: Line }} Request
+ */
+
 /** The states before a simulation server is known. `until`: when the next thing happens by itself.
  * @typedef {{ is: 'idle' }
- *   | { is: 'asking', goal: Goal, id: number, until?: number | undefined, waitsFor?: Problem | undefined, line?: Line | undefined }
+ *   | { is: 'asking', goal: Goal, request: Request, waitsFor?: Problem | undefined }
  *   | { is: 'waiting', goal: Goal, why: Problem, until?: number | undefined }
  *   | { is: 'redirected', goal: Goal, why: Problem, until: number }} Unconnected
  */
@@ -133,8 +143,6 @@ const FIRST_WAIT = 2000;
 const LONGEST_WAIT = 30_000;
 /** Longest random pause after a server has become free, so that not all waiting pages ask at once, in milliseconds. */
 const JITTER = 3000;
-/** The number of no request. */
-const NOT_ASKED = 0;
 /** Reasons for which a pass is refused: the session server gives another one. */
 const NO_PASS = ['invalid-pass', 'used-pass', 'expired-pass'];
 /** Close codes after which another simulation server may accept the client: going away, try again later. */
@@ -173,7 +181,7 @@ export function next(visit, event, now, random) {
   if (isConnected(from) && !isConnected(to)) {
     effects.unshift({ do: event.type === 'hidden' && resumptionOf(from) ? 'detach' : 'leave' });
   }
-  const asked = to.is === 'asking' ? Math.max(to.id, visit.asked) : visit.asked;
+  const asked = to.is === 'asking' && 'id' in to.request ? to.request.id : visit.asked;
   return { visit: { fleet, state: to, asked, wakeAt: wakeAt(to, visit.wakeAt, now) }, effects };
 }
 
@@ -199,7 +207,8 @@ function wakeAt(state, before, now) {
   if (isConnected(state)) {
     return before !== undefined && before > now && before <= now + SECOND ? before : now + SECOND;
   }
-  return 'until' in state ? state.until : undefined;
+  const waits = state.is === 'asking' ? state.request : state;
+  return 'until' in waits ? waits.until : undefined;
 }
 
 /**
@@ -227,12 +236,12 @@ export function resumptionOf(state) {
 function transition(state, event, around) {
   switch (event.type) {
     case 'submitted':
-      return ask({ world: event.world, attempt: 0, wait: FIRST_WAIT }, around, undefined, [{ do: 'clear' }]);
+      return ask({ world: event.world, attempt: 0, wait: FIRST_WAIT }, around, { before: [{ do: 'clear' }] });
     case 'restored':
       return restore(event.kept, around);
     case 'awaited':
       // It is asked for when the session server is there.
-      return { to: inLine({ world: event.world, attempt: 0, wait: FIRST_WAIT }) };
+      return { to: held({ world: event.world, attempt: 0, wait: FIRST_WAIT }, { ahead: undefined }) };
     case 'left':
       return {
         to: { is: 'idle' },
@@ -264,24 +273,25 @@ function transition(state, event, around) {
 /* the session server */
 
 /**
- * Requests a simulation server.
+ * Requests a simulation server. `waitsFor`: why it has waited; `line`: its place so far; `before`: effects before that.
  * @param {Goal} goal
  * @param {Surroundings} around
- * @param {Problem} [waitsFor] why it has waited
- * @param {Effect[]} [before] effects before that
+ * @param {{ waitsFor?: Problem | undefined, line?: Line | undefined, before?: Effect[] }} [after]
  * @returns {Transition}
  */
-function ask(goal, { fleet, asked, now }, waitsFor, before = []) {
+function ask(goal, { fleet, asked, now }, { waitsFor, line, before = [] } = {}) {
+  const until = now + ANSWER;
+  if (fleet === 'connecting' || fleet === 'unreachable') {
+    /** @type {Going} */
+    const asking = { is: 'asking', goal, request: { is: 'early', until }, waitsFor };
+    const to = fleet === 'connecting' ? asking : end({ code: 'session-unreachable' }, asking);
+    return { to, effects: before };
+  }
   const id = asked + 1;
-  /** @type {State} */
-  const asking = { is: 'asking', goal, id, until: now + ANSWER, waitsFor };
-  if (fleet === 'connecting') {
-    return { to: { ...asking, id: NOT_ASKED }, effects: before };
-  }
-  if (fleet === 'unreachable') {
-    return { to: end({ code: 'session-unreachable' }, asking), effects: before };
-  }
-  return { to: asking, effects: [...before, { do: 'ask', id, world: goal.world }] };
+  return {
+    to: { is: 'asking', goal, request: { is: 'sent', id, until, line }, waitsFor },
+    effects: [...before, { do: 'ask', id, world: goal.world }],
+  };
 }
 
 /**
@@ -291,28 +301,27 @@ function ask(goal, { fleet, asked, now }, waitsFor, before = []) {
  * @returns {Transition | undefined}
  */
 function whileAsking(state, event, around) {
+  const { goal, request } = state;
+  const line = lineOf(state);
   if (event.type === 'disconnected') {
-    return { to: state.line ? inLine(state.goal, state.line) : end({ code: 'session-unreachable' }, state) };
+    return { to: line ? held(goal, line) : end({ code: 'session-unreachable' }, state) };
   }
-  if (event.type === 'available' && state.id === NOT_ASKED) {
-    const { to, effects } = ask(state.goal, around);
-    return to.is === 'asking'
-      ? { to: { ...to, ...(state.line && { line: state.line }) }, ...(effects && { effects }) }
-      : undefined;
+  if (event.type === 'available' && !('id' in request)) {
+    return ask(goal, around, { line });
   }
-  if (event.type === 'tick' && state.until !== undefined && around.now >= state.until) {
+  if (event.type === 'tick' && 'until' in request && around.now >= request.until) {
     return { to: end({ code: 'session-silent' }, state) };
   }
-  if (!('id' in event) || event.id !== state.id) {
+  if (!('id' in event) || !('id' in request) || event.id !== request.id) {
     return undefined;
   }
-  const { goal } = state;
+  const { id } = request;
   if (event.type === 'queued') {
-    return { to: { ...state, until: undefined, line: { ...state.line, ahead: event.ahead } } };
+    return { to: { ...state, request: { is: 'inLine', id, line: { ...line, ahead: event.ahead } } } };
   }
   if (event.type === 'estimated') {
-    const line = { ahead: state.line?.ahead, turnAt: around.now + SECOND * event.seconds };
-    return { to: { ...state, until: undefined, line } };
+    const turnAt = around.now + SECOND * event.seconds;
+    return { to: { ...state, request: { is: 'inLine', id, line: { ahead: line?.ahead, turnAt } } } };
   }
   if ('failure' in event.answer) {
     const { failure } = event.answer;
@@ -325,18 +334,26 @@ function whileAsking(state, event, around) {
   const effects = [{ do: 'connect', server, request: { world: goal.world, ...(pass && { pass }) } }];
   return {
     to: { is: 'connecting', goal, server, isRestored: false, place: { is: 'opening' } },
-    effects: state.line ? [...effects, { do: 'sayTurn' }] : effects,
+    effects: line ? [...effects, { do: 'sayTurn' }] : effects,
   };
 }
 
 /**
  * A place in the line, for which the session server is asked when it is there.
  * @param {Goal} goal
- * @param {Line} [line]
+ * @param {Line} line
  * @returns {Unconnected}
  */
-function inLine(goal, line = { ahead: undefined }) {
-  return { is: 'asking', goal, id: NOT_ASKED, line };
+function held(goal, line) {
+  return { is: 'asking', goal, request: { is: 'held', line } };
+}
+
+/**
+ * The place in the line of a state, if it has one.
+ * @param {State} state
+ */
+export function lineOf(state) {
+  return state.is === 'asking' && 'line' in state.request ? state.request.line : undefined;
 }
 
 /**
@@ -356,7 +373,7 @@ function whileWaiting(state, event, around) {
     // The next report that a server is free sets another time.
     return { to: { ...state, until: undefined } };
   }
-  return ask({ ...state.goal, attempt: 0 }, around, state.why);
+  return ask({ ...state.goal, attempt: 0 }, around, { waitsFor: state.why });
 }
 
 /**
