@@ -27,7 +27,7 @@
 //! | [`simulation::client`] | a client's WebSocket (`web_client`), its simulation when it comes back on another one (`resume`), that of a session server that asks for slots (`slot_link`), the session of its simulation, which sends it nearly all messages (`session`; `start`: before Webots runs, with the choice of the GPU) |
 //! | `simulation::handover`, [`simulation::upgrade`] | an upgrade: the processes of a server, what they tell and pass each other, and which one a connection is for; the old process' side is `upgrade` |
 //! | [`simulation::attachment`] | what a connection and its session send each other, and the tokens by which a client that resumes finds its session |
-//! | [`simulation::slots`] | the slots that clients wait for: leases, the queue and the shares of addresses and users (`slot_pool`), those that are reserved for the line of session servers (`reservations`), how many run in real time (`real_time_places`), the streams of simulations and the tokens that identify them (`stream`) |
+//! | [`simulation::slots`] | the slots that clients wait for: the slot of a simulation (`slot`), its states and what pages show of them (`simulation_record`), the queue and the shares of addresses and users (`slot_pool`), those that are reserved for the line of session servers (`reservations`), how many run in real time (`real_time_places`), the streams of simulations and the tokens that identify them (`stream`) |
 //! | [`simulation::spare_wishes`] | which worlds are kept ready before clients ask for them, and how many; the actor that does it is `spare_keeper` in [`simulation::client`], a spare's slot is in `spare` of [`simulation::slots`] |
 //! | `simulation::relay` | a stream between a client and the port of its Webots |
 //! | `simulation::web` | routes, pages, `/status` and Prometheus metrics of the simulation server (gauges in `metrics`, counters in `app` and `ends`) |
@@ -63,7 +63,7 @@
 //!   token for one connection, `relay/watcher` lets it change nothing).
 //! - **reason**: why a request was refused, a start has failed or a simulation has ended, as a code
 //!   ([`shared::domain::Reason`]); a **failure** ([`shared::domain::Failure`]) has also its sentence and the output of others.
-//! - **stage**: the state of a simulation as pages show it ([`shared::domain::Stage`]); it follows from the state of its actor.
+//! - **stage**: the state of a simulation as pages show it ([`shared::domain::Stage`]); `SimulationRecord` in [`simulation::slots`] derives it from its states.
 //! - **spare**: a simulation that is kept ready without a client (key `ready`).
 //! - **ready**: Webots has its world, so that viewers may connect. Until then it may **listen**.
 //!
@@ -88,7 +88,7 @@
 //!     | one per WebSocket   ^  |                     '-- Readings (watch channel) --> routes
 //!   WebClient               |  |
 //!     | one per simulation  |  |
-//!   Session --- SlotLease -----'  |
+//!   Session --- Slot ----------'  |
 //!     ^  ^------- SlotEvent --'
 //!     |  |--- checkout (clients of a world share the search for its commit; each copy has its own thread) --> git
 //!     |  '--- starts ---> Webots (one per simulation) --> Webots' process group, in a sandbox
@@ -96,7 +96,7 @@
 //! ```
 //!
 //! The [`session::fleet::Registry`] alone decides availability: it receives every report and every pick. A
-//! [`simulation::webots::Webots`] holds its process group, its instance directory and the lease of its slot in
+//! [`simulation::webots::Webots`] holds its process group, its instance directory and its slot in
 //! guards. Dropping it frees all three, whatever its state, even after a panic. When the simulation server exits, for
 //! whatever reason, its [`simulation::process::guardian`] process ends everything that the server has started.
 //! One `simulation::isolation::DiskMonitor` enforces what the kernel does not: how much simulations write. One thread copies
@@ -110,7 +110,7 @@
 //! | `ServerMonitor` | when its server is removed from the configuration, or no name resolves to that server any more | the registry starts a new one |
 //! | mailer | never | it is restarted; the notices that it held are lost |
 //! | `WebClient` | with its connection | its connection closes, and its session is notified |
-//! | `Session` | with its simulation, or its client | its lease is released, and its client is notified |
+//! | `Session` | with its simulation, or its client | its slot is released, and its client is notified |
 //! | Webots | with its process tree; it is never restarted, its client is notified | its process tree is killed at once, its directory removed, its slot released |
 //!
 //! The `SlotPool` is not an actor: a mutex guards it. [`shared::run::permanent::restarted`] restarts the tasks; after

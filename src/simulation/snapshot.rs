@@ -5,8 +5,9 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::shared::domain::{Instances, ProjectUrl, Stage};
-use crate::shared::run::seconds_since_1970;
+#[cfg(test)]
+use crate::shared::domain::ProjectUrl;
+use crate::shared::domain::{Instances, Stage};
 use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::simulated_time::SimulatedTime;
 use crate::simulation::simulation_id::SimulationId;
@@ -59,7 +60,7 @@ impl Holdings {
     }
 }
 
-/// One simulation, as pages and programs see it.
+/// One simulation, as pages and programs see it: made of its record in the slot pool, which holds its states.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub struct Simulation {
@@ -104,8 +105,9 @@ pub struct Simulation {
     pub log: Option<PathBuf>,
 }
 
+#[cfg(test)]
 impl Simulation {
-    /// A simulation that a client has just requested.
+    /// One that a client has just requested.
     pub fn new(id: SimulationId, world: &ProjectUrl, identity: ClientIdentity) -> Self {
         Self {
             id,
@@ -113,7 +115,7 @@ impl Simulation {
             repository: world.repository(),
             identity,
             stage: Stage::Queued,
-            since: seconds_since_1970(),
+            since: crate::shared::run::seconds_since_1970(),
             launched: None,
             pid: None,
             port: None,

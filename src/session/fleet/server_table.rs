@@ -140,7 +140,7 @@ impl ServerTable {
     /// Tells a server what to keep ready.
     pub fn keep_ready(&self, server: &PublicAddress, list: KeepReady) {
         if let Some(monitor) = self.monitors.get(server) {
-            monitor.do_send(Ask(ToSimulationServer::Ready(list)));
+            monitor.do_send(Ask(ToSimulationServer::KeepReady(list)));
         }
     }
 

@@ -19,7 +19,7 @@ pub enum ToSimulationServer {
     Stop(StopOrder),
     /// Without a tag.
     #[serde(untagged)]
-    Ready(KeepReady),
+    KeepReady(KeepReady),
     /// Without a tag.
     #[serde(untagged)]
     Wishes(Wishes),

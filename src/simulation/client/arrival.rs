@@ -6,7 +6,7 @@
 use actix::prelude::*;
 use actix_rt::task::spawn_blocking;
 
-use super::session::{Arrival, Client, Ready, Session, State};
+use super::session::{Arrival, Client, ReadySimulation, Session, State};
 use crate::simulation::ends::StopReason;
 use crate::simulation::process::process_tree::has_connection;
 
@@ -40,7 +40,7 @@ impl Session {
     /// The timer of the wait, if it waits.
     fn awaited(&self) -> Option<SpawnHandle> {
         match self.state {
-            State::Ready(Ready {
+            State::Ready(ReadySimulation {
                 arrival: Arrival::Awaited(timer),
                 ..
             }) => Some(timer),

@@ -3,7 +3,9 @@
 use actix::prelude::*;
 use futures_util::stream::{self, StreamExt};
 
-use super::session::{Attachment, Client, Comeback, Launched, Ready, Session, State, seconds_until};
+use super::session::{
+    Attachment, Client, Comeback, LaunchedSimulation, ReadySimulation, Session, State, seconds_until,
+};
 use crate::shared::domain::Failure;
 use crate::shared::run::seconds_since_1970;
 use crate::simulation::attachment::{ClientAction, Connection, Resume, ToClient, Token};
@@ -47,7 +49,7 @@ impl Session {
 
     /// Sends the client the kind of the scene, the URL of Webots and, if the client may come back, the token for that.
     pub(super) fn offer(&self) {
-        let State::Ready(Ready { launched, url, .. }) = &self.state else {
+        let State::Ready(ReadySimulation { launched, url, .. }) = &self.state else {
             return;
         };
         if let Some(scene) = launched.scene {
@@ -106,7 +108,7 @@ impl Session {
     }
 
     /// Sends the rest of the time limit, and what the project requests.
-    fn tell_launched(&self, launched: &Launched) {
+    fn tell_launched(&self, launched: &LaunchedSimulation) {
         if let Some(started) = launched.started {
             let rest = self.server.config.timeout.saturating_sub(started.elapsed().as_secs());
             self.text(protocol::shutdown_timeout(rest));

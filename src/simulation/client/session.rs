@@ -16,13 +16,13 @@ use crate::shared::domain::{Failure, ProjectUrl, Reason, ReservationId, View};
 use crate::shared::http::Peer;
 use crate::shared::run::closing;
 use crate::simulation::attachment::{ClientAction, Connection, NewClient, ToClient, Token};
-use crate::simulation::checkout::{Project, Tip};
+use crate::simulation::checkout::Project;
 use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::ends::{StopReason, lost};
 use crate::simulation::progress::Progress;
 use crate::simulation::protocol;
 use crate::simulation::simulation_id::SimulationId;
-use crate::simulation::slots::{Slot, SlotEvent, SlotLease, SpareKind, Taker};
+use crate::simulation::slots::{QueuePosition, Slot, SlotEvent, SpareKind, Taker};
 use crate::simulation::snapshot::SceneKind;
 use crate::simulation::state::AppState;
 use crate::simulation::webots::{Keep, Stop, Webots, WebotsEvent};
@@ -107,26 +107,25 @@ impl Drop for Attachment {
 /// The life cycle of a simulation, as its session knows it. Each state holds what exists only in it; dropping a state
 /// releases that.
 pub(super) enum State {
-    /// Waiting for a slot; the lease holds the position in the queue. `tip` is the commit, if it is known already.
+    /// Waiting for a slot.
     Waiting {
         world: ProjectUrl,
-        tip: Option<Tip>,
-        lease: SlotLease,
+        position: QueuePosition,
         /// The number of clients ahead, once it is known.
         ahead: Option<usize>,
     },
     /// The project is being checked out for this slot; the job ends with the actor.
     CheckingOut(Slot),
     /// Webots was requested, and is not ready.
-    Launching(Launched),
+    Launching(LaunchedSimulation),
     /// Webots is ready.
-    Ready(Ready),
+    Ready(ReadySimulation),
     /// The simulation has ended, or was not admitted. A client that may come back hears why.
     Over(Failure),
 }
 
 /// A simulation whose Webots was requested.
-pub(super) struct Launched {
+pub(super) struct LaunchedSimulation {
     pub(super) webots: WebotsHandle,
     /// The project that was checked out, as long as its Webots holds it.
     pub(super) project: Weak<Project>,
@@ -139,8 +138,8 @@ pub(super) struct Launched {
 }
 
 /// A simulation whose Webots is ready.
-pub(super) struct Ready {
-    pub(super) launched: Launched,
+pub(super) struct ReadySimulation {
+    pub(super) launched: LaunchedSimulation,
     /// The port on which Webots listens.
     pub(super) port: u16,
     /// The URL of Webots.
@@ -184,9 +183,9 @@ impl State {
         Self::Over(lost())
     }
 
-    pub(super) fn launched(&self) -> Option<&Launched> {
+    pub(super) fn launched(&self) -> Option<&LaunchedSimulation> {
         match self {
-            Self::Launching(launched) | Self::Ready(Ready { launched, .. }) => Some(launched),
+            Self::Launching(launched) | Self::Ready(ReadySimulation { launched, .. }) => Some(launched),
             Self::Waiting { .. } | Self::CheckingOut(_) | Self::Over(_) => None,
         }
     }
@@ -226,8 +225,8 @@ impl Session {
         };
         match server.slots.take_spare(&taker, reservation) {
             // The session exists until it has received this.
-            Some(session) => {
-                session.do_send(SlotEvent::Taken(Box::new(client)));
+            Some((session, again)) => {
+                session.do_send(SlotEvent::Taken(Box::new(client), again));
                 None
             }
             None => Some(Self::start_for(Arc::clone(server), client, reservation)),
@@ -253,11 +252,10 @@ impl Session {
         log::info!("{id}: client {peer}: asks for {world}{identity}");
         Self::create(|ctx| {
             let me = ctx.address().recipient();
-            let state = match SlotLease::acquire(&server.slots, id, me, &world, (peer, identity), reservation) {
-                Ok(lease) => State::Waiting {
+            let state = match QueuePosition::join(&server.slots, id, me, &world, (peer, identity), reservation) {
+                Ok(position) => State::Waiting {
                     world,
-                    tip: None,
-                    lease,
+                    position,
                     ahead: None,
                 },
                 Err(failure) => State::Over(failure),
@@ -340,10 +338,11 @@ impl Session {
     /// Reports why the simulation ends, before the state is dropped. Webots' own report takes precedence.
     pub(super) fn report(&self, reason: StopReason) {
         match &self.state {
-            State::Waiting { lease, .. } | State::CheckingOut(Slot { lease, .. }) => lease.end(Failure::from(reason)),
-            State::Launching(Launched { webots, .. })
-            | State::Ready(Ready {
-                launched: Launched { webots, .. },
+            State::Waiting { position, .. } => position.end(Failure::from(reason)),
+            State::CheckingOut(slot) => slot.end(Failure::from(reason)),
+            State::Launching(LaunchedSimulation { webots, .. })
+            | State::Ready(ReadySimulation {
+                launched: LaunchedSimulation { webots, .. },
                 ..
             }) => {
                 webots.0.do_send(Stop(reason));
@@ -385,7 +384,7 @@ impl Session {
             // It has ended meanwhile.
             other => return self.state = other,
         };
-        self.state = State::Ready(Ready {
+        self.state = State::Ready(ReadySimulation {
             launched,
             port,
             url,
@@ -462,7 +461,7 @@ impl StreamHandler<ClientAction> for Session {
         match action {
             ClientAction::ResetController(file) => self.reset_controller(file, ctx),
             ClientAction::Keep => {
-                if let Some(Launched { webots, .. }) = self.state.launched() {
+                if let Some(LaunchedSimulation { webots, .. }) = self.state.launched() {
                     webots.0.do_send(Keep);
                 }
             }
@@ -480,7 +479,7 @@ impl Handler<SlotEvent> for Session {
     fn handle(&mut self, event: SlotEvent, ctx: &mut Self::Context) {
         match event {
             SlotEvent::Granted(port) => match std::mem::replace(&mut self.state, State::lost()) {
-                State::Waiting { world, tip, lease, .. } => self.check_out(world, tip, Slot { lease, port }, ctx),
+                State::Waiting { world, position, .. } => self.check_out(world, None, position.granted(port), ctx),
                 // It has ended while it waited.
                 other => self.state = other,
             },
@@ -514,7 +513,7 @@ impl Handler<SlotEvent> for Session {
                 self.report(reason);
                 self.finish(reason.into(), ctx);
             }
-            SlotEvent::Taken(client) => self.taken_by(*client, ctx),
+            SlotEvent::Taken(client, again) => self.taken_by(*client, again, ctx),
         }
     }
 }

@@ -106,7 +106,7 @@ impl SlotLink {
                 self.server.slots.open_link(id, ctx.address().recipient());
             }
             State::Trusted { id, .. } => match serde_json::from_str(text) {
-                Ok(ToSimulationServer::Ready(KeepReady { keep_ready })) => {
+                Ok(ToSimulationServer::KeepReady(KeepReady { keep_ready })) => {
                     self.server.spare_wishes.ask(*id, keep_ready);
                 }
                 Ok(ToSimulationServer::Wishes(wishes)) if self.server.takes_nobody() => {

@@ -5,15 +5,15 @@ use std::time::Instant;
 
 use actix::prelude::*;
 
-use super::session::{Client, Comeback, Expected, Ready, Session, SpareEvent, State};
-use crate::shared::domain::{Failure, Reason};
+use super::session::{Client, Comeback, Expected, ReadySimulation, Session, SpareEvent, State};
+use crate::shared::domain::{Failure, Reason, ReservationId};
 use crate::simulation::attachment::NewClient;
 use crate::simulation::checkout::Tip;
 use crate::simulation::protocol;
 use crate::simulation::simulation_id::SimulationId;
-use crate::simulation::slots::{SlotLease, SpareKind};
+use crate::simulation::slots::{Slot, SpareKind};
 use crate::simulation::state::AppState;
-use crate::simulation::webots::Taken;
+use crate::simulation::webots::HasClient;
 
 impl Session {
     /// Opens the session of a simulation without a client, if there is a free slot that no client waits for.
@@ -26,30 +26,26 @@ impl Session {
         let id = SimulationId::next();
         let server = Arc::clone(server);
         Self::create(|ctx| {
-            let lease = SlotLease::for_spare(&server.slots, id, ctx.address().recipient(), kind.clone());
-            let state = if let Some(lease) = lease {
-                log::info!("{id}: is kept ready with {}", kind.world);
-                State::Waiting {
-                    world: kind.world.clone(),
-                    tip,
-                    lease,
-                    ahead: None,
-                }
-            } else {
-                ctx.stop();
-                State::lost()
-            };
-            Self {
+            let slot = Slot::for_spare(&server.slots, id, ctx.address().recipient(), kind.clone());
+            let world = kind.world.clone();
+            let mut session = Self {
                 server,
                 id,
                 peer: None,
                 view: kind.view,
                 client: Client::Expected(Expected { kind, keeper }),
-                state,
+                state: State::lost(),
                 comeback: Comeback::Never,
                 progress: None,
                 is_resetting: false,
+            };
+            if let Some(slot) = slot {
+                log::info!("{id}: is kept ready with {world}");
+                session.check_out(world, tip, slot, ctx);
+            } else {
+                ctx.stop();
             }
+            session
         })
     }
 
@@ -70,12 +66,13 @@ impl Session {
         }
     }
 
-    /// A client takes the simulation.
-    pub(super) fn taken_by(&mut self, client: NewClient, ctx: &mut Context<Self>) {
+    /// A client takes the simulation. If that has failed, it starts another one with the reservation `again`.
+    pub(super) fn taken_by(&mut self, client: NewClient, again: ReservationId, ctx: &mut Context<Self>) {
         if let State::Over(_) = self.state {
-            Self::start_for(Arc::clone(&self.server), client, None);
+            Self::start_for(Arc::clone(&self.server), client, Some(again));
             return ctx.stop();
         }
+        self.server.slots.taken(self.id, again);
         let NewClient {
             connection,
             identity,
@@ -93,11 +90,11 @@ impl Session {
             self.issue_token(ctx);
             self.offer_comeback();
         }
-        if let State::Launching(launched) | State::Ready(Ready { launched, .. }) = &mut self.state {
+        if let State::Launching(launched) | State::Ready(ReadySimulation { launched, .. }) = &mut self.state {
             launched.started = Some(Instant::now());
         }
         if let Some(launched) = self.state.launched() {
-            launched.webots.0.do_send(Taken);
+            launched.webots.0.do_send(HasClient);
             self.text(protocol::shutdown_timeout(self.server.config.timeout));
             self.texts(launched.texts.iter().cloned());
         }

@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use actix::prelude::*;
 
-use super::session::{Client, Launched, Session, State, WebotsHandle};
+use super::session::{Client, LaunchedSimulation, Session, State, WebotsHandle};
 use crate::shared::domain::{Blame, Failure, ProjectUrl, Reason, ReservationId, View};
 use crate::shared::http::Peer;
 use crate::simulation::checkout::{Project, Tip};
@@ -14,7 +14,7 @@ use crate::simulation::machine::sensors::Gpu;
 use crate::simulation::progress::{Progress, Step};
 use crate::simulation::protocol::{self, Start};
 use crate::simulation::readiness;
-use crate::simulation::slots::{Slot, SlotLease};
+use crate::simulation::slots::{Prepared, Slot};
 use crate::simulation::snapshot::SceneKind;
 use crate::simulation::state::AppState;
 use crate::simulation::webots::{LaunchSpec, Release, Webots, WebotsEvent};
@@ -54,8 +54,8 @@ impl Session {
                 .failed_starts
                 .add(&format!("{}: {failure} ({})", self.name(), failure.reason));
         }
-        if let State::CheckingOut(Slot { lease, .. }) = &self.state {
-            lease.end(failure.clone());
+        if let State::CheckingOut(slot) = &self.state {
+            slot.end(failure.clone());
         }
         self.finish(failure, ctx);
     }
@@ -108,14 +108,19 @@ impl Session {
         let version = project.world.version.clone();
         let release = Release::of_simulation(&program, &project.world.version);
         let scene = (self.view != View::Mjpeg).then(|| SceneKind::of(release));
-        slot.lease.update(|simulation| {
-            simulation.version = Some(version);
-            simulation.scene = scene;
+        let gpu = self.take_gpu();
+        slot.prepared(Prepared {
+            version,
+            scene,
+            gpu: gpu.as_ref().map(|gpu| gpu.index),
         });
+        if let Some(gpu) = &gpu {
+            let event = format!("it gets GPU {}, {}", gpu.index, gpu.name);
+            slot.log(log::Level::Info, &event, &event);
+        }
         let texts = protocol::progress(&Progress::new(Step::Launch, "webots is starting"));
         self.texts(texts.clone());
         self.progress = Some(texts);
-        let gpu = self.take_gpu(&slot.lease);
         let project = Arc::new(project);
         let project_of_webots = Arc::downgrade(&project);
         let spec = LaunchSpec {
@@ -136,7 +141,7 @@ impl Session {
         };
         let thread = self.server.webots_thread(spec.slot.port);
         let webots = Webots::start_in_arbiter(thread, |ctx| Webots::create(spec, ctx));
-        self.state = State::Launching(Launched {
+        self.state = State::Launching(LaunchedSimulation {
             webots: WebotsHandle(webots),
             project: project_of_webots,
             scene,
@@ -146,13 +151,9 @@ impl Session {
     }
 
     /// Assigns a GPU to a simulation, if simulations are spread over GPUs and one answers.
-    fn take_gpu(&self, lease: &SlotLease) -> Option<Gpu> {
+    fn take_gpu(&self) -> Option<Gpu> {
         let spread = self.server.spread.as_ref()?;
-        let gpu = spread.take(&self.server.readings.borrow().gpus, Instant::now())?;
-        let event = format!("it gets GPU {}, {}", gpu.index, gpu.name);
-        lease.update(|simulation| simulation.gpu = Some(gpu.index));
-        lease.log(log::Level::Info, &event, &event);
-        Some(gpu)
+        spread.take(&self.server.readings.borrow().gpus, Instant::now())
     }
 }
 

@@ -42,12 +42,12 @@ impl SlotPool {
 
 impl Slots {
     fn limit_places(&mut self, target: f64) {
-        let of_clients = self.records.values().filter(|record| record.spare().is_none());
-        let paces: Vec<Pace> = of_clients
+        let paces: Vec<Pace> = self
+            .of_clients()
             .filter_map(|record| {
                 Some(Pace {
-                    factor: record.simulation.time.recent()?,
-                    world: record.simulation.world.clone(),
+                    factor: record.time.recent()?,
+                    world: record.world.clone(),
                 })
             })
             .collect();
@@ -58,15 +58,17 @@ impl Slots {
     /// Tells the client of each simulation that is slow how fast it runs, and once that it is not slow any more.
     fn tell_paces(&mut self, histogram: &Histogram) {
         for record in self.records.values_mut() {
-            let factor = record.simulation.time.recent();
+            let factor = record.time.recent();
             if let Some(factor) = factor {
                 histogram.observe(factor);
             }
             let slow = factor.filter(|factor| *factor < REAL_TIME);
-            if slow.is_some() || record.is_slow {
+            let Some(served) = record.served_mut() else { continue };
+            let is_news = slow.is_some() || served.knows_slow;
+            served.knows_slow = slow.is_some();
+            if is_news {
                 record.listener.do_send(SlotEvent::Pace(slow));
             }
-            record.is_slow = slow.is_some();
         }
     }
 }

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use actix::{Message, Recipient};
 
-use super::simulation_record::Party;
+use super::simulation_record::{Client, Party};
 use crate::shared::domain::{Failure, Offer, Offers, Passed, ProjectUrl, Reason, ReservationId, Wish, Wishes};
 use crate::shared::http::AddressQuota;
 use crate::simulation::simulation_id::SimulationId;
@@ -24,7 +24,7 @@ pub struct LinkId(pub u64);
 pub(super) struct Reservations {
     /// How long one holds.
     valid: Duration,
-    links: BTreeMap<LinkId, Link>,
+    lines: BTreeMap<LinkId, Line>,
     pub(super) reserved: HashMap<ReservationId, Reservation>,
     /// The last reservations whose clients have come.
     used: VecDeque<ReservationId>,
@@ -42,9 +42,26 @@ pub(super) struct Reservation {
     pub(super) parties: Vec<(Party, usize)>,
     /// When its client has entered the line.
     pub(super) since: Instant,
-    address: Option<IpAddr>,
     until: Instant,
-    link: LinkId,
+    of: ReservedFor,
+}
+
+/// Whom a reservation is for.
+enum ReservedFor {
+    /// A client of a session server, with this address.
+    InLine(LinkId, Option<IpAddr>),
+    /// A client that is here, and was about to take this simulation, which was kept ready and has failed.
+    TakerOf(SimulationId),
+}
+
+impl Reservation {
+    /// The session server that has sent its client; `None` if that client was here before.
+    pub(super) fn link(&self) -> Option<LinkId> {
+        match self.of {
+            ReservedFor::InLine(link, _) => Some(link),
+            ReservedFor::TakerOf(_) => None,
+        }
+    }
 }
 
 /// What a reservation holds.
@@ -75,7 +92,8 @@ pub(super) struct Wanted {
     world: Option<ProjectUrl>,
 }
 
-struct Link {
+/// The line of a session server, as far as this server knows it.
+struct Line {
     wanted: VecDeque<Wanted>,
     /// Number of clients that want a slot, of which `wanted` are the first.
     all: usize,
@@ -100,7 +118,7 @@ impl Reservations {
     pub(super) fn new(valid: Duration) -> Self {
         Self {
             valid,
-            links: BTreeMap::new(),
+            lines: BTreeMap::new(),
             reserved: HashMap::new(),
             used: VecDeque::new(),
             expired: AddressQuota::new(20, 12),
@@ -110,7 +128,7 @@ impl Reservations {
 
     /// A session server has connected. It is told at once that it may ask.
     pub(super) fn open(&mut self, id: LinkId, listener: Recipient<Reserved>) {
-        let link = Link {
+        let line = Line {
             wanted: VecDeque::new(),
             all: 0,
             listener,
@@ -119,12 +137,12 @@ impl Reservations {
             queue: Vec::new(),
             passed: Vec::new(),
         };
-        self.links.insert(id, link);
+        self.lines.insert(id, line);
     }
 
     /// A session server has left. What is reserved for its clients stays: they have their passes.
     pub(super) fn close(&mut self, id: LinkId) {
-        self.links.remove(&id);
+        self.lines.remove(&id);
     }
 
     /// The clients of a session server that want slots. `parties` are those that a client counts for.
@@ -132,9 +150,9 @@ impl Reservations {
         for back in &wishes.back {
             self.reserved.remove(back);
         }
-        let Some(link) = self.links.get_mut(&id) else { return };
+        let Some(line) = self.lines.get_mut(&id) else { return };
         let now = Instant::now();
-        let known: HashMap<u64, Instant> = link.wanted.iter().map(|one| (one.ticket, one.since)).collect();
+        let known: HashMap<u64, Instant> = line.wanted.iter().map(|one| (one.ticket, one.since)).collect();
         let wanted = wishes.first.iter().map(|wish| {
             let since = now.checked_sub(Duration::from_millis(wish.waited)).unwrap_or(now);
             Wanted {
@@ -146,31 +164,31 @@ impl Reservations {
                 world: wish.world.clone(),
             }
         });
-        link.wanted = wanted.collect();
+        line.wanted = wanted.collect();
         // Their order is exact. The times are not: messages round them, and are on their way for some time.
         let mut next: Option<Instant> = None;
-        for one in link.wanted.iter_mut().rev() {
+        for one in line.wanted.iter_mut().rev() {
             one.since = next.map_or(one.since, |next| one.since.min(next));
             next = Some(one.since);
         }
-        link.all = (wishes.all as usize).max(link.wanted.len());
-        link.news.number = wishes.number;
-        link.has_news = true;
+        line.all = (wishes.all as usize).max(line.wanted.len());
+        line.news.number = wishes.number;
+        line.has_news = true;
     }
 
     /// No client of a session server wants a slot any more.
     pub(super) fn clear(&mut self, id: LinkId) {
-        if let Some(link) = self.links.get_mut(&id) {
-            link.wanted.clear();
-            link.all = 0;
+        if let Some(line) = self.lines.get_mut(&id) {
+            line.wanted.clear();
+            line.all = 0;
         }
     }
 
     /// The first client that may have a slot: its session server, its index there, and its place in the order.
     pub(super) fn first(&self, may_have: impl Fn(&[(Party, usize)]) -> bool) -> Option<(LinkId, usize, Order)> {
         let mut first: Option<(LinkId, usize, Order)> = None;
-        for (id, link) in &self.links {
-            for (index, wanted) in link.wanted.iter().enumerate() {
+        for (id, line) in &self.lines {
+            for (index, wanted) in line.wanted.iter().enumerate() {
                 let order = (self.is_behind(wanted.address), wanted.since);
                 if first.is_none_or(|(.., best)| order < best) && may_have(&wanted.parties) {
                     first = Some((*id, index, order));
@@ -187,7 +205,7 @@ impl Reservations {
 
     /// The world of a client.
     pub(super) fn world(&self, id: LinkId, index: usize) -> Option<&ProjectUrl> {
-        self.links.get(&id)?.wanted.get(index)?.world.as_ref()
+        self.lines.get(&id)?.wanted.get(index)?.world.as_ref()
     }
 
     /// Whether a simulation that is kept ready is promised to a client.
@@ -204,17 +222,17 @@ impl Reservations {
 
     /// Reserves a port, or a simulation that is kept ready, for a client.
     pub(super) fn reserve(&mut self, id: LinkId, index: usize, held: Held) {
-        let Some(link) = self.links.get_mut(&id) else { return };
-        let Some(wanted) = link.wanted.remove(index) else {
+        let Some(line) = self.lines.get_mut(&id) else { return };
+        let Some(wanted) = line.wanted.remove(index) else {
             return;
         };
-        link.all = link.all.saturating_sub(1);
+        line.all = line.all.saturating_sub(1);
         let reservation = ReservationId(rand::random());
-        link.news.offers.push(Offer {
+        line.news.offers.push(Offer {
             ticket: wanted.ticket,
             reservation,
         });
-        link.has_news = true;
+        line.has_news = true;
         let seconds = wanted.since.elapsed().as_secs_f64();
         let what = match held {
             Held::Port(port) => format!("the slot of port {port}"),
@@ -225,11 +243,29 @@ impl Reservations {
             held,
             parties: wanted.parties,
             since: wanted.since,
-            address: wanted.address,
             until: Instant::now() + self.valid,
-            link: id,
+            of: ReservedFor::InLine(id, wanted.address),
         };
         self.reserved.insert(reservation, reserved);
+    }
+
+    /// A simulation that was kept ready has left its port before its session knew of the client that takes it: that client
+    /// gets the port.
+    pub(super) fn keep_for(&mut self, reservation: ReservationId, failed: SimulationId, port: u16, client: &Client) {
+        let reserved = Reservation {
+            held: Held::Port(port),
+            parties: client.parties.clone(),
+            since: client.since,
+            until: Instant::now() + self.valid,
+            of: ReservedFor::TakerOf(failed),
+        };
+        self.reserved.insert(reservation, reserved);
+    }
+
+    /// Whether a client is on its way that was about to take this simulation, which has failed.
+    pub(super) fn expects_taker(&self, failed: SimulationId) -> bool {
+        let is_for = |one: &Reservation| matches!(one.of, ReservedFor::TakerOf(id) if id == failed);
+        self.reserved.values().any(is_for)
     }
 
     /// The reservation of a client that has come.
@@ -246,9 +282,10 @@ impl Reservations {
         };
         self.used.truncate(USED - 1);
         self.used.push_front(id);
-        if let Some(link) = self.links.get_mut(&reservation.link) {
-            link.news.used.push(id);
-            link.has_news = true;
+        let line = reservation.link().and_then(|link| self.lines.get_mut(&link));
+        if let Some(line) = line {
+            line.news.used.push(id);
+            line.has_news = true;
         }
         Ok(reservation)
     }
@@ -267,7 +304,7 @@ impl Reservations {
         reserved.retain(|_, reservation| {
             let holds = now < reservation.until;
             if !holds
-                && let Some(address) = reservation.address
+                && let ReservedFor::InLine(_, Some(address)) = reservation.of
                 && !expired.take(Some(address))
             {
                 behind.insert(address, now + *valid);
@@ -279,17 +316,17 @@ impl Reservations {
 
     /// Number of clients of session servers that have come before this time.
     pub(super) fn ahead_of(&self, since: Instant) -> usize {
-        let ahead = |link: &Link| {
-            let listed = link.wanted.iter().filter(|wanted| wanted.since < since).count();
+        let ahead = |line: &Line| {
+            let listed = line.wanted.iter().filter(|wanted| wanted.since < since).count();
             // Of those that are not listed it is only known that they came later than all that are.
-            if listed == link.wanted.len() { link.all } else { listed }
+            if listed == line.wanted.len() { line.all } else { listed }
         };
-        self.links.values().map(ahead).sum()
+        self.lines.values().map(ahead).sum()
     }
 
     /// Number of clients of session servers that may have a slot.
     pub(super) fn waiting(&self, may_have: impl Fn(&[(Party, usize)]) -> bool) -> usize {
-        let wanted = self.links.values().flat_map(|link| &link.wanted);
+        let wanted = self.lines.values().flat_map(|line| &line.wanted);
         wanted.filter(|wanted| may_have(&wanted.parties)).count()
     }
 
@@ -297,24 +334,24 @@ impl Reservations {
     /// address or user has all the slots that it may have.
     pub(super) fn tell(&mut self, free: usize, queue: &[Instant], has_share: impl Fn(&(Party, usize)) -> bool) {
         let now = Instant::now();
-        for link in self.links.values_mut() {
-            let passed = passed_over(&link.wanted, &self.behind, &has_share);
-            if !link.has_news && link.queue == queue && link.passed == passed {
+        for line in self.lines.values_mut() {
+            let passed = passed_over(&line.wanted, &self.behind, &has_share);
+            if !line.has_news && line.queue == queue && line.passed == passed {
                 continue;
             }
-            queue.clone_into(&mut link.queue);
-            link.passed.clone_from(&passed);
+            queue.clone_into(&mut line.queue);
+            line.passed.clone_from(&passed);
             let waited = |since: &Instant| u64::try_from(now.duration_since(*since).as_millis()).unwrap_or(u64::MAX);
-            let number = link.news.number;
+            let number = line.news.number;
             let news = Offers {
                 free: u32::try_from(free).unwrap_or(u32::MAX),
                 queue: queue.iter().map(waited).collect(),
                 passed,
-                ..std::mem::take(&mut link.news)
+                ..std::mem::take(&mut line.news)
             };
-            link.news.number = number;
-            link.has_news = false;
-            link.listener.do_send(Reserved(news));
+            line.news.number = number;
+            line.has_news = false;
+            line.listener.do_send(Reserved(news));
         }
     }
 }

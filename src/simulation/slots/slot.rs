@@ -1,10 +1,11 @@
-//! What the owner of a simulation holds: its slot, or its position in the queue for one.
+//! What the owner of a simulation holds: its position in the queue, and then its slot.
 
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use actix::Recipient;
 
-use super::simulation_record::{Access, Holder, SimulationRecord, SlotEvent, SpareKind};
+use super::simulation_record::{Access, Client, Holder, OpenStream, Prepared, SimulationRecord, SlotEvent, SpareKind};
 use super::slot_pool::SlotPool;
 use crate::shared::domain::{Failure, ProjectUrl, ReservationId};
 use crate::shared::http::Peer;
@@ -12,44 +13,57 @@ use crate::simulation::attachment::Token;
 use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::ends::End;
 use crate::simulation::simulation_id::SimulationId;
-use crate::simulation::snapshot::Simulation;
 
-/// A slot, or a position in the queue for one. Dropping it releases it.
-pub struct SlotLease {
-    id: SimulationId,
-    slots: Arc<SlotPool>,
-}
+/// A position in the queue for a slot. Dropping it leaves the queue, and frees the slot that it may have been granted.
+pub struct QueuePosition(Entry);
 
-/// A port for one simulation, with its lease.
+/// A port for one simulation. Dropping it frees the port.
 pub struct Slot {
-    /// Frees the slot when it is dropped.
-    pub lease: SlotLease,
+    entry: Entry,
     /// The port on which Webots listens.
     pub port: u16,
 }
 
-impl SlotLease {
+/// A simulation in the pool. Dropping it removes the simulation.
+struct Entry {
+    id: SimulationId,
+    slots: Arc<SlotPool>,
+}
+
+impl QueuePosition {
     /// Joins the queue for a slot, or takes the one that is reserved for the client. `listener` receives the events, `world`
     /// is shown, and the client counts for its address and its user.
     ///
     /// # Errors
     /// Why it may not wait.
-    pub fn acquire(
+    pub fn join(
         slots: &Arc<SlotPool>,
         id: SimulationId,
         listener: Recipient<SlotEvent>,
         world: &ProjectUrl,
-        (client, identity): (Peer, ClientIdentity),
+        (peer, identity): (Peer, ClientIdentity),
         reservation: Option<ReservationId>,
     ) -> Result<Self, Failure> {
-        let record = SimulationRecord::for_client(Simulation::new(id, world, identity), client, listener);
-        slots.acquire(record, reservation)?;
-        Ok(Self {
+        let client = Client::new(peer, identity);
+        slots.acquire(SimulationRecord::for_client(id, world, client, listener), reservation)?;
+        Ok(Self(Entry {
             id,
             slots: Arc::clone(slots),
-        })
+        }))
     }
 
+    /// The slot that it was granted.
+    pub fn granted(self, port: u16) -> Slot {
+        Slot { entry: self.0, port }
+    }
+
+    /// Reports how the simulation ends, before this is dropped. Only the first report counts.
+    pub fn end(&self, end: impl Into<End>) {
+        self.0.end(end.into());
+    }
+}
+
+impl Slot {
     /// Takes a free slot for a simulation that is kept ready for clients; `None` if there is none that no client waits
     /// for.
     pub fn for_spare(
@@ -58,60 +72,82 @@ impl SlotLease {
         listener: Recipient<SlotEvent>,
         kind: SpareKind,
     ) -> Option<Self> {
-        let simulation = Simulation::new(id, &kind.world, ClientIdentity::default());
-        let record = SimulationRecord::for_spare(simulation, kind, listener);
-        slots.add_spare(record).then(|| Self {
+        let port = slots.add_spare(id, kind, listener)?;
+        let entry = Entry {
             id,
             slots: Arc::clone(slots),
-        })
+        };
+        Some(Self { entry, port })
     }
 
     /// The id of the simulation.
     pub fn id(&self) -> SimulationId {
-        self.id
-    }
-
-    /// Changes what pages show of the simulation.
-    pub fn update(&self, change: impl FnOnce(&mut Simulation)) {
-        self.slots.update(self.id, change);
+        self.entry.id
     }
 
     /// Logs an event of the simulation under its id, and records `note`, the text that clients may read.
     pub fn log(&self, level: log::Level, event: &str, note: &str) {
-        log::log!(target: "simulation", level, "{}: {event}", self.id);
-        self.slots.change(self.id, |record| record.note(note));
+        log::log!(target: "simulation", level, "{}: {event}", self.entry.id);
+        self.entry.change(|record| record.note(note));
     }
 
-    /// Notes why the server is about to end the simulation: those at its streams are told when Webots closes these.
-    pub fn ending(&self, why: &str) {
-        self.slots.change(self.id, |record| {
-            record.ending.get_or_init(|| why.to_owned());
-        });
+    /// Its world is checked out.
+    pub fn prepared(&self, prepared: Prepared) {
+        self.entry.change(|record| record.prepare(prepared));
     }
 
-    /// Reports how the simulation ends, before the lease is dropped. Only the first report counts. Its tokens become
-    /// invalid, because another simulation may soon have its port.
-    pub fn end(&self, end: impl Into<End>) {
-        self.slots.change(self.id, |record| {
-            record.accesses.clear();
-            record.end.get_or_insert_with(|| end.into());
-        });
+    /// Its Webots was launched as the process `pid`, whose output is kept in the file `log`.
+    pub fn launched(&self, pid: i32, log: Option<PathBuf>) {
+        self.entry.change(|record| record.launch(pid, log));
     }
 
     /// Opens the stream of the simulation, until its end is reported. Returns the token for its
     /// client. `answers_controllers`: its Webots tells controllers whether it has a world.
-    pub fn open_stream(&self, answers_controllers: bool) -> Token {
+    pub fn open_stream(&self, answers_controllers: bool, is_running: bool) -> Token {
         let access = Access::new(Holder::Client);
         let token = access.token;
-        self.slots.change(self.id, |record| {
-            record.answers_controllers = answers_controllers;
-            record.accesses.push(access);
-        });
+        let stream = OpenStream {
+            answers_controllers,
+            accesses: vec![access],
+        };
+        self.entry.change(|record| record.open_stream(stream, is_running));
         token
+    }
+
+    /// The simulation is paused, or goes on.
+    pub fn set_running(&self, is_running: bool) {
+        self.entry.change(|record| record.set_running(is_running));
+    }
+
+    /// Notes why the server is about to end the simulation: those at its streams are told when Webots closes these.
+    pub fn ending(&self, why: &str) {
+        self.entry.change(|record| {
+            record.ending.get_or_init(|| why.to_owned());
+        });
+    }
+
+    /// Its Webots ends.
+    pub fn stopping(&self) {
+        self.entry.change(SimulationRecord::stop);
+    }
+
+    /// Reports how the simulation ends, before this is dropped. Only the first report counts. Its tokens become invalid.
+    pub fn end(&self, end: impl Into<End>) {
+        self.entry.end(end.into());
     }
 }
 
-impl Drop for SlotLease {
+impl Entry {
+    fn change(&self, change: impl FnOnce(&mut SimulationRecord)) {
+        self.slots.change(self.id, change);
+    }
+
+    fn end(&self, end: End) {
+        self.change(|record| record.end(end));
+    }
+}
+
+impl Drop for Entry {
     fn drop(&mut self) {
         self.slots.release(self.id);
     }

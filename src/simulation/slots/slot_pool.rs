@@ -1,8 +1,8 @@
-//! Leases slots to simulations, keeps the queue, and knows all simulations of this server.
+//! Grants slots to simulations, keeps the queue, and knows all simulations of this server.
 //!
-//! One for the whole server. A slot is a streaming port. A session creates a [`SlotLease`](super::SlotLease), and
-//! receives its position in the queue until a port is granted. Dropping the lease leaves the queue or frees the port, so
-//! that neither leaks in any state or after any panic.
+//! One for the whole server. A slot is a streaming port. A session creates a [`QueuePosition`](super::QueuePosition), which
+//! becomes a [`Slot`](super::Slot) once a port is granted. Dropping either leaves the queue or frees the port, so that neither
+//! leaks in any state or after any panic.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::net::IpAddr;
@@ -16,11 +16,13 @@ use parking_lot::Mutex;
 use super::port;
 use super::real_time_places::RealTimePlaces;
 use super::reservations::{Held, LinkId, Reservations, Reserved};
-use super::simulation_record::{Party, SimulationRecord, SlotEvent, SpareKind};
+use super::simulation_record::{
+    Away, Client, Holding, Party, Served, SimulationRecord, SlotEvent, SpareKind, Standing,
+};
 use crate::shared::domain::{Failure, Instances, Reason, ReservationId, Stage, View, Wish, Wishes};
 use crate::simulation::ends::Ends;
 use crate::simulation::simulation_id::SimulationId;
-use crate::simulation::snapshot::{Holdings, Simulation, Snapshot};
+use crate::simulation::snapshot::{Holdings, Snapshot};
 
 /// The slots of this server, and the simulations that have one or wait for one.
 pub struct SlotPool(pub(super) Mutex<Slots>);
@@ -32,7 +34,7 @@ pub(super) struct Slots {
     pub(super) per_user: Option<usize>,
     /// How long a client may be away before its simulation gives its slot to one that waits.
     yield_after: Duration,
-    /// Number of leases that were requested, including those of clients that were refused.
+    /// Number of clients that have asked for a slot, including those that were refused.
     pub(super) arrivals: u64,
     /// Number of simulations that have given their slots back.
     freed: u64,
@@ -55,7 +57,7 @@ const EXPIRY: Duration = Duration::from_millis(100);
 const RECHECK: Duration = Duration::from_secs(1);
 
 impl SlotPool {
-    /// Leases these ports; `queue_capacity` clients may wait. `per_address` and `per_user` limit the slots of one
+    /// Lends these ports; `queue_capacity` clients may wait. `per_address` and `per_user` limit the slots of one
     /// address and one user, and likewise their waiting clients. A simulation whose client is away for `yield_after` gives
     /// its slot to a client that waits. A reservation holds for the time `pass`. Each end is recorded with `ends`.
     pub fn new(
@@ -132,7 +134,7 @@ impl SlotPool {
         Holdings {
             ports: slots.left.clone().unwrap_or_else(|| slots.taken().collect()),
             instances: slots.own_instances(),
-            simulations: slots.of_clients().cloned().collect(),
+            simulations: slots.of_clients().map(SimulationRecord::shown).collect(),
         }
     }
 
@@ -144,7 +146,7 @@ impl SlotPool {
 
     /// Whether this process has the simulation with this id.
     pub fn has(&self, id: &str) -> bool {
-        self.0.lock().of_clients().any(|one| one.id.to_string() == id)
+        self.0.lock().of_clients().any(|record| record.id.to_string() == id)
     }
 
     /// A session server has connected, for whose line slots are reserved.
@@ -186,15 +188,22 @@ impl SlotPool {
     ) -> Result<(), Failure> {
         let mut slots = self.0.lock();
         let reservation = reservation.map(|id| slots.reservations.redeem(id)).transpose()?;
-        slots.arrivals += 1;
+        // A client that was about to take a simulation that was kept ready was counted then.
+        let is_new = reservation
+            .as_ref()
+            .is_none_or(|reservation| reservation.link().is_some());
+        slots.arrivals += u64::from(is_new);
         let limits = (slots.per_address, slots.per_user);
-        let user = record.simulation.identity.user.clone();
-        record.parties = parties(record.address(), user, limits);
-        let id = record.simulation.id;
+        let id = record.id;
+        let Standing::Waiting { client, .. } = &mut record.standing else {
+            return Ok(());
+        };
+        client.parties = parties(client.address(), client.identity.user.clone(), limits);
+        let own = client.parties.clone();
         if let Some(reservation) = reservation {
-            record.since = reservation.since;
+            client.since = reservation.since;
             // It may count for somebody else than the session server knew.
-            if record.parties == reservation.parties || may_have(&slots.lent(), &record.parties) {
+            if own == reservation.parties || may_have(&slots.lent(), &own) {
                 match reservation.held {
                     Held::Port(port) => record.lend(port),
                     // It is of another kind than the client: the client gets its port.
@@ -205,11 +214,11 @@ impl SlotPool {
                 return Ok(());
             }
         }
-        let refusal = slots.refusal(&record);
+        let refusal = slots.refusal(&own);
         slots.records.insert(id, record);
         slots.grant();
         if let Some(refusal) = refusal
-            && slots.queue().any(|record| record.simulation.id == id)
+            && slots.queue().any(|(waiting, _)| waiting == id)
         {
             slots.records.remove(&id);
             return Err(refusal);
@@ -222,9 +231,18 @@ impl SlotPool {
     pub(super) fn release(&self, id: SimulationId) {
         let mut slots = self.0.lock();
         if let Some(record) = slots.records.remove(&id) {
-            if let Some(port) = record.simulation.port {
+            if let Some(Holding { port, .. }) = record.holding() {
+                let port = *port;
                 slots.reservations.keep_port(id, port);
-                slots.freed += u64::from(record.spare().is_none());
+                match record.served() {
+                    Some(Served {
+                        client,
+                        arriving: Some(reservation),
+                        ..
+                    }) => slots.reservations.keep_for(*reservation, id, port, client),
+                    Some(_) => slots.freed += 1,
+                    None => {}
+                }
                 log::info!(target: "simulation", "{id}: the slot of port {port} is free");
             }
             slots.ends.record(record.ended());
@@ -239,28 +257,15 @@ impl SlotPool {
         }
     }
 
-    /// Changes what pages show of a simulation, if it has not ended.
-    pub fn update(&self, id: SimulationId, change: impl FnOnce(&mut Simulation)) {
-        self.change(id, |record| change(&mut record.simulation));
-    }
-
     /// Records until when the client of a simulation, which has gone, may come back; `None`: it is there.
     pub fn mark_away(&self, id: SimulationId, until: Option<u64>) {
-        self.change(id, |record| {
-            record.simulation.away_until = until;
-            record.away_since = until.map(|_| Instant::now());
-            // A client that is there again keeps its simulation, also one that was to make room.
-            record.makes_room &= until.is_some();
-        });
+        self.change(id, |record| record.set_away(until));
     }
 
     /// Stops the simulations with these ids; `why` is the text for their clients. Returns the ids of those that are there.
     pub fn stop(&self, ids: &[String], why: &str) -> Vec<String> {
         let slots = self.0.lock();
-        let with_ids = slots
-            .records
-            .values()
-            .map(|record| (record.simulation.id.to_string(), record));
+        let with_ids = slots.records.values().map(|record| (record.id.to_string(), record));
         let chosen = with_ids.filter(|(id, _)| ids.contains(id));
         let stopped = chosen.map(|(id, record)| {
             record.listener.do_send(SlotEvent::Stopped(why.to_owned()));
@@ -277,34 +282,30 @@ impl SlotPool {
     /// All simulations at this moment, those of processes that serve their last clients first.
     pub fn snapshot(&self) -> Snapshot {
         let slots = self.0.lock();
+        let others = slots.others.simulations.iter().cloned();
         Snapshot {
             instances: slots.instances(),
-            simulations: slots
-                .others
-                .simulations
-                .iter()
-                .chain(slots.of_clients())
-                .cloned()
-                .collect(),
+            simulations: others.chain(slots.of_clients().map(SimulationRecord::shown)).collect(),
         }
     }
 }
 
 impl Slots {
     /// The simulations that have a client.
-    fn of_clients(&self) -> impl Iterator<Item = &Simulation> {
-        let of_clients = self.records.values().filter(|record| record.spare().is_none());
-        of_clients.map(|record| &record.simulation)
+    pub(super) fn of_clients(&self) -> impl Iterator<Item = &SimulationRecord> {
+        self.records.values().filter(|record| record.spare().is_none())
     }
 
-    fn queue(&self) -> impl Iterator<Item = &SimulationRecord> {
-        self.records.values().filter(|record| record.simulation.port.is_none())
+    fn queue(&self) -> impl Iterator<Item = (SimulationId, &Client)> {
+        self.records
+            .values()
+            .filter_map(|record| Some((record.id, record.waiting()?)))
     }
 
     /// The simulations in the queue whose client's address and user may have another slot.
-    fn eligible(&self) -> impl Iterator<Item = &SimulationRecord> {
+    fn eligible(&self) -> impl Iterator<Item = (SimulationId, &Client)> {
         let lent = self.lent();
-        self.queue().filter(move |waiting| may_have(&lent, &waiting.parties))
+        self.queue().filter(move |(_, client)| may_have(&lent, &client.parties))
     }
 
     /// Number of slots that each address and user has whose slots are limited.
@@ -313,8 +314,8 @@ impl Slots {
         let of_records = self
             .records
             .values()
-            .filter(|record| record.simulation.port.is_some())
-            .flat_map(|record| &record.parties);
+            .filter_map(SimulationRecord::served)
+            .flat_map(|served| &served.client.parties);
         let of_reservations = self.reservations.reserved.values().flat_map(|one| &one.parties);
         for (party, _) in of_records.chain(of_reservations) {
             *lent.entry(party.clone()).or_default() += 1;
@@ -328,10 +329,10 @@ impl Slots {
         let in_line = self.reservations.first(|parties| may_have(&lent, parties));
         let in_queue = self
             .queue()
-            .filter(|waiting| may_have(&lent, &waiting.parties))
-            .map(|waiting| {
-                let is_behind = self.reservations.is_behind(waiting.address());
-                ((is_behind, waiting.since), waiting.simulation.id)
+            .filter(|(_, client)| may_have(&lent, &client.parties))
+            .map(|(id, client)| {
+                let is_behind = self.reservations.is_behind(client.address());
+                ((is_behind, client.since), id)
             })
             .min();
         match (in_line, in_queue) {
@@ -343,17 +344,17 @@ impl Slots {
         }
     }
 
-    /// Why one more simulation may not wait; `None` if it may.
-    fn refusal(&self, record: &SimulationRecord) -> Option<Failure> {
-        for party in &record.parties {
-            let waiting = self.queue().filter(|record| record.parties.contains(party)).count();
+    /// Why one more client that counts for these may not wait; `None` if it may.
+    fn refusal(&self, parties: &[(Party, usize)]) -> Option<Failure> {
+        for party in parties {
+            let waiting = self
+                .queue()
+                .filter(|(_, client)| client.parties.contains(party))
+                .count();
             // Even with a high limit, a party leaves a part of the queue to others.
             if waiting >= party.1.min((self.queue_capacity * 3 / 4).max(1)) {
-                let all = self
-                    .records
-                    .values()
-                    .filter(|record| record.parties.contains(party))
-                    .count();
+                let clients = self.records.values().filter_map(SimulationRecord::client);
+                let all = clients.filter(|client| client.parties.contains(party)).count();
                 return Some(party.0.refusal(all - waiting, waiting));
             }
         }
@@ -372,21 +373,21 @@ impl Slots {
     pub(super) fn serve(&mut self) {
         self.grant();
         self.make_room();
-        let queue: Vec<Instant> = self.queue().map(|waiting| waiting.since).collect();
+        let queue: Vec<Instant> = self.queue().map(|(_, client)| client.since).collect();
         let free = self.places().saturating_sub(self.used());
         let lent = self.lent();
         let has_share = |(party, most): &(Party, usize)| lent.get(party).is_some_and(|slots| slots >= most);
         self.reservations.tell(free, &queue, has_share);
-        for (before, waiting) in self
-            .records
-            .values_mut()
-            .filter(|record| record.simulation.port.is_none())
-            .enumerate()
-        {
-            let ahead = before + self.reservations.ahead_of(waiting.since);
-            if waiting.sent_position.replace(ahead) != Some(ahead) {
-                waiting.listener.do_send(SlotEvent::Queued(ahead));
+        let mut before = 0;
+        for record in self.records.values_mut() {
+            let Standing::Waiting { client, told } = &mut record.standing else {
+                continue;
+            };
+            let ahead = before + self.reservations.ahead_of(client.since);
+            if told.replace(ahead) != Some(ahead) {
+                record.listener.do_send(SlotEvent::Queued(ahead));
             }
+            before += 1;
         }
     }
 
@@ -404,10 +405,7 @@ impl Slots {
     /// The slots that clients have, or that are reserved for them, or that other processes of this server have. That of a
     /// simulation without a client is as good as free, unless it is promised.
     pub(super) fn used(&self) -> usize {
-        let of_clients = self
-            .records
-            .values()
-            .filter(|record| record.simulation.port.is_some() && record.spare().is_none());
+        let of_clients = self.records.values().filter_map(SimulationRecord::served);
         of_clients.count() + self.reservations.reserved.len() + self.others.ports.len()
     }
 
@@ -464,56 +462,56 @@ impl Slots {
         if waiting == 0 || offers_slot && self.free_port().is_some() {
             return;
         }
-        let leaving = self
-            .records
-            .values()
-            .filter(|record| record.makes_room && (record.is_away() || record.spare().is_some()));
+        let leaving = self.records.values().filter(|record| record.makes_room());
         for _ in leaving.count()..waiting {
             // Where no slot is offered, theirs would help nobody.
             if offers_slot && let Some(spare) = self.least_spare() {
                 self.end_now(spare);
                 continue;
             }
-            let Some(longest_away) = self.longest_away() else {
+            let Some((listener, away)) = self.longest_away() else {
                 return;
             };
-            longest_away.makes_room = true;
-            longest_away.listener.do_send(SlotEvent::MakeRoom);
+            away.makes_room = true;
+            listener.do_send(SlotEvent::MakeRoom);
         }
     }
 
     /// The simulation that waits for its client the longest, if that is too long, or more than the share of its address
     /// waits.
-    fn longest_away(&mut self) -> Option<&mut SimulationRecord> {
+    fn longest_away(&mut self) -> Option<(Recipient<SlotEvent>, &mut Away)> {
         let share = (self.ports.len() / 4).max(1);
-        let mut away: HashMap<IpAddr, usize> = HashMap::new();
-        let address = |record: &SimulationRecord| record.address().filter(|_| record.is_away() && !record.makes_room);
-        for address in self.records.values().filter_map(address) {
-            *away.entry(address).or_default() += 1;
+        let mut of_addresses: HashMap<IpAddr, usize> = HashMap::new();
+        let served = self.records.values().filter_map(SimulationRecord::served);
+        let clients = served.map(|served| &served.client);
+        let waiting = clients.filter(|client| client.away.is_some_and(|away| !away.makes_room));
+        for address in waiting.filter_map(Client::address) {
+            *of_addresses.entry(address).or_default() += 1;
         }
         let yield_after = self.yield_after;
-        let has_to_go = |record: &&mut SimulationRecord| {
-            let is_long = record.away_since.is_some_and(|since| since.elapsed() >= yield_after);
-            let is_one_of_many = address(record).is_some_and(|address| away.get(&address) > Some(&share));
-            record.is_away() && !record.makes_room && (is_long || is_one_of_many)
-        };
-        self.records
-            .values_mut()
-            .filter(has_to_go)
-            .min_by_key(|record| record.away_since)
+        let away = self.records.values_mut().filter_map(|record| {
+            let listener = record.listener.clone();
+            let Client { peer, away, .. } = &mut record.served_mut()?.client;
+            let address = peer.rate_limit_key();
+            let away = away.as_mut().filter(|away| !away.makes_room)?;
+            let is_long = away.since.elapsed() >= yield_after;
+            let is_one_of_many = address.is_some_and(|address| of_addresses.get(&address) > Some(&share));
+            (is_long || is_one_of_many).then_some((listener, away))
+        });
+        away.min_by_key(|(_, away)| away.since)
     }
 
-    /// The ports that are leased or reserved.
+    /// The ports that simulations have, or that are reserved.
     fn taken(&self) -> impl Iterator<Item = u16> {
-        let leased = self.records.values().filter_map(|record| record.simulation.port);
+        let lent = self.records.values().filter_map(|record| Some(record.holding()?.port));
         let reserved = self.reservations.reserved.values().filter_map(|one| match one.held {
             Held::Port(port) => Some(port),
             Held::Spare(_) => None,
         });
-        leased.chain(reserved)
+        lent.chain(reserved)
     }
 
-    /// The lowest port that is neither leased nor reserved nor that of another process of this server, nor used by another
+    /// The lowest port that is neither lent nor reserved nor that of another process of this server, nor used by another
     /// program.
     pub(super) fn free_port(&self) -> Option<u16> {
         let taken: HashSet<u16> = self.taken().collect();
@@ -535,9 +533,8 @@ impl Slots {
     fn own_instances(&self) -> Instances {
         let count = |stages: &[Stage]| {
             let matching = self
-                .records
-                .values()
-                .filter(|record| record.spare().is_none() && stages.contains(&record.simulation.stage))
+                .of_clients()
+                .filter(|record| stages.contains(&record.stage()))
                 .count();
             u32::try_from(matching).unwrap_or(u32::MAX)
         };
@@ -590,7 +587,7 @@ mod tests {
     use crate::shared::domain::ProjectUrl;
     use crate::shared::http::{Metrics, Peer};
     use crate::simulation::client_identity::ClientIdentity;
-    use crate::simulation::slots::SlotLease;
+    use crate::simulation::slots::QueuePosition;
 
     /// Passes on that its simulation is to make room.
     struct Listener(UnboundedSender<()>);
@@ -628,13 +625,13 @@ mod tests {
         let (sender, mut told) = unbounded_channel();
         let listener = Listener(sender).start();
         let ids = [SimulationId::next(), SimulationId::next()];
-        let _leases = ids.map(|id| {
+        let _positions = ids.map(|id| {
             let client = (
                 Peer::Proxy(std::net::Ipv4Addr::LOCALHOST.into()),
                 ClientIdentity::default(),
             );
-            let lease = SlotLease::acquire(&pool, id, listener.clone().recipient(), &world, client, None);
-            lease.ok().unwrap()
+            let position = QueuePosition::join(&pool, id, listener.clone().recipient(), &world, client, None);
+            position.ok().unwrap()
         });
         // The second client waits for the slot of the first.
         for _ in 0..2 {

@@ -6,12 +6,10 @@ use std::collections::BTreeMap;
 
 use actix::Recipient;
 
-use super::simulation_record::{RunsFor, SimulationRecord, SlotEvent, SpareKind};
+use super::simulation_record::{Client, Phase, Run, SimulationRecord, SlotEvent, SpareKind, SpareState};
 use super::slot_pool::{SlotPool, Slots, may_have, parties};
 use crate::shared::domain::ReservationId;
-use crate::shared::domain::Stage;
 use crate::shared::http::Peer;
-use crate::shared::run::seconds_since_1970;
 use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::simulation_id::SimulationId;
 
@@ -42,13 +40,16 @@ pub struct Taker {
 impl SimulationRecord {
     /// How far a simulation without a client has come; `None` if it has a client, or ends.
     fn progress(&self) -> Option<Progress> {
-        let is_left = self.spare().is_some() && !self.makes_room && self.end.is_none();
-        match self.simulation.stage {
-            Stage::Idle | Stage::Running if is_left => Some(Progress::Ready),
-            Stage::Launching if is_left => Some(Progress::Launching),
-            Stage::CheckingOut if is_left => Some(Progress::CheckingOut),
-            _ => None,
-        }
+        let is_left = self.spare()?.state != SpareState::Ending && self.end.is_none();
+        let progress = match &self.holding()?.run {
+            Run::CheckingOut | Run::Preparing(_) => Progress::CheckingOut,
+            Run::Launched(launch) => match launch.phase {
+                Phase::Launching => Progress::Launching,
+                Phase::Ready { .. } => Progress::Ready,
+                Phase::Stopping(_) => return None,
+            },
+        };
+        is_left.then_some(progress)
     }
 
     fn is_of(&self, kind: &SpareKind) -> bool {
@@ -57,8 +58,10 @@ impl SimulationRecord {
 
     /// Ends a simulation without a client, which then nobody takes any more.
     fn yield_slot(&mut self) {
-        self.makes_room = true;
-        self.listener.do_send(SlotEvent::MakeRoom);
+        if let Some(spare) = self.spare_mut() {
+            spare.state = SpareState::Ending;
+            self.listener.do_send(SlotEvent::MakeRoom);
+        }
     }
 }
 
@@ -72,8 +75,13 @@ enum Progress {
 
 impl SlotPool {
     /// Gives a simulation that is kept ready to a client, if there is one for it: the one that has come furthest. A client
-    /// with a reservation uses it by that. Returns where the session of the simulation is told.
-    pub fn take_spare(&self, taker: &Taker, reservation: Option<ReservationId>) -> Option<Recipient<SlotEvent>> {
+    /// with a reservation uses it by that. Returns where the session of the simulation is told, and a reservation for the
+    /// client should the simulation have failed.
+    pub fn take_spare(
+        &self,
+        taker: &Taker,
+        reservation: Option<ReservationId>,
+    ) -> Option<(Recipient<SlotEvent>, ReservationId)> {
         let mut slots = self.0.lock();
         let limits = (slots.per_address, slots.per_user);
         let parties = parties(taker.peer.rate_limit_key(), taker.identity.user.clone(), limits);
@@ -92,33 +100,38 @@ impl SlotPool {
             .or_else(|| slots.best_spare(&taker.kind))?;
         let reservation = reservation.map(|id| slots.reservations.redeem(id)).transpose().ok()?;
         slots.arrivals += 1;
+        let mut client = Client::new(taker.peer, taker.identity.clone());
+        client.parties = parties;
+        client.since = reservation.map_or(client.since, |reservation| reservation.since);
         let record = slots.records.get_mut(&id)?;
-        record.runs_for = RunsFor::Client(taker.peer);
-        record.parties = parties;
-        record.since = reservation.map_or_else(std::time::Instant::now, |reservation| reservation.since);
-        let now = seconds_since_1970();
-        let simulation = &mut record.simulation;
-        simulation.identity = taker.identity.clone();
-        simulation.since = now;
-        simulation.waited = Some(record.since.elapsed().as_secs_f64());
-        // The time limit of a simulation that is kept ready begins with its client.
-        simulation.launched = simulation.launched.map(|_| now);
-        record.note("a client takes it; it was kept ready");
+        let again = ReservationId(rand::random());
+        record.take(client, again);
         let session = record.listener.clone();
         slots.serve();
-        Some(session)
+        Some((session, again))
     }
 
-    /// Adds a simulation without a client, if a slot is free that no client waits for. Returns whether it was added.
-    pub(super) fn add_spare(&self, mut record: SimulationRecord) -> bool {
+    /// The session of a simulation that was kept ready knows its client.
+    pub fn taken(&self, id: SimulationId, again: ReservationId) {
         let mut slots = self.0.lock();
-        let Some(port) = slots.free_port().filter(|_| slots.has_room_for_spare()) else {
-            return false;
-        };
-        record.lend(port);
-        slots.records.insert(record.simulation.id, record);
+        if let Some(served) = slots.records.get_mut(&id).and_then(SimulationRecord::served_mut) {
+            served.arriving = None;
+        } else {
+            // Its Webots has just ended, of which its client will hear.
+            slots.reservations.reserved.remove(&again);
+            slots.serve();
+        }
+    }
+
+    /// Adds a simulation without a client, if a slot is free that no client waits for, and returns its port.
+    pub(super) fn add_spare(&self, id: SimulationId, kind: SpareKind, listener: Recipient<SlotEvent>) -> Option<u16> {
+        let mut slots = self.0.lock();
+        let port = slots.free_port().filter(|_| slots.has_room_for_spare())?;
+        slots
+            .records
+            .insert(id, SimulationRecord::for_spare(id, kind, port, listener));
         slots.serve();
-        true
+        Some(port)
     }
 
     /// Whether there is a free slot that no client waits for.
@@ -135,11 +148,11 @@ impl SlotPool {
             let Some((spare, progress)) = record.spare().zip(record.progress()) else {
                 continue;
             };
-            let id = record.simulation.id;
+            let id = record.id;
             spares.entry(spare.kind.clone()).or_default().push(SpareStatus {
                 id,
                 is_ready: progress == Progress::Ready,
-                is_outdated: spare.is_outdated,
+                is_outdated: spare.state == SpareState::Outdated,
                 is_reserved: slots.reservations.holds(id),
             });
         }
@@ -150,10 +163,11 @@ impl SlotPool {
     pub fn outdate_spares(&self, kind: &SpareKind) {
         let mut slots = self.0.lock();
         for record in slots.records.values_mut() {
-            if let RunsFor::Spare(spare) = &mut record.runs_for
+            if let Some(spare) = record.spare_mut()
                 && spare.kind == *kind
+                && spare.state == SpareState::Current
             {
-                spare.is_outdated = true;
+                spare.state = SpareState::Outdated;
             }
         }
     }
@@ -170,14 +184,18 @@ impl SlotPool {
         }
     }
 
-    /// A simulation that was kept ready has failed. Returns whether it has no client; then it gets none any more.
+    /// A simulation that was kept ready has failed. Returns whether no client is on its way; then none takes it any more.
     pub fn give_up_spare(&self, id: SimulationId) -> bool {
         let mut slots = self.0.lock();
         let Some(record) = slots.records.get_mut(&id) else {
-            return true;
+            return !slots.reservations.expects_taker(id);
         };
-        record.makes_room = record.spare().is_some();
-        record.makes_room
+        let spare = record.spare_mut();
+        let has_no_client = spare.is_some();
+        if let Some(spare) = spare {
+            spare.state = SpareState::Ending;
+        }
+        has_no_client
     }
 }
 
@@ -220,5 +238,114 @@ impl Slots {
 }
 
 fn is_outdated(record: &SimulationRecord) -> bool {
-    record.spare().is_some_and(|spare| spare.is_outdated)
+    record.spare().is_some_and(|spare| spare.state == SpareState::Outdated)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::Ipv4Addr;
+    use std::sync::Arc;
+    use std::time::Duration;
+
+    use actix::prelude::*;
+
+    use super::*;
+    use crate::shared::domain::{Failure, ProjectUrl, Reason, View};
+    use crate::shared::http::Metrics;
+    use crate::simulation::ends::Ends;
+    use crate::simulation::slots::{QueuePosition, Slot};
+
+    /// Hears nothing.
+    struct Listener;
+
+    impl Actor for Listener {
+        type Context = Context<Self>;
+    }
+
+    impl Handler<SlotEvent> for Listener {
+        type Result = ();
+
+        fn handle(&mut self, _: SlotEvent, _: &mut Self::Context) {}
+    }
+
+    const PEER: Peer = Peer::Proxy(std::net::IpAddr::V4(Ipv4Addr::LOCALHOST));
+
+    fn pool() -> Arc<SlotPool> {
+        let ends = Ends::start("/nonexistent".into(), String::new(), 12, &Metrics::default()).unwrap();
+        let free = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        let port = free.local_addr().unwrap().port();
+        drop(free);
+        SlotPool::new(port..=port, 9, None, None, Duration::MAX, Duration::from_mins(1), ends)
+    }
+
+    fn kind() -> SpareKind {
+        SpareKind {
+            world: ProjectUrl::parse("https://github.com/lab/arm/blob/main/worlds/a.wbt").unwrap(),
+            view: View::default(),
+        }
+    }
+
+    fn taker() -> Taker {
+        Taker {
+            kind: kind(),
+            peer: PEER,
+            identity: ClientIdentity::default(),
+        }
+    }
+
+    /// The client of a simulation: since when it waits, and whether it has a slot.
+    fn standing(pool: &SlotPool, id: SimulationId) -> (std::time::Instant, bool) {
+        let slots = pool.0.lock();
+        let record = &slots.records[&id];
+        (record.client().unwrap().since, record.holding().is_some())
+    }
+
+    #[actix_rt::test]
+    async fn who_takes_one_that_fails_at_that_moment_keeps_its_turn() {
+        let pool = pool();
+        let listener = Listener.start().recipient();
+        let join = |id, reservation| {
+            let client = (PEER, ClientIdentity::default());
+            QueuePosition::join(&pool, id, listener.clone(), &kind().world, client, reservation)
+        };
+        let failed = SimulationId::next();
+        let slot = Slot::for_spare(&pool, failed, listener.clone(), kind()).unwrap();
+        let (_, again) = pool.take_spare(&taker(), None).unwrap();
+        let (since, _) = standing(&pool, failed);
+        // Others wait already when it fails.
+        let other = SimulationId::next();
+        let _waiting = join(other, None).ok().unwrap();
+        slot.end(Failure::new(Reason::Crashed, "it has failed"));
+        drop(slot);
+        assert!(!pool.give_up_spare(failed), "its session waits for the client");
+        assert!(!standing(&pool, other).1, "the slot is the first client's");
+        let second = SimulationId::next();
+        let position = join(second, Some(again)).ok().unwrap();
+        assert_eq!(standing(&pool, second), (since, true));
+        let instances = pool.instances();
+        assert_eq!((instances.arrivals, instances.freed, instances.reserved), (2, 0, 0));
+        drop(position);
+        assert!(standing(&pool, other).1);
+    }
+
+    #[actix_rt::test]
+    async fn what_its_client_has_taken_is_reserved_for_nobody_once_it_ends() {
+        let pool = pool();
+        let listener = Listener.start().recipient();
+        for is_told_first in [true, false] {
+            let id = SimulationId::next();
+            let slot = Slot::for_spare(&pool, id, listener.clone(), kind()).unwrap();
+            let (_, again) = pool.take_spare(&taker(), None).unwrap();
+            if is_told_first {
+                pool.taken(id, again);
+                drop(slot);
+            } else {
+                // Its Webots ends just before its session hears of the client.
+                drop(slot);
+                pool.taken(id, again);
+            }
+            assert_eq!(pool.instances().reserved, 0);
+            assert!(pool.give_up_spare(id));
+        }
+    }
 }

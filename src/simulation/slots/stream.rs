@@ -39,13 +39,8 @@ pub struct WatchGuard {
 impl SimulationRecord {
     /// Notifies the session if one watcher is connected: it is the first one, or the last one that leaves.
     fn notify_of_watchers(&self, is_watched: bool) {
-        if self
-            .accesses
-            .iter()
-            .filter(|access| access.holder == Holder::Watcher)
-            .count()
-            == 1
-        {
+        let accesses = self.stream().into_iter().flat_map(|stream| &stream.accesses);
+        if accesses.filter(|access| access.holder == Holder::Watcher).count() == 1 {
             self.listener.do_send(SlotEvent::Watched(is_watched));
         }
     }
@@ -55,14 +50,15 @@ impl SlotPool {
     /// The stream of a token, if the token is valid.
     pub fn stream(&self, token: Token) -> Option<StreamTarget> {
         self.0.lock().records.values().find_map(|record| {
-            let access = record.accesses.iter().find(|access| access.token == token)?;
+            let stream = record.stream()?;
+            let access = stream.accesses.iter().find(|access| access.token == token)?;
             Some(StreamTarget {
-                simulation: record.simulation.id,
-                port: record.simulation.port?,
-                answers_controllers: record.answers_controllers,
+                simulation: record.id,
+                port: record.holding()?.port,
+                answers_controllers: stream.answers_controllers,
                 read_only: access.holder != Holder::Client,
                 connections: Arc::clone(&access.connections),
-                time: record.simulation.time.clone(),
+                time: record.time.clone(),
                 ending: Arc::clone(&record.ending),
             })
         })
@@ -76,13 +72,10 @@ impl SlotPool {
     /// Issues a token to watch a simulation; `None` if it has no stream.
     pub fn watch(&self, simulation: SimulationId) -> Option<Token> {
         let mut slots = self.0.lock();
-        let accesses = &mut slots.records.get_mut(&simulation)?.accesses;
-        if accesses.is_empty() {
-            return None;
-        }
+        let stream = slots.records.get_mut(&simulation)?.stream_mut()?;
         let access = Access::new(Holder::Invited);
         let token = access.token;
-        accesses.push(access);
+        stream.accesses.push(access);
         Some(token)
     }
 
@@ -90,10 +83,8 @@ impl SlotPool {
     pub fn start_watching(self: &Arc<Self>, simulation: SimulationId, token: Token) -> Option<WatchGuard> {
         let mut slots = self.0.lock();
         let record = slots.records.get_mut(&simulation)?;
-        let invited = record
-            .accesses
-            .iter_mut()
-            .find(|access| access.token == token && access.holder == Holder::Invited)?;
+        let mut accesses = record.stream_mut()?.accesses.iter_mut();
+        let invited = accesses.find(|access| access.token == token && access.holder == Holder::Invited)?;
         invited.holder = Holder::Watcher;
         record.notify_of_watchers(true);
         Some(WatchGuard {
@@ -108,7 +99,9 @@ impl Drop for WatchGuard {
     fn drop(&mut self) {
         self.slots.change(self.simulation, |record| {
             record.notify_of_watchers(false);
-            record.accesses.retain(|access| access.token != self.token);
+            if let Some(stream) = record.stream_mut() {
+                stream.accesses.retain(|access| access.token != self.token);
+            }
         });
     }
 }

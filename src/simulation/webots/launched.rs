@@ -25,7 +25,7 @@ pub struct Exit {
 }
 
 /// A Webots that was launched.
-pub struct Launched {
+pub struct LaunchedProcess {
     /// Its processes.
     pub group: ProcessGroup,
     /// The last lines of its output.
@@ -59,15 +59,15 @@ pub fn launch(
     spec: &LaunchSpec,
     containers: Option<SimulationContainers>,
     events: Recipient<OutputEvent>,
-) -> std::io::Result<(Launched, impl Future<Output = Exit> + use<>)> {
+) -> std::io::Result<(LaunchedProcess, impl Future<Output = Exit> + use<>)> {
     let folder = spec.config.log_dir.0.join("simulation").join(FOLDER_OF_RUNNING);
-    let log = folder.join(format!("{}.log", spec.slot.lease.id()));
+    let log = folder.join(format!("{}.log", spec.slot.id()));
     let file = RotatedFile::open(&log, MAX_LOG, "").inspect_err(|error| {
         let why = format!(
             "what Webots prints is not kept: {} can't be written: {error}",
             log.display()
         );
-        spec.slot.lease.log(log::Level::Warn, &why, &why);
+        spec.slot.log(log::Level::Warn, &why, &why);
     });
     let log = file.is_ok().then_some(log);
     let (reader, output) = std::io::pipe()?;
@@ -100,7 +100,7 @@ pub fn launch(
             taken,
         }
     };
-    Ok((Launched { group, tail, log }, ended))
+    Ok((LaunchedProcess { group, tail, log }, ended))
 }
 
 impl Exit {

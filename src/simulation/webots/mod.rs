@@ -13,4 +13,4 @@ pub use event::WebotsEvent;
 pub use idleness::Keep;
 pub use launch_spec::LaunchSpec;
 pub use release::Release;
-pub use webots::{Stop, Taken, Webots};
+pub use webots::{HasClient, Stop, Webots};

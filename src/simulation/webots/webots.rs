@@ -13,12 +13,10 @@ use tokio::sync::Notify;
 
 use super::event::WebotsEvent;
 use super::launch_spec::LaunchSpec;
-use super::launched::{self, Exit, Launched, Reached};
+use super::launched::{self, Exit, LaunchedProcess, Reached};
 use super::output::{OutputEvent, Tail};
 use super::startup::StartupEvent;
-use crate::shared::domain::Stage;
 use crate::shared::domain::{Blame, Failure, Reason};
-use crate::shared::run::seconds_since_1970;
 use crate::simulation::container::SimulationContainers;
 use crate::simulation::ends::{End, StopReason, lost};
 use crate::simulation::process::ProcessGroup;
@@ -30,10 +28,10 @@ use crate::simulation::slots::port;
 #[rtype(result = "()")]
 pub struct Stop(pub StopReason);
 
-/// A client takes the simulation, which was kept ready: its time limit begins.
+/// The simulation, which was kept ready, has a client: its time limit begins.
 #[derive(Message)]
 #[rtype(result = "()")]
-pub struct Taken;
+pub struct HasClient;
 
 /// The actor.
 pub struct Webots {
@@ -102,17 +100,6 @@ pub(super) struct Process {
 const MISSED_HEARTBEATS: u32 = 6;
 
 impl State {
-    /// The state as pages and programs see it.
-    fn stage(&self) -> Stage {
-        match self {
-            Self::Preparing(_) => Stage::CheckingOut,
-            Self::Launching(_) => Stage::Launching,
-            Self::Ready(ready) if ready.process.is_running => Stage::Running,
-            Self::Ready(_) => Stage::Idle,
-            Self::Stopping(_) | Self::Ended(_) => Stage::Stopping,
-        }
-    }
-
     /// The process, unless it is ending.
     fn process(&mut self) -> Option<&mut Process> {
         match self {
@@ -162,11 +149,11 @@ impl Webots {
                 return self.end(Failure::new(Reason::LaunchFailed, message).into(), ctx);
             }
         };
-        self.enter(State::Launching(Launching {
+        self.state = State::Launching(Launching {
             process,
             startup: None,
             has_listened: false,
-        }));
+        });
         self.send(WebotsEvent::Started(Instant::now()));
         // In containers, the wait begins when the container reports that it runs.
         if self.spec.containers.is_none() {
@@ -198,16 +185,12 @@ impl Webots {
             return Err(std::io::ErrorKind::AddrInUse.into());
         }
         let (launched, exit) = launched::launch(&self.spec, containers, ctx.address().recipient())?;
-        let Launched { group, tail, log } = launched;
+        let LaunchedProcess { group, tail, log } = launched;
         let program = self.spec.program.display();
         let world = self.spec.project.world.path.display();
         let pid = group.leader();
         self.log(Level::Info, &format!("started {program} for {world} (process {pid})"));
-        self.spec.slot.lease.update(|simulation| {
-            simulation.launched = Some(seconds_since_1970());
-            simulation.pid = Some(pid);
-            simulation.log = log;
-        });
+        self.spec.slot.launched(pid, log);
         let exit = wrap_future::<_, Self>(exit).map(|exit, this, ctx| this.exited(&exit, ctx));
         ctx.spawn(exit);
         let excess = wrap_future::<_, Self>(self.spec.until_too_much(pid));
@@ -245,15 +228,17 @@ impl Webots {
             other => return self.state = other,
         };
         self.log(Level::Info, "ready");
-        self.enter(State::Ready(Ready {
+        let answers_controllers = !self.spec.is_ready_by_heartbeat();
+        let stream = self.spec.slot.open_stream(answers_controllers, process.is_running);
+        self.state = State::Ready(Ready {
             process,
             last_heartbeat: Instant::now(),
             is_hanging: false,
             idle_end: None,
-        }));
+        });
         self.send(WebotsEvent::Ready {
             port: self.spec.slot.port,
-            stream: self.spec.slot.lease.open_stream(!self.spec.is_ready_by_heartbeat()),
+            stream,
         });
         ctx.run_interval(self.spec.config.timing.heartbeat, Self::check_heartbeat);
         self.used(ctx);
@@ -303,18 +288,19 @@ impl Webots {
         self.log(level, &format!("ending: {failure}"));
         // Something has failed, otherwise.
         if failure.reason.blame() == Blame::User || failure.reason == Reason::ServerStopped {
-            self.spec.slot.lease.ending(&failure.message);
+            self.spec.slot.ending(&failure.message);
         }
         if is_excess || self.spec.is_spare {
             drop(group);
         } else {
             group.terminate();
         }
-        self.enter(State::Stopping(Stopping {
+        self.spec.slot.stopping();
+        self.state = State::Stopping(Stopping {
             tail,
             was_ready,
             failure,
-        }));
+        });
     }
 
     /// How far it came. In containers the project determines what runs: whatever happens there is not the server's
@@ -355,7 +341,7 @@ impl Webots {
             failure,
             taken: exit.taken,
         };
-        self.spec.slot.lease.end(end);
+        self.spec.slot.end(end);
         if was_ready {
             self.spec.keep_assets();
         }
@@ -365,23 +351,9 @@ impl Webots {
 
     /// Ends before Webots was started.
     fn end(&mut self, end: End, ctx: &mut Context<Self>) {
-        self.spec.slot.lease.end(end.clone());
+        self.spec.slot.end(end.clone());
         self.state = State::Ended(end.failure);
         ctx.stop();
-    }
-
-    /// Enters a state, and shows it.
-    fn enter(&mut self, state: State) {
-        self.state = state;
-        self.show();
-    }
-
-    fn show(&self) {
-        let stage = self.state.stage();
-        self.spec.slot.lease.update(|simulation| {
-            simulation.stage = stage;
-            simulation.time.set_running(stage == Stage::Running);
-        });
     }
 
     /// Takes the state out, in order to enter another one.
@@ -396,7 +368,7 @@ impl Webots {
     /// Logs an event with the port, and records it without: a client that has only a token must not learn the port.
     fn log(&self, level: Level, event: &str) {
         let with_port = format!("port {}: {event}", self.spec.slot.port);
-        self.spec.slot.lease.log(level, &with_port, event);
+        self.spec.slot.log(level, &with_port, event);
     }
 }
 
@@ -443,7 +415,7 @@ impl Handler<OutputEvent> for Webots {
             OutputEvent::Paused | OutputEvent::Running => {
                 if let Some(process) = self.state.process() {
                     process.is_running = event == OutputEvent::Running;
-                    self.show();
+                    self.spec.slot.set_running(event == OutputEvent::Running);
                 }
                 self.used(ctx);
             }
@@ -467,10 +439,10 @@ impl Handler<StartupEvent> for Webots {
     }
 }
 
-impl Handler<Taken> for Webots {
+impl Handler<HasClient> for Webots {
     type Result = ();
 
-    fn handle(&mut self, _: Taken, ctx: &mut Self::Context) {
+    fn handle(&mut self, _: HasClient, ctx: &mut Self::Context) {
         self.spec.is_spare = false;
         if self.state.process().is_some() {
             self.limit_time(ctx);
