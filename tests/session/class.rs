@@ -1,9 +1,12 @@
 //! The class: simulations and who waits, of all servers, at the session server, and actions that it forwards.
 
+use std::collections::BTreeMap;
 use std::io::Read;
+use std::time::Instant;
 
 use flate2::read::MultiGzDecoder;
 use futures_util::StreamExt;
+use futures_util::future::join_all;
 use serde_json::{Value, json};
 
 use super::stand_in::{Manner, StandIn};
@@ -141,6 +144,43 @@ async fn the_class_is_one_list_and_its_actions_are_forwarded() {
         )
     );
     until_class(&session, 0).await;
+}
+
+#[actix_rt::test]
+async fn a_hundred_stops_in_a_loop_are_not_refused_while_somebody_guesses() {
+    const AT_ONCE: u16 = 25;
+    let server = keyed(AT_ONCE).start().await;
+    let session = fleet(&[server.address()]).await;
+    let guess = async |path: &str| {
+        let request = awc::Client::builder().timeout(SOON).finish().post(session.url(path));
+        let answer = request.basic_auth("student", "guess").send().await.unwrap();
+        answer.status().as_u16()
+    };
+    until_class(&session, 0).await;
+    let mut guesses = BTreeMap::<u16, u32>::new();
+    let begin = Instant::now();
+    for _ in 0..100 / AT_ONCE {
+        let clients = join_all((0..AT_ONCE).map(|_| start(&server, "Anna"))).await;
+        until_class(&session, AT_ONCE.into()).await;
+        for client in &clients {
+            let path = format!("/simulations/{}/stop", client.id());
+            *guesses.entry(guess(&path).await).or_default() += 1;
+            // The password, four times as often: 400 requests, each of which must succeed.
+            for _ in 0..4 {
+                class(&session).await;
+            }
+            let (status, text) = send(&session, &path, TOKEN, &json!({})).await;
+            assert_eq!(status, 202, "{text}");
+            *guesses.entry(guess("/simulations/stop").await).or_default() += 1;
+        }
+        until_class(&session, 0).await;
+    }
+    let most = 31.0 + 12.0 * begin.elapsed().as_secs_f64() / 60.0;
+    assert!(guesses.keys().eq(&[401, 429]), "{guesses:?}");
+    assert!(
+        (30.0..=most).contains(&f64::from(guesses[&401])),
+        "{guesses:?} of {most}"
+    );
 }
 
 #[actix_rt::test]
