@@ -95,9 +95,15 @@ class Firefox:
     def reload(self):
         self.ask("browsingContext.reload", context=self.tab, wait="complete")
 
-    def evaluate(self, expression):
-        """The value of an expression in the page."""
+    def frame(self):
+        """The first frame of the page, for `evaluate`."""
+        (tab,) = self.ask("browsingContext.getTree", root=self.tab)["contexts"]
+        return tab["children"][0]["context"]
+
+    def evaluate(self, expression, frame=None):
+        """The value of an expression in the page, or in a frame of it."""
         text = f"JSON.stringify(({expression}) ?? null)"
-        answer = self.ask("script.evaluate", expression=text, target={"context": self.tab}, awaitPromise=True)
+        target = {"context": frame or self.tab}
+        answer = self.ask("script.evaluate", expression=text, target=target, awaitPromise=True)
         assert answer["type"] == "success", answer
         return json.loads(answer["result"]["value"])

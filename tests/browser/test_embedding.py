@@ -92,11 +92,11 @@ class Embedding(BrowserTest):
     def visit(self, name, text, **options):
         return self.open(self.site.put(name, text), **options)
 
-    def firefox(self, name, text):
+    def firefox(self, url):
         """A Firefox that shows a page of the site, and a function that looks at what an element of it shows."""
         tab = self.enterContext(Firefox())
         self.addCleanup(lambda: self.may_complain or self.assertEqual(tab.complaints, [], "the console"))
-        tab.goto(self.site.put(name, text))
+        tab.goto(url)
         return tab, lambda name, selector: f"document.getElementById('{name}')?.shadowRoot?.querySelector('{selector}')"
 
     def in_order(self, page, frame=None):
@@ -143,7 +143,7 @@ class PrintedPages(Embedding):
 
     @in_firefox
     def test_in_firefox_a_page_starts_reloads_goes_on_and_ends(self):
-        tab, part = self.firefox("page", printed("A page"))
+        tab, part = self.firefox(self.site.put("page", printed("A page")))
         until("it is available", lambda: tab.evaluate(f"!!{part('robot', '#availability.on')}"))
         tab.evaluate(part("robot", "[part=start]") + ".click()")
         until("it is shown", lambda: tab.evaluate(f"!!{part('robot', SHOWN)}"))
@@ -162,7 +162,7 @@ class PrintedPages(Embedding):
 
     @in_firefox
     def test_in_firefox_two_elements_are_two_simulations_and_the_removal_of_one_ends_it(self):
-        tab, part = self.firefox("race", printed("Two simulations"))
+        tab, part = self.firefox(self.site.put("race", printed("Two simulations")))
         for side in ("left", "right"):
             mode = f"{part(side, '#mode')}?.textContent"
             until(f"{side} runs", lambda mode=mode: tab.evaluate(mode) == "real time")
@@ -288,7 +288,7 @@ class PrintedPages(Embedding):
                 expect(page.tab.locator(SHOWN)).to_be_visible()
                 self.in_order(page)
                 network.breaks()
-                expect(page.tab.locator("[data-is=lost]")).to_be_visible()
+                expect(page.tab.locator("[data-is=lost] #notice")).to_be_visible()
                 self.in_order(page)
                 network.works()
                 expect(page.tab.locator("[data-is=running]")).to_be_visible()
@@ -387,7 +387,7 @@ class InLine(Embedding):
         first = self.visit("race", printed("Two simulations"))
         for side in ("left", "right"):
             expect(first.tab.locator(f"#{side} {SHOWN}")).to_be_visible()
-        tab, part = self.firefox("page", printed("A page"))
+        tab, part = self.firefox(self.site.put("page", printed("A page")))
         until("it is known", lambda: tab.evaluate("document.getElementById('robot').state") == "idle")
         tab.evaluate("document.getElementById('robot').start()")
         note = f"{part('robot', '#step-session small')}?.textContent"
@@ -421,7 +421,7 @@ class Refused(Embedding):
 
     @in_firefox
     def test_in_firefox_a_site_that_is_not_listed_is_told_once_on_the_page_and_in_the_console(self):
-        tab, part = self.firefox("page", printed("A page"))
+        tab, part = self.firefox(self.site.put("page", printed("A page")))
         until("it is known", lambda: tab.evaluate("document.getElementById('robot').state") == "idle")
         tab.evaluate("document.getElementById('robot').start()")
         problem = f"{part('robot', '#problem-text')}?.textContent"
@@ -446,20 +446,26 @@ class InAFrame(Embedding):
         named = {"port": free_ports(1), "frameAncestors": [cls.site.origin]}
         return cls.fleet.start("session-server", name, {**servers, **named, **config})
 
-    def course(self, server, query="", **options):
-        """A page with the printed frame, of this server, and its frame once it is there."""
+    def course(self, server, query=""):
+        """The URL of a page with the printed frame, of this server."""
         text = f"<!DOCTYPE html><html lang='en'><title>Course</title><main><h1>Course</h1>{printed('A frame')}</main>"
         text = text.replace("https://simulations.example.org", server.url("").rstrip("/"))
-        page = self.visit("course", text.replace("embed=1", f"embed=1{query}"), **options)
+        return self.site.put("course", text.replace("embed=1", f"embed=1{query}"))
+
+    def attend(self, server, query="", **options):
+        """The page, its frame once it is there, and the network between them and the simulation servers."""
+        page = self.open("about:blank", **options)
+        network = Network(page)
+        page.tab.goto(self.course(server, query))
         expect(page.tab.frame_locator("iframe").locator("#availability.on")).to_be_visible()
-        return page, page.tab.frames[1]
+        return page, page.tab.frames[1], network
 
     def test_only_a_site_that_is_listed_may_frame_the_viewer(self):
         self.may_complain = True
         text = f"<!DOCTYPE html><html lang='en'><title>Course</title><main>{printed('A frame')}</main>"
         refused = self.visit("course", text)
         until("the browser says why", lambda: any("frame-ancestors" in one for one in refused.complaints))
-        page, frame = self.course(self.framed)
+        page, frame, _ = self.attend(self.framed)
         self.assertEqual(page.faults(), [])
         frame.get_by_role("button", name="Connect").click()
         expect(frame.locator(SHOWN)).to_be_visible()
@@ -469,14 +475,37 @@ class InAFrame(Embedding):
         until("it is gone", lambda: not self.simulations())
         self.assertEqual(page.complaints, [])
 
+    @in_firefox
+    def test_in_firefox_the_frame_runs_a_simulation_also_over_a_reload(self):
+        tab, part = self.firefox(self.course(self.framed))
+
+        def shows(selector):
+            return tab.evaluate(f"!!{part('simulation', selector)}", tab.frame())
+
+        until("it is available", lambda: shows("#availability.on"))
+        tab.evaluate(f"{part('simulation', '[part=start]')}.click()", tab.frame())
+        until("it is shown", lambda: shows(SHOWN))
+        (before,) = self.simulations()
+        tab.reload()
+        until("it is shown again", lambda: shows(SHOWN))
+        (after,) = self.simulations()
+        self.assertEqual((before["id"], before["pid"]), (after["id"], after["pid"]))
+        tab.evaluate(f"{part('simulation', '[part=leave]')}.click()", tab.frame())
+        until("it is gone", lambda: not self.simulations())
+
     def test_the_frame_is_in_order_in_all_languages_and_both_schemes_narrow_and_enlarged(self):
         for size, language, scheme in LOOKS:
             with self.subTest(language, scheme=scheme):
-                page, frame = self.course(self.framed, f"&amp;lang={language}", scheme=scheme, **size)
+                page, frame, network = self.attend(self.framed, f"&amp;lang={language}", scheme=scheme, **size)
                 self.in_order(page, frame)
                 frame.locator("[part=start]").click()
                 expect(frame.locator(SHOWN)).to_be_visible()
                 self.in_order(page, frame)
+                network.breaks()
+                expect(frame.locator("[data-is=lost] #notice")).to_be_visible()
+                self.in_order(page, frame)
+                network.works()
+                expect(frame.locator("[data-is=running]")).to_be_visible()
                 frame.locator("[part=leave]").click()
                 expect(frame.locator("[part=start]")).to_be_focused()
                 frame.evaluate(f"document.getElementById('simulation').start('{WORLD.format('missing')}')")
@@ -484,7 +513,7 @@ class InAFrame(Embedding):
                 self.in_order(page, frame)
 
     def test_the_frame_asks_for_a_name_and_starts_nothing_without_where_one_is_required(self):
-        page, frame = self.course(self.framing("naming", askName="required"), "&amp;start=1")
+        page, frame, _ = self.attend(self.framing("naming", askName="required"), "&amp;start=1")
         name = frame.get_by_label("Your name")
         name.fill(" ")
         frame.locator("[part=start]").click()
