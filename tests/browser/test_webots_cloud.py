@@ -6,6 +6,7 @@ import os
 import re
 import signal
 import ssl
+import subprocess
 import unittest
 import urllib.error
 import urllib.request
@@ -138,6 +139,17 @@ class Visitors(Cloud):
         os.kill(other[0]["pid"], signal.SIGKILL)
         until("the crash is told", lambda: any(CRASH in said for said in self.said(pages[0])))
         self.assertFalse(any(CRASH in said for said in self.said(stopped)), stopped.dialogs)
+
+    def test_the_page_of_a_competition_lets_its_visitors_try(self):
+        self.wait_for_places()
+        # The site tries a competition on its branch of this name.
+        repository = self.fleet.forge / "demo/worlds"
+        subprocess.run(["git", "-C", repository, "branch", "--force", "competition", "main"], check=True)
+        page = self.visit(f"run?version=R2025a&type=competition&url={WORLD.format(real.world())}")
+        page.tab.locator("#try-competition").click()
+        self.runs(page)
+        (running,) = [one for server in self.servers() for one in self.simulations(server)]
+        self.assertIn("/blob/competition/worlds/", running["world"])
 
     def test_one_is_told_that_a_world_is_missing(self):
         self.wait_for_places()
