@@ -2,17 +2,19 @@
 
 use std::collections::BTreeMap;
 use std::io::Read;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use flate2::read::MultiGzDecoder;
 use futures_util::StreamExt;
 use futures_util::future::join_all;
 use serde_json::{Value, json};
+use webots_fleet::shared::domain::{RosterUpdate, SimulationReport, Stage, ToSessionServer};
 
 use super::stand_in::{Manner, StandIn};
 use super::until_states;
 use crate::support::http::{PASSWORD, get_as_administrator};
 use crate::support::program::{Builder, Server, demo_server, session_server};
+use crate::support::reserving::ReservingServer;
 use crate::support::{Client, SOON, arm, until};
 
 const KEY: &str = "a key for a whole fleet";
@@ -288,6 +290,115 @@ async fn a_page_is_told_what_has_changed() {
             "{path}"
         );
     }
+}
+
+/// The simulations of one of four servers in a round: one of ten has other figures than in the round before.
+fn told(server: u32, round: u32) -> Vec<SimulationReport> {
+    let one = |number: u32| SimulationReport {
+        id: format!("2026-11-24T10-00-{server}-{number}"),
+        world: format!("https://github.com/lab/arm/blob/main/worlds/world{}.wbt", number % 5),
+        user: Some(format!("student{:03}@school.example", 250 * server + number)),
+        label: None,
+        state: Stage::Running,
+        since: 1_795_000_000 + u64::from(server + 7 * number),
+        waited: Some(0.0),
+        away_until: None,
+        cpu: Some(5 * ((number * number + (round + number) / 10) % 20)),
+        real_time: Some(100 - 5 * ((number + (round + number) / 10) % 4)),
+    };
+    let is_new = |number: &u32| round == 0 || (round + number).is_multiple_of(10);
+    (0..250).filter(is_new).map(one).collect()
+}
+
+/// A session server with 1,000 simulations on four servers, of which a tenth changes each second.
+async fn large_class() -> Server {
+    let mut servers = Vec::new();
+    for _ in 0..4 {
+        servers.push(ReservingServer::start(1000, 10.0).await);
+    }
+    let addresses: Vec<String> = servers.iter().map(|server| server.address.clone()).collect();
+    let session = fleet(&addresses).await;
+    for (number, mut server) in (0..).zip(servers) {
+        let mut link = server.link().await;
+        actix_rt::spawn(async move {
+            let mut seconds = actix_rt::time::interval(Duration::from_secs(1));
+            for round in 0.. {
+                let update = ToSessionServer::Roster(RosterUpdate {
+                    all: round == 0,
+                    simulations: told(number, round),
+                    ended: Vec::new(),
+                });
+                let until_next = async {
+                    tokio::select! {
+                        _ = seconds.tick() => true,
+                        () = async { while link.wishes_if_any().await.is_some() {} } => false,
+                    }
+                };
+                if !until_next.await || !link.say(serde_json::to_string(&update).unwrap()).await {
+                    return server;
+                }
+            }
+            server
+        });
+    }
+    until_class(&session, 1000).await;
+    session
+}
+
+#[actix_rt::test]
+async fn the_page_of_a_large_class_gets_20_kib_at_first_and_then_changes() {
+    let session = large_class().await;
+    let gzip = ("Accept-Encoding", "gzip");
+    let (text, bytes) = events(&session, &[gzip], "\"gone\":[]").await;
+    assert!(text.contains("\"all\":true"), "{text}");
+    assert!(bytes <= 20 * 1024, "{bytes} bytes");
+    let id = text
+        .lines()
+        .find_map(|line| line.strip_prefix("id: "))
+        .unwrap()
+        .to_owned();
+    let (text, changes) = events(&session, &[gzip, ("Last-Event-ID", &id)], "\"gone\":[]").await;
+    assert!(text.contains("\"all\":false"), "{text}");
+    assert!(changes < bytes / 4, "{changes} bytes of {bytes}");
+}
+
+#[actix_rt::test]
+async fn on_a_quiet_machine_the_page_of_a_large_class_costs_two_percent_of_a_core() {
+    const TIME: Duration = Duration::from_secs(20);
+    let session = large_class().await;
+    let percent = async || {
+        let used = || {
+            let stat = procfs::process::Process::new(session.pid()).unwrap().stat().unwrap();
+            (stat.utime + stat.stime) as f64 / procfs::ticks_per_second() as f64
+        };
+        let (before, begin) = (used(), Instant::now());
+        actix_rt::time::sleep(TIME).await;
+        100.0 * (used() - before) / begin.elapsed().as_secs_f64()
+    };
+    let without = percent().await;
+    let client = awc::Client::builder().disable_timeout().finish();
+    let request = client.get(session.url("/class/events")).basic_auth("admin", PASSWORD);
+    let mut answer = request
+        .no_decompress()
+        .insert_header(("Accept-Encoding", "gzip"))
+        .send()
+        .await
+        .unwrap();
+    let read = async {
+        let mut bytes = 0;
+        let end = actix_rt::time::sleep(TIME);
+        tokio::pin!(end);
+        loop {
+            tokio::select! {
+                chunk = answer.next() => bytes += chunk.unwrap().unwrap().len(),
+                () = &mut end => return bytes,
+            }
+        }
+    };
+    let (with, bytes) = futures_util::future::join(percent(), read).await;
+    let figures = format!("{without:.2} % without, {with:.2} % with a reader, who got {bytes} bytes in 20 s");
+    eprintln!("{figures}");
+    assert!(with - without <= 2.0, "{figures}");
 }
 
 #[actix_rt::test]
