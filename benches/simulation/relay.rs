@@ -20,7 +20,7 @@ use tokio_tungstenite::tungstenite::{self, Message};
 use crate::Verdict;
 use crate::support::client::Client;
 use crate::support::git::{Forge, arm};
-use crate::support::program::simulation_server;
+use crate::support::program::{Server, simulation_server};
 use crate::support::webots::Webots;
 use crate::support::{SOON, ports};
 use crate::web_server::{Kind, WebServer};
@@ -43,6 +43,11 @@ const SIZE: usize = 1024;
 const LATER: Duration = Duration::from_millis(2);
 /// The environment variable that makes this program run in place of Webots.
 const SENDER: &str = "RELAY_SENDER";
+/// The environment variable with the state that it says its simulation has: the server reads the time in the streams of a
+/// simulation that runs, and of no other.
+const STATE: &str = "RELAY_STATE";
+/// Limit of the processor time with reading compared with that without.
+const READING: f64 = 1.05;
 
 /// Whether this process runs in place of Webots.
 pub fn is_sender() -> bool {
@@ -59,6 +64,13 @@ pub async fn send() {
     let port = std::env::args()
         .find_map(|word| word.strip_prefix("--port=")?.parse().ok())
         .unwrap();
+    let state = std::env::var(STATE).unwrap();
+    actix_rt::spawn(async move {
+        loop {
+            println!("{state}");
+            actix_rt::time::sleep(Duration::from_secs(1)).await;
+        }
+    });
     let listener = tokio::net::TcpListener::bind((Ipv4Addr::LOCALHOST, port))
         .await
         .unwrap();
@@ -87,7 +99,10 @@ pub async fn send() {
             let mut message = vec![0; SIZE];
             loop {
                 ticks.tick().await;
-                message[..8].copy_from_slice(&now().to_be_bytes());
+                let now = now();
+                message[..8].copy_from_slice(&now.to_be_bytes());
+                let update = format!("application/json:{{\"time\":{},", now / 1_000_000);
+                message[8..8 + update.len()].copy_from_slice(update.as_bytes());
                 if client.send(Message::binary(message.clone())).await.is_err() {
                     return;
                 }
@@ -125,19 +140,8 @@ fn flood(socket: TcpStream) {
 pub async fn measure(verdict: &mut Verdict, time: Duration, rounds: usize) {
     println!("{STREAMS} streams of {MESSAGES} messages of {SIZE} bytes a second, {time:?} each:");
     let forge = Forge::with_arm();
-    let program = std::env::current_exe().unwrap();
-    let webots = Webots::script(&format!("{SENDER}=1 exec '{}' \"$@\"", program.display()));
-    let builder = simulation_server(&webots.path(), forge.path(), SIMULATIONS)
-        .set("isolation", "none")
-        .set("streaming", "relay");
-    let server = builder.set("hangLimit", 3600).start().await;
-    let mut relayed = Vec::new();
-    for _ in 0..SIMULATIONS {
-        let mut client = Client::start(&server, &arm()).await;
-        let told = client.until("webots:").await;
-        relayed.push(told.replace("webots:", "").replace("localhost", "127.0.0.1"));
-        actix_rt::spawn(async move { while client.next_within(Duration::MAX).await.is_some() {} });
-    }
+    let (_webots, server, relayed) = relay(&forge, "pause").await;
+    let (_reading, reader, read) = relay(&forge, "real-time").await;
     let listen = ports::block(1);
     let ports: Vec<u16> = (1..=SIMULATIONS).map(|number| server.port + number).collect();
     let locations = ports.iter().map(|port| {
@@ -171,8 +175,13 @@ pub async fn measure(verdict: &mut Verdict, time: Duration, rounds: usize) {
             relayed.iter().map(|url| format!("{url}/")).collect(),
             server.pid(),
         ),
+        (
+            "reading",
+            read.iter().map(|url| format!("{url}/")).collect(),
+            reader.pid(),
+        ),
     ];
-    let mut results = [const { Vec::new() }; 3];
+    let mut results = [const { Vec::new() }; 4];
     for _ in 0..rounds {
         for ((_, urls, process), results) in ways.iter().zip(&mut results) {
             results.push(one(urls, *process, time).await);
@@ -188,18 +197,23 @@ pub async fn measure(verdict: &mut Verdict, time: Duration, rounds: usize) {
         println!("  {name:<8} p99 {:>9.3?}, {:>6.2} % of a core", latency, processor);
         medians.push((latency, processor));
     }
-    let [direct, nginx, relay] = medians[..] else {
+    let [direct, nginx, relay, reading] = medians[..] else {
         unreachable!()
     };
     verdict.bound("p99 beside direct", relay.0.saturating_sub(direct.0), LATER);
     verdict.ratio("processor time beside nginx", relay.1 / nginx.1, 1.0);
+    verdict.ratio(
+        "processor time with the time of simulations read, beside without",
+        reading.1 / relay.1,
+        READING,
+    );
 
     println!(
         "{FAST} streams as fast as possible, and one that sends back {ECHO} bytes each {PERIOD:?}, {time:?} each:"
     );
     let mut results = [const { Vec::new() }; 3];
     for _ in 0..rounds {
-        for ((_, urls, _), results) in ways.iter().zip(&mut results) {
+        for ((_, urls, _), results) in ways[..3].iter().zip(&mut results) {
             let url = urls[0].clone();
             results.push(
                 actix_rt::task::spawn_blocking(move || beside_fast_ones(&url, time))
@@ -227,6 +241,27 @@ pub async fn measure(verdict: &mut Verdict, time: Duration, rounds: usize) {
         ECHO_BESIDE_NGINX,
     );
     verdict.ratio("throughput of nginx beside it", nginx.1 / relay.1, 1.0);
+}
+
+/// A server that relays the streams of simulations in this state, and the URLs of the streams.
+async fn relay(forge: &Forge, state: &str) -> (Webots, Server, Vec<String>) {
+    let program = std::env::current_exe().unwrap();
+    let webots = Webots::script(&format!(
+        "{SENDER}=1 {STATE}={state} exec '{}' \"$@\"",
+        program.display()
+    ));
+    let builder = simulation_server(&webots.path(), forge.path(), SIMULATIONS)
+        .set("isolation", "none")
+        .set("streaming", "relay");
+    let server = builder.set("hangLimit", 3600).start().await;
+    let mut urls = Vec::new();
+    for _ in 0..SIMULATIONS {
+        let mut client = Client::start(&server, &arm()).await;
+        let told = client.until("webots:").await;
+        urls.push(told.replace("webots:", "").replace("localhost", "127.0.0.1"));
+        actix_rt::spawn(async move { while client.next_within(Duration::MAX).await.is_some() {} });
+    }
+    (webots, server, urls)
 }
 
 /// What an echo takes beside fast streams, and the throughput of these, in MiB per second.
