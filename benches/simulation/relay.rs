@@ -14,6 +14,7 @@ use futures_util::future::join_all;
 use futures_util::{SinkExt, StreamExt};
 use nix::time::{ClockId, clock_gettime};
 use procfs::process::{Process, all_processes};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio_tungstenite::tungstenite::stream::MaybeTlsStream;
 use tokio_tungstenite::tungstenite::{self, Message};
 
@@ -75,13 +76,20 @@ pub async fn send() {
         .await
         .unwrap();
     loop {
-        let (socket, _) = listener.accept().await.unwrap();
+        let (mut socket, _) = listener.accept().await.unwrap();
         socket.set_nodelay(true).unwrap();
         actix_rt::spawn(async move {
             let mut begin = [0; 16];
             let Ok(length) = socket.peek(&mut begin).await else {
                 return;
             };
+            if begin[..length].starts_with(b"CTR") {
+                // The server asks whether there is a world.
+                if socket.read(&mut [0; 1024]).await.is_ok_and(|length| length > 0) {
+                    socket.write_all(b"REFUSED").await.ok();
+                }
+                return;
+            }
             let is_for = |path: &str| begin[..length].starts_with(format!("GET {path} ").as_bytes());
             if is_for("/echo") || is_for("/flood") {
                 let is_echo = is_for("/echo");
