@@ -154,7 +154,8 @@ reasons! {
         BuildTimeout = "build-timeout", Project, No;
         /// There is no image for the world's version of Webots.
         ImageNotFound = "image-not-found", Project, No;
-        /// Images of other projects were being built for as long as a build may take (`timing.build`).
+        /// Images of other projects were being built for as long as a build may take (`timing.build`), or several builds
+        /// have filled the disk of Docker, and which one is not known.
         BuildersBusy = "builders-busy", Fleet, Later;
         /// The image of the project is larger than it may be, or its build has filled the disk.
         ImageTooLarge = "image-too-large", Project, No;

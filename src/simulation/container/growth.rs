@@ -1,8 +1,10 @@
-//! Which of several builds has filled the disk of Docker.
+//! Which of several builds have filled the disk of Docker.
 //!
 //! Docker does not tell to which build a container belongs. Each build has a host name of its own (`--add-host`), which the
 //! containers of its steps have in their settings; their image is that of the step before. A step that copies files has no
-//! container: what it adds is seen in the next step.
+//! container, and a pull has none: these have written what no container has.
+
+use std::collections::BTreeMap;
 
 use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
 use super::dockerfile::LABEL;
@@ -32,23 +34,38 @@ impl BuildMark {
     }
 }
 
-/// The build that has written most so far, and how much, in bytes; `None` if no step of these builds runs.
+/// What those of these builds have written so far that have a container now, in bytes.
 ///
 /// # Errors
 /// When Docker does not tell.
-pub async fn largest(docker: &Docker, builds: &[BuildMark]) -> Result<Option<(BuildMark, u64)>, DockerError> {
+pub async fn written(docker: &Docker, builds: &[BuildMark]) -> Result<BTreeMap<BuildMark, u64>, DockerError> {
     let list = docker
         .run(&["ps", "--format", "{{.ID}} {{.Names}}"], SHORT_TIMEOUT)
         .await?;
-    let mut grown = None;
+    let mut written = BTreeMap::new();
     for (id, name) in list.lines().filter_map(|line| line.split_once(' ')) {
         if !name.starts_with(SIMULATIONS)
             && let Some((mark, size)) = growth(docker, id, builds).await
         {
-            grown = grown.max(Some((size, mark)));
+            written.insert(mark.clone(), size);
         }
     }
-    Ok(grown.map(|(size, mark)| (mark.clone(), size)))
+    Ok(written)
+}
+
+/// The builds that may have filled the disk, which has lost this many bytes since the first of them began: the one with a
+/// container that has written half of that, or else those without one. All, if each has a container.
+pub fn fillers(builds: &[BuildMark], written: &BTreeMap<BuildMark, u64>, lost: u64) -> Vec<BuildMark> {
+    let largest = written.iter().max_by_key(|(_, size)| **size);
+    if let Some((mark, _)) = largest.filter(|(_, size)| **size >= lost / 2) {
+        return vec![mark.clone()];
+    }
+    let without: Vec<BuildMark> = builds
+        .iter()
+        .filter(|mark| !written.contains_key(mark))
+        .cloned()
+        .collect();
+    if without.is_empty() { builds.to_vec() } else { without }
 }
 
 /// The build of a container, and what it has written; `None` if it is of no build, or has ended meanwhile.
@@ -101,5 +118,29 @@ mod tests {
             format!("5 /bin/sh -c b\n{label}\n7 /bin/sh -c echo LABEL webots-fleet.owner=\n{label}\n100 base\n");
         assert_eq!(of_this_stage(&history), 12);
         assert_eq!(of_this_stage("100 base\n"), 0);
+    }
+
+    #[test]
+    fn what_no_container_has_written_was_copied_or_pulled() {
+        let [a, b, c] = ["a", "b", "c"].map(|name| BuildMark(name.to_owned()));
+        let builds = [a.clone(), b.clone(), c.clone()];
+        for (written, found, why) in [
+            (vec![(&a, 60), (&b, 30)], vec![&a], "it has written most"),
+            (vec![(&a, 10), (&b, 10)], vec![&c], "the only one that copies"),
+            (vec![(&a, 10)], vec![&b, &c], "one of two that copy"),
+            (vec![], vec![&a, &b, &c], "all copy"),
+            (
+                vec![(&a, 10), (&b, 10), (&c, 10)],
+                vec![&a, &b, &c],
+                "all have written little",
+            ),
+        ] {
+            let written = written.into_iter().map(|(mark, size)| (mark.clone(), size)).collect();
+            assert_eq!(
+                fillers(&builds, &written, 100).iter().collect::<Vec<_>>(),
+                found,
+                "{why}"
+            );
+        }
     }
 }

@@ -37,13 +37,13 @@ pub struct Images {
     pub store: Arc<ImageStore>,
     builders: Builders,
     jobs: SingleFlight<String, Result<(), Failure>>,
-    /// The builds that run, each with the free room of Docker's disk at its begin, in bytes.
+    /// The builds and pulls that run, each with the free room of Docker's disk at its begin, in bytes.
     running: Mutex<HashMap<BuildMark, u64>>,
     /// When a build was last ended because it has filled the disk.
     ended: tokio::sync::Mutex<Option<Instant>>,
 }
 
-/// A build that runs. Dropping it ends its entry.
+/// A build or pull that runs. Dropping it ends its entry.
 struct RunningBuild<'images> {
     mark: BuildMark,
     images: &'images Images,
@@ -101,6 +101,7 @@ impl Images {
         let name = image.to_owned();
         let pull = move |steps: Steps| async move {
             let _builder = this.builder(address, &steps).await?;
+            let _running = this.running_build().await;
             let on_line = |line: &str| steps.send(numbered(1, MAX_STEPS, format!("fetching {name}: {line}")));
             this.store.expect(&name);
             let command = ["docker", "pull", &name].map(OsString::from).to_vec();
@@ -267,7 +268,7 @@ impl Images {
         Err(Failure::new(Reason::ImageTooLarge, message))
     }
 
-    /// A build that begins now.
+    /// A build or pull that begins now.
     async fn running_build(&self) -> RunningBuild<'_> {
         let mark = BuildMark::new();
         let free = spawn_blocking(free_room).await.ok().flatten().unwrap_or_default();
@@ -275,7 +276,7 @@ impl Images {
         RunningBuild { mark, images: self }
     }
 
-    /// Waits until the disk of Docker has less than `diskReserve` left, and this build is why, or none is known to be.
+    /// Waits until the disk of Docker has less than `diskReserve` left, and this build may be why.
     async fn until_ended(&self, mark: &BuildMark) -> Failure {
         let reserve = self.config.disk_reserve;
         loop {
@@ -287,31 +288,28 @@ impl Images {
             if ended.is_some_and(|ended| ended.elapsed() < RELIEF) {
                 continue;
             }
-            match self.filler().await {
-                None => return self.has_filled_disk(),
-                Some(filler) if filler == *mark => {
-                    *ended = Some(Instant::now());
-                    return filled_by_project();
-                }
-                Some(_) => {}
+            let fillers = self.fillers().await;
+            if *fillers == [mark.clone()] {
+                *ended = Some(Instant::now());
+                return filled_by_project();
+            }
+            if fillers.contains(mark) {
+                return self.has_filled_disk();
             }
         }
     }
 
-    /// The build that has taken most of the room that the disk of Docker has lost since the first of these builds began;
-    /// `None` if none is known to have.
-    async fn filler(&self) -> Option<BuildMark> {
+    /// The builds and pulls that may have taken the room that the disk of Docker has lost since the first of those that run
+    /// began.
+    async fn fillers(&self) -> Vec<BuildMark> {
         let running = self.running.lock().clone();
         let marks: Vec<BuildMark> = running.keys().cloned().collect();
-        if let [only] = &*marks
-            && self.builders.in_use() <= 1
-        {
-            return Some(only.clone());
+        let before = running.values().copied().max().unwrap_or_default();
+        let now = spawn_blocking(free_room).await.ok().flatten().unwrap_or_default();
+        match growth::written(&self.docker, &marks).await {
+            Ok(written) => growth::fillers(&marks, &written, before.saturating_sub(now)),
+            Err(_) => marks,
         }
-        let before = running.values().copied().max()?;
-        let now = spawn_blocking(free_room).await.ok().flatten()?;
-        let (mark, written) = growth::largest(&self.docker, &marks).await.ok().flatten()?;
-        (written >= before.saturating_sub(now) / 2).then_some(mark)
     }
 
     /// The failure of a build during which the disk of Docker has become full: the server takes no clients with a full
