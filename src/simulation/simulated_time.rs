@@ -311,6 +311,8 @@ mod tests {
         time.0.lock().next = None;
         time.read(STREAM, update);
         time.set_running(false);
+        time.0.lock().next = None;
+        time.read(STREAM, update);
         assert_eq!(count(), 0);
     }
 }

@@ -143,11 +143,19 @@ struct Brake {
 }
 
 impl Brake {
-    fn on(server: &Server, simulations: usize) -> Self {
+    /// On the simulations in the first slots: clients have these, and what is kept ready has a later one.
+    fn on(server: &Server, simulations: u16) -> Self {
+        let ports: Vec<String> = (1..=simulations)
+            .map(|slot| format!("--port={}", server.port + slot))
+            .collect();
+        let is_theirs = |words: &str| {
+            let mut options = words.split_whitespace();
+            words.starts_with(env!("CARGO_BIN_EXE_demo-simulator"))
+                && options.any(|option| ports.iter().any(|port| port == option))
+        };
         let all = instances_below(&server.cache()).into_iter();
-        let webots = all.filter(|(_, words)| words.starts_with(env!("CARGO_BIN_EXE_demo-simulator")));
-        let pids: Vec<i32> = webots.map(|(pid, _)| pid).take(simulations).collect();
-        assert_eq!(pids.len(), simulations);
+        let pids: Vec<i32> = all.filter(|(_, words)| is_theirs(words)).map(|(pid, _)| pid).collect();
+        assert_eq!(pids.len(), ports.len());
         let stopped = pids.clone();
         let task = actix_rt::spawn(async move {
             loop {
@@ -178,7 +186,9 @@ async fn places(server: &Server) -> Value {
 
 #[actix_rt::test]
 async fn a_server_whose_simulations_are_slow_offers_fewer_places_until_they_are_well() {
-    let server = server(6, "0.001").start().await;
+    let ready = |count: u32| json!([{"world": arm(), "count": count}]);
+    let builder = server(6, "0.001").set("readyLoad", 1000).set("ready", ready(1));
+    let server = builder.start().await;
     let session = session_server(&[server.address()])
         .set("loadThreshold", 1000)
         .start()
@@ -187,6 +197,8 @@ async fn a_server_whose_simulations_are_slow_offers_fewer_places_until_they_are_
     for _ in 0..4 {
         seats.push(Seat::take(&server).await);
     }
+    let kept = async || server.status().await["ready"][0].clone();
+    until("one is ready", async || kept().await["ready"] == 1).await;
     until_well(&server, 4).await;
     let brake = Brake::on(&server, 1);
     until("one is slow", async || {
@@ -210,9 +222,20 @@ async fn a_server_whose_simulations_are_slow_offers_fewer_places_until_they_are_
         answer.contains("no simulation server available")
     })
     .await;
-    // Who comes anyway waits.
+    // None is started to be kept ready.
+    let is_kept = async || {
+        let now = kept().await;
+        assert_eq!((&now["ready"], &now["starting"]), (&json!(1), &json!(0)), "{now}");
+    };
+    server.reload(json!({ "ready": ready(2) }));
+    until("two are wanted", async || kept().await["wanted"] == 2).await;
+    actix_rt::time::sleep(Duration::from_secs(3)).await;
+    is_kept().await;
+    // Who comes anyway waits, though one is ready, which stays.
     let mut next = Client::start(&server, &arm()).await;
     assert_eq!(next.within("queue: ", SOON).await, "queue: 0");
+    actix_rt::time::sleep(Duration::from_secs(1)).await;
+    is_kept().await;
     drop(brake);
     until("those that are there have shown that they fit", async || {
         places(&server).await == 4

@@ -412,9 +412,13 @@ async fn on_a_full_disk_what_is_ready_stays_and_none_is_started() {
     let ended = pids(&server)[0];
     kill(Pid::from_raw(ended), Signal::SIGKILL).unwrap();
     until_ready(&server, 1).await;
-    actix_rt::time::sleep(Duration::from_secs(3)).await;
+    let starts = || server.log().matches(": is kept ready with").count();
+    let before = starts();
+    // Longer than the first pause after its end.
+    actix_rt::time::sleep(Duration::from_secs(4)).await;
     let one = kept(&server).await;
     assert_eq!((&one["ready"], &one["starting"]), (&json!(1), &json!(0)), "{one}");
+    assert_eq!(starts(), before, "none is started only to fail");
     drop(filler);
     until_ready(&server, 2).await;
 }

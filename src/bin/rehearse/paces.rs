@@ -60,3 +60,33 @@ impl Paces {
             .collect()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::behaviour::Behaviour;
+    use crate::visit::{Outcome, Pace, Steps};
+
+    #[test]
+    fn a_client_has_settled_after_five_seconds_without_the_first() {
+        let paces = Paces::default();
+        let mut visit = Visit {
+            client: 1,
+            behaviour: Behaviour::Ordinary,
+            asked: 0.0,
+            server: Some("gpu-1:2000".to_owned()),
+            place: None,
+            turn: None,
+            outcome: Outcome::Unseen,
+            steps: Steps::default(),
+            pace: Vec::new(),
+            ended: 0.0,
+        };
+        for (second, factor) in [0.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.5].into_iter().enumerate() {
+            assert_eq!(paces.settled(1).is_some(), second > 5, "{second}");
+            visit.pace.push(Pace { at: 0.0, factor });
+            paces.add(&visit);
+        }
+        assert_eq!((paces.of("gpu-1:2000"), paces.of("gpu-2:2000")), (vec![0.9], vec![]));
+    }
+}

@@ -179,6 +179,8 @@ mod tests {
         server.run(&paces("a", &[1.0; 30]), 30, 1);
         let slow = paces("a", &[0.5; 30]);
         assert_eq!(server.run(&slow, 30, 1), Some(15));
+        let less_slow = paces("a", &[0.9; 30]);
+        assert_eq!(server.run(&less_slow, 30, 60), Some(15), "more would not be well");
         // Another program was the cause.
         let well = paces("a", &[1.0; 30]);
         assert_eq!(server.run(&well, 30, 9), Some(15), "not yet");
@@ -195,6 +197,13 @@ mod tests {
         assert_eq!(server.run(&paces("heavy", &[0.5]), 1, 60), None);
         assert_eq!(server.run(&paces("heavy", &[0.5; 10]), 10, 60), None);
         assert_eq!(server.run(&paces("heavy", &[0.4; 10]), 10, 1), Some(8));
+    }
+
+    #[test]
+    fn a_world_that_has_run_faster_than_real_time_is_not_slow_in_it() {
+        let mut server = Server::new();
+        assert_eq!(server.run(&paces("fast", &[20.0; 10]), 10, 60), None);
+        assert_eq!(server.run(&paces("fast", &[1.0; 10]), 10, 60), None);
     }
 
     #[test]
