@@ -21,6 +21,7 @@ export class VisitRunner {
   #choices;
   #changed;
   #visit = BEGIN;
+  #isClosed = false;
   #sessionServer;
   /** @type {ReturnType<typeof setTimeout> | undefined} */
   #timer;
@@ -46,6 +47,10 @@ export class VisitRunner {
 
   /** @param {VisitEvent} event */
   take(event) {
+    // A request or a module may still be on its way.
+    if (this.#isClosed) {
+      return;
+    }
     if (event.type === 'announced') {
       this.#panel.announce(event.text);
     }
@@ -102,6 +107,7 @@ export class VisitRunner {
   /** Ends the simulation, and the connections. */
   close() {
     this.take({ type: 'left' });
+    this.#isClosed = true;
     this.#sessionServer.close();
   }
 

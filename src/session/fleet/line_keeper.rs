@@ -122,8 +122,8 @@ impl LineKeeper {
                 Ok(None)
             }
             Entered::Waits(place, displaced) => {
-                if let Some(displaced) = displaced {
-                    displaced.do_send(LineEvent::TakenOver);
+                for client in displaced {
+                    client.do_send(LineEvent::TakenOver);
                 }
                 Ok(Some(place))
             }

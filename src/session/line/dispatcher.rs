@@ -41,8 +41,8 @@ pub struct Turn<Server> {
 /// What has become of a client that asked for a slot.
 #[derive(Debug, PartialEq, Eq)]
 pub enum Entered<Server, Client> {
-    /// It has a place in the line, which another connection may have lost.
-    Waits(Place, Option<Client>),
+    /// It has a place in the line. These have lost theirs to it.
+    Waits(Place, Vec<Client>),
     /// It comes back for the turn that it has had a moment ago.
     Again(Turn<Server>),
 }
@@ -527,6 +527,7 @@ struct Shares<Server> {
 #[cfg(test)]
 mod tests {
     use std::collections::BTreeSet;
+    use std::fmt::Debug;
 
     use proptest::prelude::*;
 
@@ -874,12 +875,18 @@ mod tests {
         assert_eq!(estimates, [Some(20), None], "six slots in 110 seconds, and none");
     }
 
+    /// The place of somebody who waits, and took it from nobody.
+    fn alone<Server: Debug, Client: Debug>(entered: Entered<Server, Client>) -> Place {
+        match entered {
+            Entered::Waits(place, displaced) if displaced.is_empty() => place,
+            other => panic!("{other:?}"),
+        }
+    }
+
     #[test]
     fn a_turn_is_resumed_while_its_pass_holds_and_its_ticket_is_used_once() {
         let mut fleet = Fleet::new(&[(&[0], true, 1)]);
-        let Entered::Waits(place, None) = fleet.enter(0, None, 1) else {
-            panic!()
-        };
+        let place = alone(fleet.enter(0, None, 1));
         fleet.free(0);
         let ticket = Some(Ticket {
             place,
@@ -890,9 +897,7 @@ mod tests {
         };
         assert!(turn.server == 0 && turn.pass.is_some());
         fleet.pass_time(Duration::from_secs(11));
-        let Entered::Waits(again, None) = fleet.enter(0, ticket, 3) else {
-            panic!()
-        };
+        let again = alone(fleet.enter(0, ticket, 3));
         assert_eq!(
             again,
             Place {
@@ -905,13 +910,9 @@ mod tests {
     #[test]
     fn whose_server_is_gone_has_its_place_again_and_whose_pass_is_used_has_not() {
         let mut fleet = Fleet::new(&[(&[0], true, 2)]);
-        let Entered::Waits(first, None) = fleet.enter(0, None, 1) else {
-            panic!()
-        };
+        let first = alone(fleet.enter(0, None, 1));
         fleet.pass_time(Duration::from_millis(1));
-        let Entered::Waits(second, None) = fleet.enter(0, None, 2) else {
-            panic!()
-        };
+        let second = alone(fleet.enter(0, None, 2));
         fleet.free(0);
         fleet.free(0);
         let used = Offers {
@@ -924,11 +925,11 @@ mod tests {
         let sent = fleet.now.unix;
         let again = |place| Some(Ticket { place, sent });
         fleet.pass_time(Duration::from_millis(1));
-        assert_eq!(fleet.enter(0, again(first), 3), Entered::Waits(first, None));
+        assert_eq!(fleet.enter(0, again(first), 3), Entered::Waits(first, Vec::new()));
         let since = fleet.now.unix;
         assert_eq!(
             fleet.enter(0, again(second), 4),
-            Entered::Waits(Place { since, number: 4 }, None)
+            Entered::Waits(Place { since, number: 4 }, Vec::new())
         );
     }
 

@@ -115,7 +115,7 @@ const MAX_TEXTS: usize = 4096;
 
 impl<Server: Clone + Eq, Client: Clone> WaitingLine<Server, Client> {
     /// Adds a client at a place. If its ticket or its user has a place already, the client takes that over: it gets the
-    /// earlier one of the two. Returns its place, and the client that has lost it. `terms` is on what terms a server
+    /// earliest of them. Returns its place, and the clients that have lost theirs. `terms` is on what terms a server
     /// takes a world.
     pub(super) fn enter(
         &mut self,
@@ -123,15 +123,15 @@ impl<Server: Clone + Eq, Client: Clone> WaitingLine<Server, Client> {
         entry: Entry<Client>,
         terms: impl Fn(&Server, &ProjectUrl) -> Option<Admission>,
         now: Instant,
-    ) -> (Place, Option<Client>) {
+    ) -> (Place, Vec<Client>) {
         let user: Option<Arc<str>> = entry.user.map(Arc::from);
         let of_user = user.as_ref().and_then(|user| self.users.get(user)).copied();
         let of_ticket = self.place_of(place.number);
-        let mut displaced = None;
+        let mut displaced = Vec::new();
         let mut first = place;
         for before in [of_ticket, of_user].into_iter().flatten() {
             first = first.min(before);
-            displaced = self.remove(before).map(|waiting| waiting.client).or(displaced);
+            displaced.extend(self.remove(before).map(|waiting| waiting.client));
         }
         let repository = entry.world.repository().to_lowercase();
         let classes = &mut self.classes;
@@ -431,18 +431,25 @@ mod tests {
         // The same ticket on another connection, before and after the first one has ended.
         assert_eq!(
             line.enter(place(10, 1), entry("lab/arm", 4, None), takes_all, now),
-            (place(10, 1), Some(1))
+            (place(10, 1), vec![1])
         );
         line.leave(1);
         assert_eq!(clients(&line), [4, 2, 3]);
         // Another tab of the same user.
         assert_eq!(
             line.enter(place(40, 5), entry("lab/arm", 5, Some("anna")), takes_all, now),
-            (place(20, 2), Some(2))
+            (place(20, 2), vec![2])
         );
         assert_eq!(clients(&line), [4, 5, 3]);
+        // The same user with the ticket of somebody else: both are told.
+        assert_eq!(
+            line.enter(place(10, 1), entry("lab/arm", 6, Some("anna")), takes_all, now),
+            (place(10, 1), vec![4, 5])
+        );
+        assert_eq!(clients(&line), [6, 3]);
         line.leave(4);
         line.leave(5);
+        line.leave(6);
         line.leave(3);
         assert!(line.waiting.is_empty() && line.since.is_empty() && line.users.is_empty() && line.groups.is_empty());
         assert!(line.connections.is_empty() && line.classes.occupied() == 0);
