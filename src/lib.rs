@@ -14,9 +14,9 @@
 //! | [`session::placement`] | which server gets the next client: the load of a server and the key that servers are sorted by (`backend`), the choice of the first (`load_balancer`), cost |
 //! | [`session::line`] | the clients that wait for a slot of the fleet: tickets (`ticket`), the order (`waiting_line`), who gets the next slot of which server (`dispatcher`) |
 //! | [`session::class`] | all simulations of the fleet and who waits, with the number of each change, and the links to servers for actions (`roster`) |
-//! | [`session::mail`] | notices: to whom (`smtp`, one address, from the key `administrator` in `config/session_config`) and how (`channel`), what is in them (`notice_text`), when they are sent (`outbox`) |
+//! | [`session::mail`] | notices: to whom (`smtp`, one address, from the key `administrator` in `config/session_config`) and how (`channel`), what is in them (`notice_text`), which changes are mailed (`event` in `fleet/server_record`), and how long they wait (`outbox`) |
 //! | [`session::fleet`] | the registry and the monitors of simulation servers, and what connects them with the line (`line_keeper`, `slot_link`) |
-//! | [`session::web`] | routes, pages, `/status`, Prometheus metrics (gauges in `metrics`, counters in `app`) and the WebSocket of the session server with its messages (`web_client`) |
+//! | [`session::web`] | routes, pages, `/status`, Prometheus metrics (gauges in `metrics`, counters and histograms in `app`) and the WebSocket of the session server with its messages (`web_client`) |
 //! | [`simulation::process`] | process trees: how they start and end (`process_group`: SIGTERM, grace period, SIGKILL; leftovers of a dead server: `process_tree`, `guardian`); directories of simulations |
 //! | [`simulation::machine`] | readings of the machine (`sensors`) and its GPUs (`gpus`), the load and `monitor.csv` (`load_monitor`); which GPU a simulation gets if they are spread over several (`spread`) |
 //! | [`simulation::checkout`] | worlds checked out with git; `timing.checkout` limits a whole checkout (`checkout_service`), each git command, and by a quarter of it a silent remote (`git`); `projectSize` limits its size; the simulation server's `config/mirrors` has GitHub's address and the mirrors of others |
@@ -30,14 +30,14 @@
 //! | [`simulation::slots`] | the slots that clients wait for: the slot of a simulation (`slot`), its states and what pages show of them (`simulation_record`), the queue and the shares of addresses and users (`slot_pool`), those that are reserved for the line of session servers (`reservations`), how many run in real time (`real_time_places`), the streams of simulations and the tokens that identify them (`stream`) |
 //! | [`simulation::spare_wishes`] | which worlds are kept ready before clients ask for them, and how many; the actor that does it is `spare_keeper` in [`simulation::client`], a spare's slot is in `spare` of [`simulation::slots`] |
 //! | `simulation::relay` | a stream between a client and the port of its Webots |
-//! | `simulation::web` | routes, pages, `/status` and Prometheus metrics of the simulation server (gauges in `metrics`, counters in `app` and `ends`) |
+//! | `simulation::web` | routes, pages, `/status` and Prometheus metrics of the simulation server (gauges in `metrics`, counters and histograms in `app` and `ends`) |
 //!
 //! The HTML of pages is in `templates/session` and `templates/simulation` (in each, `monitor.html`: the head of the
 //! monitor's table, `row.html`: a row), their styles (`style.css`) and scripts in `templates/assets`. A column of
 //! `monitor.csv` appears in the charts (`charts.js` groups them by how their headings begin; the others are drawn in
 //! percent); the figures above are in `glance.html`.
 //!
-//! Each server also has a directory `config` (every key: `session_config`, `simulation_config`; time limits: `timing`;
+//! Each server also has a directory `config` (every key: `session_config`, `simulation_config`; durations of the key `timing`: `timing`;
 //! `docs/configuration.md` lists all), its `app` (start and end) and its `state` (what its routes share). Files of
 //! `simulation` are the [`protocol`](simulation::protocol) with the texts of messages to clients (except the reason in
 //! an error and the [`progress`](simulation::progress) of a start, which their causes define: a checkout's is in
@@ -60,7 +60,7 @@
 //! - **connection**: a TCP connection or a WebSocket, never a slot (the key `maxConnections` has its name from the original).
 //! - **client**: who holds a WebSocket of either server; **viewer**: who shows the stream of a Webots; **watcher**: an
 //!   administrator who looks at the simulation of another (`web/page_routes` checks the password, `slots/stream` issues a
-//!   token for one connection, `relay/watcher` lets it change nothing).
+//!   token for one connection, `web/stream_routes` redeems it, `relay/watcher` lets it change nothing).
 //! - **reason**: why a request was refused, a start has failed or a simulation has ended, as a code
 //!   ([`shared::domain::Reason`]); a **failure** ([`shared::domain::Failure`]) has also its sentence and the output of others.
 //! - **stage**: the state of a simulation as pages show it ([`shared::domain::Stage`]); `SimulationRecord` in [`simulation::slots`] derives it from its states.

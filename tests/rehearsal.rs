@@ -501,7 +501,7 @@ async fn a_class_grows_until_simulations_are_slower_than_real_time() {
 async fn a_class_that_finds_no_more_places_says_so() {
     let fleet = Fleet::with_places(2).await;
     let said = fleet
-        .rehearse(&["--find", "--real-time", "0", "--patience", "5s"])
+        .rehearse(&["--find", "--real-time", "0", "--patience", "20s"])
         .await;
     assert!(
         said.out.contains("2 fit, perhaps more; \"maxConnections\": 2\n"),
@@ -509,7 +509,7 @@ async fn a_class_that_finds_no_more_places_says_so() {
     );
     assert!(
         said.out
-            .contains("Client 3 got no simulation that runs: no simulation within 5s"),
+            .contains("Client 3 got no simulation that runs: no simulation within 20s"),
         "{said:?}"
     );
     assert_eq!(said.code, Some(0), "{said:?}");
@@ -626,7 +626,7 @@ async fn no_text_of_a_server_steers_the_terminal_or_fills_it() {
         let stand_in = StandIn::start(script).await;
         let fleet = format!("http://{}", stand_in.address);
         for more in [&ONE[..], &["--explain"]] {
-            let Said { out, err, .. } = rehearse(&fleet, &[more, &["--patience", "5s"]].concat()).await;
+            let Said { out, err, .. } = rehearse(&fleet, &[more, &["--patience", "20s"]].concat()).await;
             let said = out + &err;
             assert!(!said.contains(['\u{1b}', '\u{7}', '\r', '\u{202e}']), "{said:?}");
             assert!(!said.contains("\nAll 3 fit."), "{said}");

@@ -22,7 +22,7 @@ export const words = {
     connecting: '正在连接',
     'to-session-server': '会话服务器……',
     url: '世界的网址',
-    'url-help': '代码托管网站上 .wbt 文件的页面：网址含 /blob/ 或 /tree/，文件位于 worlds 文件夹中。',
+    'url-help': '代码托管网站上 .wbt 文件的页面：网址含 /blob/、/tree/ 或 /src/branch/，文件位于 worlds 文件夹中。',
     name: '您的名字',
     'name-help': '管理员可以看到。',
     'shown-by': '显示方式',

@@ -27,7 +27,7 @@ export const words = {
     connecting: 'Connecting',
     'to-session-server': 'to the session server …',
     url: 'URL of a world',
-    'url-help': 'The page of a .wbt file on its forge: below /blob/ or /tree/, in a folder worlds.',
+    'url-help': 'The page of a .wbt file on its forge: below /blob/, /tree/ or /src/branch/, in a folder worlds.',
     name: 'Your name',
     'name-help': 'The administrator sees it.',
     'shown-by': 'Shown by',

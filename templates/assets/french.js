@@ -22,7 +22,7 @@ export const words = {
     connecting: 'Connexion',
     'to-session-server': 'au serveur de sessions…',
     url: 'URL d’un monde',
-    'url-help': 'La page d’un fichier .wbt sur sa forge : sous /blob/ ou /tree/, dans un dossier worlds.',
+    'url-help': 'La page d’un fichier .wbt sur sa forge : sous /blob/, /tree/ ou /src/branch/, dans un dossier worlds.',
     name: 'Votre nom',
     'name-help': 'L’administrateur le voit.',
     'shown-by': 'Affiché par',

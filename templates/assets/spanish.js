@@ -22,7 +22,7 @@ export const words = {
     connecting: 'Conectando',
     'to-session-server': 'con el servidor de sesiones…',
     url: 'URL de un mundo',
-    'url-help': 'La página de un archivo .wbt en su forja: bajo /blob/ o /tree/, en una carpeta worlds.',
+    'url-help': 'La página de un archivo .wbt en su forja: bajo /blob/, /tree/ o /src/branch/, en una carpeta worlds.',
     name: 'Tu nombre',
     'name-help': 'El administrador lo ve.',
     'shown-by': 'Mostrado por',

@@ -72,7 +72,7 @@ impl Stage {
             deeds.iter().map(one).collect::<String>()
         ));
         let server = change(self.builder(&webots, level)).start().await;
-        let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
+        let told = Client::start(&server, &arm()).await.patiently("loading: Error:").await;
         assert!(told.contains("THE END"), "{told}");
         nothing_left(&server, 2).await;
         told.split(" | ")
