@@ -169,9 +169,21 @@ impl Control {
         self.port.pause().await;
         // New requests wait for the new process. Those that have come before are answered as ever.
         actix_rt::time::sleep(REST).await;
+        let is_superseded = self.server.phase.send_if_modified(|phase| {
+            let is_open = *phase == Phase::Open;
+            *phase = if is_open { Phase::Superseded } else { *phase };
+            is_open
+        });
+        if !is_superseded {
+            // A stop or a drain came meanwhile. The new process ends, as the channel to it closes.
+            control::set_serving(&self.cache, RunId::own())
+                .map_err(|error| format!("cacheDir can't be written: {error}"))?;
+            self.has_moved.store(false, Relaxed);
+            self.port.resume().await;
+            return self.must_be_open().map(|()| String::new());
+        }
         let left = self.server.slots.supersede();
         let count = left.simulations.len();
-        self.server.phase.send_replace(Phase::Superseded);
         service_manager::main_process(pid);
         estate.lock = None;
         estate.pid_file = None;

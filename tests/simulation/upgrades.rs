@@ -431,3 +431,25 @@ async fn a_checkout_goes_on_and_a_new_process_waits_for_its_fetch() {
     second.close_with(1000).await;
     ends_clean(&server, main).await;
 }
+
+#[actix_rt::test]
+async fn on_a_quiet_machine_a_drain_during_an_upgrade_is_not_lost() {
+    let server = quick(demo_server(2)).start().await;
+    let client = Client::ready(&server).await;
+    let serving = server.cache().join("serving");
+    let before = std::fs::read_link(&serving).unwrap();
+    let draining = async {
+        // For a moment both have the port.
+        until("another process is ready", async || {
+            std::fs::read_link(&serving).unwrap() != before
+        })
+        .await;
+        kill(Pid::from_raw(server.pid()), Signal::SIGUSR1).unwrap();
+    };
+    let (told, ()) = tokio::join!(failed_upgrade(&server), draining);
+    assert!(told.contains("it drains"), "{told}");
+    only_the_first_is_left(&server).await;
+    assert_eq!(server.status().await["draining"], true);
+    client.close_with(1000).await;
+    until("it has ended", async || server.processes().is_empty()).await;
+}

@@ -1,7 +1,8 @@
 //! One cached repository: a bare repository into which git fetches commits of one remote, one fetch at a time; and why a
 //! checkout failed, as its next step needs to know it.
 //!
-//! What git prints is passed on to the client, and decides nothing: it contains names that projects choose.
+//! What git prints is passed on to the client, and decides nothing: it contains names that projects choose. Only the
+//! headers of answers in its trace do (`http_trace`), which the Git host writes.
 
 use std::ffi::OsStr;
 use std::fs::{File, TryLockError};
