@@ -61,7 +61,7 @@ class Page:
     def __init__(self, context):
         self.context = context
         self.tab = context.new_page()
-        self.asked, self.complaints = [], []
+        self.asked, self.complaints, self.loses_connections = [], [], False
         self.tab.on("request", lambda request: self.asked.append(request.url))
         self.tab.on("websocket", lambda socket: self.asked.append(socket.url))
         self.tab.on("console", self._console)
