@@ -10,6 +10,7 @@ use serde_json::json;
 use super::life::quick;
 use super::scene::nothing_left;
 use crate::support::relay::{Mood, Relay};
+use crate::support::wrapper::Wrapper;
 use crate::support::{
     Builder, Client, DEMO, Server, Webots, arm, demo_server, http, instances_below, server_of, until,
 };
@@ -163,6 +164,25 @@ async fn who_comes_back_to_a_start_that_has_failed_hears_why() {
         "{:?}",
         client.heard
     );
+}
+
+#[actix_rt::test]
+async fn a_checkout_ends_with_its_simulation_although_its_client_may_come_back() {
+    for command in ["ls-remote", "fetch", "checkout"] {
+        let wrapper = Wrapper::git(&format!("case \" $* \" in *\" {command} \"*) exec sleep 600;; esac"));
+        let builder = quick(demo_server(1)).env("PATH", &wrapper.path());
+        let builder = builder.set("timing.checkout", 600).set("adminPassword", http::PASSWORD);
+        let server = builder.start().await;
+        let (client, token) = early(&server).await;
+        let hanging = || instances_below(&server.folder).iter().any(|one| one.1 == "sleep 600");
+        until("git hangs", async || hanging()).await;
+        let stop = server.url(&format!("/simulations/{}/stop", client.id()));
+        assert_eq!(http::post(&stop, Some(http::PASSWORD), "").await, 202, "{command}");
+        nothing_left(&server, 1).await;
+        let told = refused(&server, &token).await;
+        let stopped = format!("{ENDED}: The administrator has stopped this simulation");
+        assert_eq!(told, stopped, "{command}");
+    }
 }
 
 #[actix_rt::test]

@@ -84,7 +84,7 @@ impl Session {
                 self.offer_comeback();
                 self.texts(ahead.iter().copied().flat_map(protocol::queue));
             }
-            State::CheckingOut(_) => {
+            State::CheckingOut { .. } => {
                 self.offer_comeback();
                 self.texts(self.progress.iter().flatten().cloned());
             }

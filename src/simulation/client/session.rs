@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 
 use actix::prelude::*;
 use futures_util::stream::AbortHandle;
+use tokio_util::sync::DropGuard;
 
 use crate::shared::domain::{Failure, ProjectUrl, Reason, ReservationId, View};
 use crate::shared::http::Peer;
@@ -114,8 +115,13 @@ pub(super) enum State {
         /// The number of clients ahead, once it is known.
         ahead: Option<usize>,
     },
-    /// The project is being checked out for this slot; the job ends with the actor.
-    CheckingOut(Slot),
+    /// The project is being checked out.
+    CheckingOut {
+        /// The slot in which the simulation will run.
+        slot: Slot,
+        /// Cancels the checkout when it is dropped.
+        _checkout: DropGuard,
+    },
     /// Webots was requested, and is not ready.
     Launching(LaunchedSimulation),
     /// Webots is ready.
@@ -186,7 +192,7 @@ impl State {
     pub(super) fn launched(&self) -> Option<&LaunchedSimulation> {
         match self {
             Self::Launching(launched) | Self::Ready(ReadySimulation { launched, .. }) => Some(launched),
-            Self::Waiting { .. } | Self::CheckingOut(_) | Self::Over(_) => None,
+            Self::Waiting { .. } | Self::CheckingOut { .. } | Self::Over(_) => None,
         }
     }
 }
@@ -339,7 +345,7 @@ impl Session {
     pub(super) fn report(&self, reason: StopReason) {
         match &self.state {
             State::Waiting { position, .. } => position.end(Failure::from(reason)),
-            State::CheckingOut(slot) => slot.end(Failure::from(reason)),
+            State::CheckingOut { slot, .. } => slot.end(Failure::from(reason)),
             State::Launching(LaunchedSimulation { webots, .. })
             | State::Ready(ReadySimulation {
                 launched: LaunchedSimulation { webots, .. },
@@ -436,7 +442,7 @@ impl Session {
             State::Ready(_) => self.finish(failure, ctx),
             State::Launching(_) => self.fail(failure, ctx),
             // The session has ended it; the client knows why.
-            State::Over(_) | State::Waiting { .. } | State::CheckingOut(_) => {}
+            State::Over(_) | State::Waiting { .. } | State::CheckingOut { .. } => {}
         }
     }
 }

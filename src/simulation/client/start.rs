@@ -1,10 +1,11 @@
 //! How a session starts its simulation: a slot, the checkout, Webots; and how a failed start ends.
 
-use std::io::ErrorKind;
+use std::io::{self, ErrorKind};
 use std::sync::Arc;
 use std::time::Instant;
 
 use actix::prelude::*;
+use tokio_util::sync::CancellationToken;
 
 use super::session::{Client, LaunchedSimulation, Session, State, WebotsHandle};
 use crate::shared::domain::{Blame, Failure, ProjectUrl, Reason, ReservationId, View};
@@ -46,45 +47,51 @@ impl Session {
         count(&self.server, outcome);
     }
 
-    /// Ends a start that has failed. A client's start that fails because of this server is reported to session servers.
+    /// Ends a start that has failed. A client's start that fails because of this server is reported to session servers,
+    /// unless the simulation has ended meanwhile.
     pub(super) fn fail(&mut self, failure: Failure, ctx: &mut Context<Self>) {
+        if let State::Over(_) = self.state {
+            return;
+        }
         let has_client = !matches!(self.client, Client::Expected(_));
         if failure.reason.blame() == Blame::Server && has_client {
             self.server
                 .failed_starts
                 .add(&format!("{}: {failure} ({})", self.name(), failure.reason));
         }
-        if let State::CheckingOut(slot) = &self.state {
+        if let State::CheckingOut { slot, .. } = &self.state {
             slot.end(failure.clone());
         }
         self.finish(failure, ctx);
     }
 
+    /// Checks the project out for this slot. The checkout is cancelled when the state that this sets is dropped.
     pub(super) fn check_out(&mut self, world: ProjectUrl, tip: Option<Tip>, slot: Slot, ctx: &mut Context<Self>) {
-        self.state = State::CheckingOut(slot);
-        let instance = match self.server.run.instance() {
-            Ok(instance) => instance,
-            Err(error) => {
-                let reason = if matches!(error.kind(), ErrorKind::StorageFull | ErrorKind::QuotaExceeded) {
-                    Reason::DiskFull
-                } else {
-                    Reason::ServerFault
-                };
-                return self.fail(Failure::new(reason, format!("No room for a project: {error}")), ctx);
-            }
+        let cancelled = CancellationToken::new();
+        self.state = State::CheckingOut {
+            slot,
+            _checkout: cancelled.clone().drop_guard(),
         };
         let me = ctx.address();
         // A full mailbox drops this line of progress.
         let progress = move |progress| drop(me.try_send(WebotsEvent::Progress(progress)));
-        let job = self.server.checkouts.start(world, tip, instance, Arc::new(progress));
-        job.into_actor(self)
+        let server = Arc::clone(&self.server);
+        let checkout = async move {
+            let instance = server.run.instance().map_err(|error| no_room(&error))?;
+            let job = server.checkouts.start(world, tip, instance, Arc::new(progress));
+            job.await.unwrap_or_else(|error| {
+                let message = format!("The checkout broke off: {error}");
+                Err(Failure::new(Reason::ServerFault, message))
+            })
+        };
+        cancelled
+            .run_until_cancelled_owned(checkout)
+            .into_actor(self)
             .map(|result, this, ctx| match result {
-                Ok(Ok(project)) => this.launch(project, ctx),
-                Ok(Err(error)) => this.fail(error, ctx),
-                Err(error) => {
-                    let message = format!("The checkout broke off: {error}");
-                    this.fail(Failure::new(Reason::ServerFault, message), ctx);
-                }
+                Some(Ok(project)) => this.launch(project, ctx),
+                Some(Err(failure)) => this.fail(failure, ctx),
+                // The simulation has ended meanwhile.
+                None => {}
             })
             .spawn(ctx);
     }
@@ -95,7 +102,7 @@ impl Session {
             Err(why) => return self.fail(Failure::new(Reason::LaunchFailed, why), ctx),
         };
         let slot = match std::mem::replace(&mut self.state, State::lost()) {
-            State::CheckingOut(slot) => slot,
+            State::CheckingOut { slot, .. } => slot,
             // It has ended meanwhile.
             other => return self.state = other,
         };
@@ -155,6 +162,16 @@ impl Session {
         let spread = self.server.spread.as_ref()?;
         spread.take(&self.server.readings.borrow().gpus, Instant::now())
     }
+}
+
+/// Why there is no directory for a project.
+fn no_room(error: &io::Error) -> Failure {
+    let reason = if matches!(error.kind(), ErrorKind::StorageFull | ErrorKind::QuotaExceeded) {
+        Reason::DiskFull
+    } else {
+        Reason::ServerFault
+    };
+    Failure::new(reason, format!("No room for a project: {error}"))
 }
 
 fn count(server: &AppState, outcome: &str) {
