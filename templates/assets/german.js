@@ -22,7 +22,8 @@ export const words = {
     connecting: 'Verbinden',
     'to-session-server': 'mit dem Sitzungsserver …',
     url: 'URL einer Welt',
-    'url-help': 'Die Seite einer .wbt-Datei auf ihrer Forge: unter /blob/, /tree/ oder /src/branch/, in einem Ordner worlds.',
+    'url-help':
+      'Die Seite einer .wbt-Datei auf ihrer Forge: unter /blob/, /tree/ oder /src/branch/, in einem Ordner worlds.',
     name: 'Dein Name',
     'name-help': 'Die Administration sieht ihn.',
     'shown-by': 'Gezeigt von',

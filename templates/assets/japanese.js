@@ -22,7 +22,8 @@ export const words = {
     connecting: '接続中',
     'to-session-server': 'セッションサーバーに接続しています…',
     url: 'ワールドの URL',
-    'url-help': 'リポジトリサイト上の .wbt ファイルのページ。/blob/、/tree/ または /src/branch/ 以下の worlds フォルダーにあるもの。',
+    'url-help':
+      'リポジトリサイト上の .wbt ファイルのページ。/blob/、/tree/ または /src/branch/ 以下の worlds フォルダーにあるもの。',
     name: '名前',
     'name-help': '管理者に表示されます。',
     'shown-by': '表示方法',
