@@ -8,12 +8,14 @@ import { FleetReader } from './messages.js';
 const RECONNECT = 2000;
 
 /**
- * What the session server sends. `answered`: the answer to the request with this number; `queued`, `estimated`: how many
- * clients are ahead of it, and the seconds until its turn.
+ * What the session server sends. `answered`: the answer to the request with this number; `ticketed`: it has a place in the
+ * line, which is said again and again; `queued`, `estimated`: how many clients are ahead of it, and the seconds until its
+ * turn.
  * @typedef {{ type: 'connected' }
  *   | { type: 'disconnected' }
  *   | { type: 'available', now: boolean }
  *   | { type: 'announced', text: string }
+ *   | { type: 'ticketed', id: number }
  *   | { type: 'queued', id: number, ahead: number }
  *   | { type: 'estimated', id: number, seconds: number }
  *   | { type: 'answered', id: number, answer: { server: string, pass?: string | undefined } | { failure: Failure } }} FleetEvent
@@ -49,7 +51,7 @@ export class SessionServer {
     const socket = new WebSocket(url);
     socket.addEventListener('open', () => this.#tell({ type: 'connected' }));
     socket.addEventListener('message', ({ data }) => this.#read(reader.read(String(data))));
-    socket.addEventListener('close', () => {
+    const closed = () => {
       this.#asked = undefined;
       if (this.#isClosed) {
         return;
@@ -60,8 +62,16 @@ export class SessionServer {
           this.#socket = this.#open();
         }
       }, RECONNECT);
-    });
+    };
+    socket.addEventListener('close', closed, { once: true });
     return socket;
+  }
+
+  /** Gives up a connection that is dead, which the browser itself may notice only after minutes. */
+  reconnect() {
+    const socket = this.#socket;
+    socket.close();
+    queueMicrotask(() => socket.dispatchEvent(new Event('close')));
   }
 
   /** @param {import('./messages.js').FleetMessage | undefined} message */
@@ -76,6 +86,7 @@ export class SessionServer {
       case 'ticket':
         if (this.#asked) {
           this.#store.keepTicket(this.#asked.world, message.ticket);
+          this.#tell({ type: 'ticketed', id: this.#asked.id });
         }
         break;
       case 'queued':

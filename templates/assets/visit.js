@@ -52,11 +52,12 @@ import { helpsToWait } from './reasons.js';
 
 /** A request to the session server. `until`: how long the page waits for an answer. `id`: its number on the connection.
  * `early`: it is sent once the session server is there. `sent`: `line` is the place from before the connection broke.
- * `inLine`: the answer is a place in the line. `held`: the connection to the session server is broken, or not there yet; it
- * is sent again, for this place, whenever that is.
+ * `inLine`: the answer is a place in the line. `hasTicket`: the session server has sent a ticket, which it repeats: `until`
+ * then something comes, and `isOverdue` if nothing came. `held`: the connection to the session server is broken, or not
+ * there yet; it is sent again, for this place, whenever that is.
  * @typedef {{ is: 'early', until: number }
- *   | { is: 'sent', id: number, until: number, line: Line | undefined }
- *   | { is: 'inLine', id: number, line: Line }
+ *   | { is: 'sent', id: number, until: number, line: Line | undefined, hasTicket: boolean }
+ *   | { is: 'inLine', id: number, line: Line, hasTicket: boolean, until: number | undefined, isOverdue: boolean }
  *   | { is: 'held', line: Line }} Request
  */
 
@@ -67,13 +68,13 @@ import { helpsToWait } from './reasons.js';
  *   | { is: 'redirected', goal: Goal, why: Problem, until: number }} Unconnected
  */
 
-/** The states on the way to a simulation; one that was accepted may have a token to return with. */
-/** @typedef {Target & { is: 'connecting', resumption?: Resumption | undefined, place: { is: 'opening' } | { is: 'asked' } | { is: 'queued', ahead: number } }} Connecting */
-/** @typedef {Target & { is: 'starting', resumption?: Resumption | undefined, phase: 'checkout' | 'launch', progress?: import('./messages.js').Progress | undefined, facts: Facts }} Starting */
-/** `heardAt`: the last sign of life of the server or the simulator; `tickedAt`: the last tick.
- * @typedef {Target & { is: 'running', address: string, scene: Scene, facts: Facts, heardAt: number, tickedAt: number,
- *   resumption?: Resumption | undefined }} Running
+/** Points in time: of the last sign of life of the server or the simulator, and of the last tick.
+ * @typedef {{ heardAt: number, tickedAt: number }} Life
  */
+/** The states on the way to a simulation; one that was accepted may have a token to return with. */
+/** @typedef {Target & Life & { is: 'connecting', resumption?: Resumption | undefined, place: { is: 'opening' } | { is: 'asked' } | { is: 'queued', ahead: number } }} Connecting */
+/** @typedef {Target & Life & { is: 'starting', resumption?: Resumption | undefined, phase: 'checkout' | 'launch', progress?: import('./messages.js').Progress | undefined, facts: Facts }} Starting */
+/** @typedef {Target & Life & { is: 'running', address: string, scene: Scene, facts: Facts, resumption?: Resumption | undefined }} Running */
 /** The simulation waits for this page, which tries to return. `hasRun`: its simulator was ready, as far as the page knows;
  * `wasShown`: the page still shows its scene;
  * `refusedSince`: since when its server refuses all attempts although the session server answers.
@@ -86,6 +87,8 @@ import { helpsToWait } from './reasons.js';
  * @typedef {{ is: 'ended', problem: Problem, from: Going }} Ended
  */
 /** @typedef {Going | Ended} State */
+/** @typedef {Extract<State, { is: 'asking' }>} Asking */
+/** @typedef {Extract<Request, { id: number }>} Answerable */
 
 /** What is known of the fleet: whether a simulation server is free, or that there is no connection.
  * @typedef {'connecting' | 'free' | 'busy' | 'unreachable'} Fleet
@@ -120,13 +123,14 @@ import { helpsToWait } from './reasons.js';
 
 /**
  * What the page does. `leave` ends the simulation, `detach` lets it wait; both close the viewer. `freeze` keeps what the
- * viewer shows and closes its stream. `probe` finds out whether the session server answers.
+ * viewer shows and closes its stream. `probe` finds out whether the session server answers; `reconnect` gives up the
+ * connection to it, which is dead.
  * @typedef {{ do: 'ask', id: number, world: string }
  *   | { do: 'connect', server: string, request: { world: string, pass?: string | undefined } | { resume: string } }
  *   | { do: 'show', address: string, kind: string | undefined, server: string, isBack: boolean }
  *   | { do: 'store', kept: Kept }
  *   | { do: 'send', message: object }
- *   | { do: 'stopWaiting' | 'sayTurn' }
+ *   | { do: 'stopWaiting' | 'sayTurn' | 'reconnect' }
  *   | { do: 'clear' | 'clearLeft' | 'clearStopped' | 'leave' | 'detach' | 'freeze' | 'probe' | 'sayLost' | 'sayFound' }} Effect
  */
 
@@ -149,9 +153,11 @@ const NO_PASS = ['invalid-pass', 'used-pass', 'expired-pass'];
 const TRY_ANOTHER = [1001, 1013];
 /** Time without a sign of life after which the connection is lost, in milliseconds; Webots gives one every five seconds. */
 const SILENCE = 8000;
+/** The same for a place in the line, whose ticket comes every 30 seconds and is valid for 60. */
+const LINE_SILENCE = 45_000;
 /** A shorter interruption is not shown. In milliseconds. */
 export const SHOWN_AFTER = 2000;
-/** Timeout of an attempt to return, in milliseconds: a second one would invalidate the token of the first. */
+/** Timeout of an attempt to connect, or to return, in milliseconds: a second one would invalidate the token of the first. */
 const ATTEMPT = 15_000;
 /** Pause after a failed attempt to return, in milliseconds; it doubles up to the longest. */
 const FIRST_PAUSE = 1000;
@@ -289,13 +295,13 @@ function ask(goal, { fleet, asked, now }, { waitsFor, line, before = [] } = {}) 
   }
   const id = asked + 1;
   return {
-    to: { is: 'asking', goal, request: { is: 'sent', id, until, line }, waitsFor },
+    to: { is: 'asking', goal, request: { is: 'sent', id, until, line, hasTicket: false }, waitsFor },
     effects: [...before, { do: 'ask', id, world: goal.world }],
   };
 }
 
 /**
- * @param {Extract<State, { is: 'asking' }>} state
+ * @param {Asking} state
  * @param {Event} event
  * @param {Surroundings} around
  * @returns {Transition | undefined}
@@ -309,19 +315,27 @@ function whileAsking(state, event, around) {
   if (event.type === 'available' && !('id' in request)) {
     return ask(goal, around, { line });
   }
-  if (event.type === 'tick' && 'until' in request && around.now >= request.until) {
-    return { to: end({ code: 'session-silent' }, state) };
+  if (event.type === 'tick' && 'until' in request && request.until !== undefined && around.now >= request.until) {
+    return request.is === 'inLine'
+      ? lineIsSilent(state, request, around.now)
+      : { to: end({ code: 'session-silent' }, state) };
   }
   if (!('id' in event) || !('id' in request) || event.id !== request.id) {
     return undefined;
   }
-  const { id } = request;
+  if (event.type === 'ticketed') {
+    const ticketed = { ...request, hasTicket: true };
+    return {
+      to:
+        line && ticketed.is === 'inLine' ? inLine(state, ticketed, line, around.now) : { ...state, request: ticketed },
+    };
+  }
   if (event.type === 'queued') {
-    return { to: { ...state, request: { is: 'inLine', id, line: { ...line, ahead: event.ahead } } } };
+    return { to: inLine(state, request, { ...line, ahead: event.ahead }, around.now) };
   }
   if (event.type === 'estimated') {
     const turnAt = around.now + SECOND * event.seconds;
-    return { to: { ...state, request: { is: 'inLine', id, line: { ahead: line?.ahead, turnAt } } } };
+    return { to: inLine(state, request, { ahead: line?.ahead, turnAt }, around.now) };
   }
   if ('failure' in event.answer) {
     const { failure } = event.answer;
@@ -333,9 +347,35 @@ function whileAsking(state, event, around) {
   /** @type {Effect[]} */
   const effects = [{ do: 'connect', server, request: { world: goal.world, ...(pass && { pass }) } }];
   return {
-    to: { is: 'connecting', goal, server, isRestored: false, place: { is: 'opening' } },
+    to: { is: 'connecting', goal, server, isRestored: false, place: { is: 'opening' }, ...aliveAt(around.now) },
     effects: line ? [...effects, { do: 'sayTurn' }] : effects,
   };
+}
+
+/**
+ * The session server has said something about a place in the line. One that sends no tickets may be silent.
+ * @param {Asking} state
+ * @param {Answerable} request
+ * @param {Line} line
+ * @param {number} now
+ * @returns {Unconnected}
+ */
+function inLine(state, { id, hasTicket }, line, now) {
+  const until = hasTicket ? now + LINE_SILENCE : undefined;
+  return { ...state, request: { is: 'inLine', id, line, hasTicket, until, isOverdue: false } };
+}
+
+/**
+ * Nothing has come from the line for too long. A page that was blocked may tick before it gets what has come meanwhile.
+ * @param {Asking} state
+ * @param {Extract<Request, { is: 'inLine' }>} request
+ * @param {number} now
+ * @returns {Transition}
+ */
+function lineIsSilent(state, request, now) {
+  return request.isOverdue
+    ? { to: { ...state, request: { ...request, until: undefined } }, effects: [{ do: 'reconnect' }] }
+    : { to: { ...state, request: { ...request, until: now + SECOND, isOverdue: true } } };
 }
 
 /**
@@ -418,25 +458,69 @@ function redirect(problem, goal, from, around) {
  * @returns {Transition | undefined}
  */
 function whileStarting(state, event, around) {
-  if (event.type === 'opened' && state.is === 'connecting') {
-    return { to: { ...state, place: { is: 'asked' } } };
+  const { now } = around;
+  switch (event.type) {
+    case 'opened':
+      return state.is === 'connecting' ? { to: { ...state, place: { is: 'asked' }, heardAt: now } } : undefined;
+    case 'closed':
+      return startFailed(state, event, around);
+    case 'tick':
+      return startOn(state, around);
+    case 'message':
+      return hearOfStart({ ...state, heardAt: now }, event.message, now);
   }
-  if (event.type === 'closed') {
-    return startFailed(state, event, around);
-  }
-  if (event.type !== 'message') {
-    return undefined;
-  }
-  const { message } = event;
+  return undefined;
+}
+
+/**
+ * @param {Connecting | Starting} state
+ * @param {Message} message
+ * @param {number} now
+ * @returns {Transition}
+ */
+function hearOfStart(state, message, now) {
   if (message.is === 'ready') {
-    const facts = factsAfter(state.is === 'starting' ? state.facts : { isWatched: false }, message, around.now);
-    return run(state, message, facts, false, around.now, state.resumption);
+    const facts = factsAfter(state.is === 'starting' ? state.facts : { isWatched: false }, message, now);
+    return run(state, message, facts, false, now, state.resumption);
   }
   if (message.is === 'resumable') {
     return keep(state, message.resumption, false);
   }
-  const to = startGoesOn(state, message, around.now);
-  return to && { to };
+  return { to: startGoesOn(state, message, now) ?? state };
+}
+
+/**
+ * A second of a start has passed. A server that sends tokens also sends signs of life; another one may be silent for as
+ * long as it takes, once it has accepted the connection.
+ * @param {Connecting | Starting} state
+ * @param {Surroundings} around
+ * @returns {Transition}
+ */
+function startOn(state, around) {
+  const { now } = around;
+  if (state.resumption && isSilent(state, SILENCE, now)) {
+    return lose(state, state.resumption, now);
+  }
+  if (state.is === 'connecting' && state.place.is === 'opening' && isSilent(state, ATTEMPT, now)) {
+    return startFailed(state, {}, around);
+  }
+  return { to: { ...state, tickedAt: now } };
+}
+
+/** @param {number} now @returns {Life} */
+function aliveAt(now) {
+  return { heardAt: now, tickedAt: now };
+}
+
+/**
+ * Whether there was no sign of life for so many milliseconds. A page that was blocked, for example while it read a large
+ * scene, may tick before it gets the messages that have come meanwhile: these are there before the next tick.
+ * @param {Life} life
+ * @param {number} limit
+ * @param {number} now
+ */
+function isSilent({ heardAt, tickedAt }, limit, now) {
+  return now - heardAt >= limit && tickedAt - heardAt >= limit - SECOND;
 }
 
 /**
@@ -448,7 +532,8 @@ function whileStarting(state, event, around) {
  */
 function startGoesOn(state, message, now) {
   const { goal, server, isRestored, resumption } = state;
-  const target = { goal, server, isRestored, resumption };
+  const life = { heardAt: now, tickedAt: 'tickedAt' in state ? state.tickedAt : now };
+  const target = { goal, server, isRestored, resumption, ...life };
   const facts = factsAfter('facts' in state ? state.facts : { isWatched: false }, message, now);
   const phase = state.is === 'starting' ? state.phase : 'checkout';
   switch (message.is) {
@@ -497,7 +582,7 @@ function startFailed(state, { code, failure, isForbidden }, around) {
     return { to: end({ code: 'origin-refused' }, state) };
   }
   if (!failure && state.resumption && state.is !== 'lost') {
-    return lose({ ...state, heardAt: around.now }, state.resumption, around.now);
+    return lose(state, state.resumption, around.now);
   }
   if (!failure) {
     return isGranted
@@ -553,8 +638,7 @@ function run({ goal, server, isRestored }, { address, kind }, facts, isBack, now
       isRestored,
       address,
       facts,
-      heardAt: now,
-      tickedAt: now,
+      ...aliveAt(now),
       resumption,
       scene: { is: 'connecting' },
     },
@@ -609,12 +693,9 @@ function whileRunning(state, event, { now }) {
  * @returns {Transition}
  */
 function runOn(state, now) {
-  const { scene, resumption, heardAt, tickedAt } = state;
+  const { scene, resumption } = state;
   const isStreamLost = scene.is === 'closed' && now >= scene.until;
-  // A page that was blocked, for example while it read a large scene, may tick before it gets the messages that have
-  // come meanwhile: these are there before the next tick.
-  const isSilent = now - heardAt >= SILENCE && tickedAt - heardAt >= SILENCE - SECOND;
-  if (resumption && (isStreamLost || isSilent)) {
+  if (resumption && (isStreamLost || isSilent(state, SILENCE, now))) {
     return lose(state, resumption, now);
   }
   // If a controller has started the simulation, only its server still takes it for paused.
@@ -644,7 +725,7 @@ function hear(state, message, now) {
 
 /**
  * The connection is lost: the page tries at once to return.
- * @param {Running | ((Connecting | Starting) & { heardAt: number })} state
+ * @param {Running | Connecting | Starting} state
  * @param {Resumption} resumption
  * @param {number} now
  * @returns {Transition}

@@ -151,6 +151,8 @@ export class VisitRunner {
         return this.#panel.say(words.lost.found);
       case 'stopWaiting':
         return this.#sessionServer.stopWaiting();
+      case 'reconnect':
+        return this.#sessionServer.reconnect();
       case 'sayTurn':
         this.#panel.say(words.line.turn);
         return ring();

@@ -48,7 +48,10 @@ test('a place in the line, its turn, and the pass', () => {
   assert.equal(visit.view.progress?.notes.session, '2 clients are ahead of you, about 4 minutes');
   assert.equal(visit.view.leave, 'Stop waiting');
   // It waits longer than any answer may take.
-  visit.pass(600).answer('queue: 0');
+  for (let time = 0; time < 20; ++time) {
+    visit.pass(30).answer('ticket: t');
+  }
+  visit.answer('queue: 0');
   assert.equal(visit.view.progress?.notes.session, 'you are next, about a minute');
   visit.answer('pass: p', SERVER);
   const request = { world: WORLD, pass: 'p' };
@@ -399,6 +402,75 @@ test('a server that hangs is noticed by its silence, and one attempt is under wa
   assert.deepEqual(visit.did(), ['connect']);
   visit.take({ type: 'online' }).pass(1);
   assert.deepEqual(visit.did(), ['connect']);
+});
+
+test('a start whose server falls silent is found again, and one that is never accepted goes elsewhere', () => {
+  const starts = { queued: ['queue: 3', 'loading: waiting'], fetching: ['loading: Step 2/9 : 10 %'], neither: [] };
+  for (const [name, texts] of Object.entries(starts)) {
+    const visit = connecting().receive(...EARLY, ...texts);
+    for (let time = 0; time < 20; ++time) {
+      visit.pass(4).receive('absence: 300');
+    }
+    const { is } = visit.state;
+    visit.did();
+    visit.pass(7);
+    assert.equal(visit.state.is, is, name);
+    visit.pass(2);
+    assert.deepEqual([visit.state.is, visit.did()], ['lost', ['freeze', 'connect', 'sayLost']], name);
+    assert.ok(visit.view.notice, 'the visitor is told');
+    visit.receive('session: 1', 'absence: 300', 'resume: next', 'queue: 1');
+    assert.deepEqual([visit.state.is, visit.view.progress?.notes.place], ['connecting', '1 client is ahead of you']);
+    // It may fall silent again.
+    visit.pass(9);
+    assert.equal(visit.state.is, 'lost');
+  }
+  const opening = asking().answer(SERVER).pass(14);
+  opening.did();
+  assert.equal(opening.state.is, 'connecting');
+  opening.pass(1);
+  assert.deepEqual([opening.state.is, opening.did()], ['redirected', ['leave']]);
+});
+
+test('a start on a server without signs of life may be silent for as long as it takes', () => {
+  assert.equal(connecting().pass(3600).state.is, 'connecting', 'one in Python clones before it says anything');
+  assert.equal(connecting().receive('loading: Step 2/9 : 10 %').pass(3600).state.is, 'starting');
+  assert.equal(connecting().receive('queue: 2').pass(3600).state.is, 'connecting');
+});
+
+test('a start in a page that was blocked is not taken for a silent one', () => {
+  const visit = connecting().receive(...EARLY, 'loading: Step 2/9 : 10 %');
+  visit.now += 20_000;
+  visit.take({ type: 'tick' });
+  assert.equal(visit.state.is, 'starting');
+  visit.receive('absence: 300').pass(1);
+  assert.equal(visit.state.is, 'starting');
+});
+
+test('a silent line is asked again for the same place', () => {
+  const visit = asking().answer('ticket: t', 'queue: 3');
+  visit.pass(30).answer('ticket: t2').pass(30).answer('ticket: t3');
+  visit.did();
+  visit.pass(44);
+  assert.deepEqual(visit.did(), []);
+  visit.pass(3);
+  assert.deepEqual(visit.did(), ['reconnect']);
+  visit.take({ type: 'disconnected' }).pass(2);
+  assert.equal(visit.view.progress?.notes.session, '3 clients are ahead of you');
+  visit.take({ type: 'connected' }, { type: 'available', now: false });
+  assert.deepEqual(visit.effects.at(-1), { do: 'ask', id: 2, world: WORLD });
+  // Also if it falls silent before the first ticket comes again.
+  visit.answer('ticket: t4', 'queue: 3').did();
+  assert.deepEqual(visit.pass(60).did(), ['reconnect']);
+
+  const old = asking().answer('queue: 3');
+  old.did();
+  assert.deepEqual(old.pass(3600).did(), [], 'without tickets the place would be lost');
+
+  const blocked = asking().answer('ticket: t', 'queue: 3');
+  blocked.did();
+  blocked.now += 90_000;
+  blocked.take({ type: 'tick' }).answer('ticket: t2').pass(10);
+  assert.deepEqual(blocked.did(), [], 'the ticket came while the page was blocked');
 });
 
 test('a page that was blocked does not take that for the silence of its server', () => {

@@ -70,6 +70,8 @@ export class Visit {
       if (message?.is === 'chosen') {
         const { server, pass } = message;
         this.take({ type: 'answered', id: this.visit.asked, answer: { server, pass } });
+      } else if (message?.is === 'ticket') {
+        this.take({ type: 'ticketed', id: this.visit.asked });
       } else if (message?.is === 'queued') {
         this.take({ type: 'queued', id: this.visit.asked, ahead: message.ahead });
       } else if (message?.is === 'estimated') {
