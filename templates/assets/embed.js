@@ -17,6 +17,8 @@ import { VisitRunner } from './visit_runner.js';
 
 /** @typedef {{ state: PublicState, world: string | undefined, ahead: number | undefined }} StateDetail */
 
+/** Pause before the words are loaded again, in milliseconds. */
+const RELOAD = 5000;
 /** The URL of the session server: these files are its assets. */
 const BASE = new URL('..', import.meta.url).href;
 const NAME = 'webots-simulation';
@@ -36,7 +38,11 @@ export class WebotsSimulation extends HTMLElement {
   #storeName = '';
   /** What is called before the element is ready. @type {(() => void)[]} */
   #calls = [];
+  /** How many of them are starts. */
+  #queuedStarts = 0;
   #isOpening = false;
+  /** Opens the element again after a failure. @type {ReturnType<typeof setTimeout> | undefined} */
+  #reopening;
   /** @type {StateDetail} */
   #told = { state: 'idle', world: undefined, ahead: undefined };
   /** The world that was started last. */
@@ -72,6 +78,7 @@ export class WebotsSimulation extends HTMLElement {
     this.#wanted = world;
     this.#isReady = false;
     this.#plays = this.hasAttribute('autoplay');
+    this.#queuedStarts += this.#runner ? 0 : 1;
     this.#call(() => this.#runner?.take({ type: 'submitted', world }));
   }
 
@@ -100,11 +107,7 @@ export class WebotsSimulation extends HTMLElement {
   /* the life of the element */
 
   connectedCallback() {
-    if (!this.#runner && !this.#isOpening) {
-      this.#isOpening = true;
-      this.#storeName = this.#nameStore();
-      this.#open();
-    }
+    this.#open();
   }
 
   disconnectedCallback() {
@@ -130,18 +133,31 @@ export class WebotsSimulation extends HTMLElement {
       call();
     } else {
       this.#calls.push(call);
+      this.#open();
     }
   }
 
   async #open() {
+    if (this.#runner || this.#isOpening || !this.isConnected) {
+      return;
+    }
+    this.#isOpening = true;
+    this.#storeName = this.#nameStore();
     const root = this.shadowRoot ?? this.attachShadow({ mode: 'open' });
     root.adoptedStyleSheets = [SHEET];
     root.replaceChildren();
-    const { words } = await LANGUAGES[firstOf([this.getAttribute('lang') ?? '', ...navigator.languages])]();
+    const load = LANGUAGES[firstOf([this.getAttribute('lang') ?? '', ...navigator.languages])];
+    const words = await load().then(
+      (language) => language.words,
+      () => undefined,
+    );
     this.#isOpening = false;
     // It may be gone again.
-    if (!this.isConnected) {
+    if (!this.isConnected || !words) {
       storeNames.delete(this.#storeName);
+      if (!words) {
+        this.#openLater();
+      }
       return;
     }
     const take = (/** @type {VisitEvent} */ event) => this.#runner?.take(event);
@@ -162,6 +178,18 @@ export class WebotsSimulation extends HTMLElement {
     );
     this.#listen();
     this.#begin();
+  }
+
+  /** The session server has not sent the words: what was started has failed, and the element tries again. */
+  #openLater() {
+    clearTimeout(this.#reopening);
+    this.#reopening = setTimeout(() => this.#open(), RELOAD);
+    this.#calls = [];
+    const starts = this.#queuedStarts;
+    this.#queuedStarts = 0;
+    for (let start = 0; start < starts; start += 1) {
+      this.#end({ code: 'session-unreachable' });
+    }
   }
 
   /** A name that no other element of the page has: elements with the same id, or without one, are numbered. */
@@ -197,6 +225,7 @@ export class WebotsSimulation extends HTMLElement {
   /** Goes on with what this tab has kept, or starts by itself. */
   #begin() {
     const calls = this.#calls.splice(0);
+    this.#queuedStarts = 0;
     const wish = calls.length === 0 ? this.#runner?.restore() : undefined;
     if (wish) {
       // Nobody has seen it run yet.
@@ -218,6 +247,7 @@ export class WebotsSimulation extends HTMLElement {
     this.#runner = undefined;
     this.#panel = undefined;
     this.#calls = [];
+    this.#queuedStarts = 0;
   }
 
   /* events */
@@ -236,11 +266,17 @@ export class WebotsSimulation extends HTMLElement {
    * @param {VisitEvent} event
    */
   #changed(before, state, event) {
+    const wasGoing = before.is !== 'idle' && before.is !== 'ended';
+    if (wasGoing && event.type === 'submitted') {
+      this.#endLeft(before);
+    }
     const last = this.#told;
     const told = { state: this.#publicState(state), world: worldOf(state), ahead: ahead(state) };
     this.#told = told;
     this.#wanted = told.world ?? this.#wanted;
-    if (told.state !== last.state || told.ahead !== last.ahead || told.world !== last.world) {
+    // A start may fail at once, from one end to the next.
+    const hasEnded = state.is === 'ended' && state !== before;
+    if (hasEnded || told.state !== last.state || told.ahead !== last.ahead || told.world !== last.world) {
       this.#dispatch('state', told);
     }
     if (lineOf(before) && state.is === 'connecting') {
@@ -249,12 +285,10 @@ export class WebotsSimulation extends HTMLElement {
     if (isShown(state) && !this.#isReady) {
       this.#ready();
     }
-    if (state.is === 'ended' && before.is !== 'ended') {
+    if (hasEnded) {
       this.#end(state.problem);
-    } else if (event.type === 'left' && before.is !== 'idle' && before.is !== 'ended') {
-      const words = this.#panel?.words.stage;
-      this.#isReady = false;
-      this.#dispatch('ended', { code: 'left', message: isConnected(before) ? words?.clearLeft : words?.clearStopped });
+    } else if (wasGoing && event.type === 'left') {
+      this.#endLeft(before);
     }
   }
 
@@ -287,6 +321,16 @@ export class WebotsSimulation extends HTMLElement {
     if (this.#plays) {
       this.play();
     }
+  }
+
+  /**
+   * The visitor has left this state, or has started something else.
+   * @param {State} before
+   */
+  #endLeft(before) {
+    const words = this.#panel?.words.stage;
+    this.#isReady = false;
+    this.#dispatch('ended', { code: 'left', message: isConnected(before) ? words?.clearLeft : words?.clearStopped });
   }
 
   /** @param {import('./visit.js').Problem} problem */
