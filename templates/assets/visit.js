@@ -159,6 +159,8 @@ const LINE_SILENCE = 45_000;
 export const SHOWN_AFTER = 2000;
 /** Timeout of an attempt to connect, or to return, in milliseconds: a second one would invalidate the token of the first. */
 const ATTEMPT = 15_000;
+/** Time in which a browser tells that a page is left after it has closed its connections, in milliseconds. */
+const UNLOADING = 500;
 /** Pause after a failed attempt to return, in milliseconds; it doubles up to the longest. */
 const FIRST_PAUSE = 1000;
 const LONGEST_PAUSE = 10_000;
@@ -211,7 +213,8 @@ function fleetAfter(fleet, event) {
  */
 function wakeAt(state, before, now) {
   if (isConnected(state)) {
-    return before !== undefined && before > now && before <= now + SECOND ? before : now + SECOND;
+    const tick = before !== undefined && before > now && before <= now + SECOND ? before : now + SECOND;
+    return state.is === 'lost' && state.nextTry > now ? Math.min(tick, state.nextTry) : tick;
   }
   const waits = state.is === 'asking' ? state.request : state;
   return 'until' in waits ? waits.until : undefined;
@@ -582,7 +585,7 @@ function startFailed(state, { code, failure, isForbidden }, around) {
     return { to: end({ code: 'origin-refused' }, state) };
   }
   if (!failure && state.resumption && state.is !== 'lost') {
-    return lose(state, state.resumption, around.now);
+    return loseClosed(state, state.resumption, around.now);
   }
   if (!failure) {
     return isGranted
@@ -665,7 +668,7 @@ function whileRunning(state, event, { now }) {
       if (event.failure) {
         return { to: end(event.failure, state) };
       }
-      return state.resumption ? lose(state, state.resumption, now) : { to: end({ code: 'broken' }, state) };
+      return state.resumption ? loseClosed(state, state.resumption, now) : { to: end({ code: 'broken' }, state) };
     case 'scene':
       return { to: { ...state, scene: event.scene } };
     case 'mode':
@@ -731,28 +734,44 @@ function hear(state, message, now) {
  * @returns {Transition}
  */
 function lose(state, resumption, now) {
+  return tryAgain(lost(state, resumption, now), now, [{ do: 'freeze' }]);
+}
+
+/**
+ * The connection has closed. Firefox closes those of a page before it says that the page is left: one that returned at
+ * once would take the simulation from the page that is loaded next.
+ * @param {Connecting | Starting | Running} state
+ * @param {Resumption} resumption
+ * @param {number} now
+ * @returns {Transition}
+ */
+function loseClosed(state, resumption, now) {
+  return { to: { ...lost(state, resumption, now), nextTry: now + UNLOADING }, effects: [{ do: 'freeze' }] };
+}
+
+/**
+ * @param {Connecting | Starting | Running} state
+ * @param {Resumption} resumption
+ * @param {number} now
+ * @returns {Lost}
+ */
+function lost(state, resumption, now) {
   const { goal, server, isRestored, heardAt } = state;
-  const wasShown = state.is === 'running' && ['shown', 'closed', 'framed'].includes(state.scene.is);
-  const closesAt = 'facts' in state ? state.facts.closesAt : undefined;
-  return tryAgain(
-    {
-      is: 'lost',
-      goal,
-      server,
-      isRestored,
-      resumption,
-      heardAt,
-      hasRun: state.is === 'running',
-      wasShown,
-      isTold: false,
-      tries: 0,
-      nextTry: now,
-      // The server says again what still applies.
-      facts: { closesAt, isWatched: false },
-    },
-    now,
-    [{ do: 'freeze' }],
-  );
+  return {
+    is: 'lost',
+    goal,
+    server,
+    isRestored,
+    resumption,
+    heardAt,
+    hasRun: state.is === 'running',
+    wasShown: state.is === 'running' && ['shown', 'closed', 'framed'].includes(state.scene.is),
+    isTold: false,
+    tries: 0,
+    nextTry: now,
+    // The server says again what still applies.
+    facts: { closesAt: 'facts' in state ? state.facts.closesAt : undefined, isWatched: false },
+  };
 }
 
 /**
