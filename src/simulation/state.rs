@@ -146,14 +146,20 @@ impl AppState {
 
     /// Accepts no new clients from now on; the server ends when the last one has left.
     pub fn drain(&self) {
-        let is_new = self.phase.send_if_modified(|phase| {
-            let is_open = *phase == Phase::Open;
-            *phase = if is_open { Phase::Draining } else { *phase };
-            is_open
-        });
-        if is_new {
+        if self.leave_open(Phase::Draining) {
             log::info!("draining: no new clients, the server ends when the last has gone");
         }
+    }
+
+    /// Enters this phase if the server is open. Returns whether it was.
+    pub fn leave_open(&self, next: Phase) -> bool {
+        self.phase.send_if_modified(|phase| {
+            let is_open = *phase == Phase::Open;
+            if is_open {
+                *phase = next;
+            }
+            is_open
+        })
     }
 
     /// Stops the simulations with these ids, for a reason, which may be empty; `by` is who stops them, for the log. Returns

@@ -164,23 +164,17 @@ impl Control {
             Err(_) => return Err(format!("the new process was not ready within {} s", START.as_secs())),
         };
         self.must_be_open()?;
-        control::set_serving(&self.cache, run).map_err(|error| format!("cacheDir can't be written: {error}"))?;
+        control::set_serving(&self.cache, run).map_err(|error| unwritable(&error))?;
         self.has_moved.store(true, Relaxed);
         self.port.pause().await;
         // New requests wait for the new process. Those that have come before are answered as ever.
         actix_rt::time::sleep(REST).await;
-        let is_superseded = self.server.phase.send_if_modified(|phase| {
-            let is_open = *phase == Phase::Open;
-            *phase = if is_open { Phase::Superseded } else { *phase };
-            is_open
-        });
-        if !is_superseded {
+        if !self.server.leave_open(Phase::Superseded) {
             // A stop or a drain came meanwhile. The new process ends, as the channel to it closes.
-            control::set_serving(&self.cache, RunId::own())
-                .map_err(|error| format!("cacheDir can't be written: {error}"))?;
             self.has_moved.store(false, Relaxed);
             self.port.resume().await;
-            return self.must_be_open().map(|()| String::new());
+            control::set_serving(&self.cache, RunId::own()).map_err(|error| unwritable(&error))?;
+            return Err(refusal(*self.server.phase.borrow()).unwrap_or_default().to_owned());
         }
         let left = self.server.slots.supersede();
         let count = left.simulations.len();
@@ -198,14 +192,25 @@ impl Control {
     }
 
     fn must_be_open(&self) -> Result<(), String> {
-        Err(match *self.server.phase.borrow() {
-            Phase::Open => return Ok(()),
-            Phase::Draining => "it drains, and ends after its last simulation",
-            Phase::Superseded => "another process has its port already",
-            Phase::Closing => "it stops",
+        match refusal(*self.server.phase.borrow()) {
+            None => Ok(()),
+            Some(why) => Err(why.to_owned()),
         }
-        .to_owned())
     }
+}
+
+/// Why a server in this phase is not upgraded; `None` if it is.
+fn refusal(phase: Phase) -> Option<&'static str> {
+    match phase {
+        Phase::Open => None,
+        Phase::Draining => Some("it drains, and ends after its last simulation"),
+        Phase::Superseded => Some("another process has its port already"),
+        Phase::Closing => Some("it stops"),
+    }
+}
+
+fn unwritable(error: &io::Error) -> String {
+    format!("cacheDir can't be written: {error}")
 }
 
 /// The program and its arguments, as this process was started.

@@ -36,10 +36,8 @@ export class WebotsSimulation extends HTMLElement {
   #runner;
   /** The name of its store. */
   #storeName = '';
-  /** What is called before the element is ready. @type {(() => void)[]} */
+  /** What is called before the element is ready. @type {{ call: () => void, isStart: boolean }[]} */
   #calls = [];
-  /** How many of them are starts. */
-  #queuedStarts = 0;
   #isOpening = false;
   /** Opens the element again after a failure. @type {ReturnType<typeof setTimeout> | undefined} */
   #reopening;
@@ -78,8 +76,7 @@ export class WebotsSimulation extends HTMLElement {
     this.#wanted = world;
     this.#isReady = false;
     this.#plays = this.hasAttribute('autoplay');
-    this.#queuedStarts += this.#runner ? 0 : 1;
-    this.#call(() => this.#runner?.take({ type: 'submitted', world }));
+    this.#call(() => this.#runner?.take({ type: 'submitted', world }), true);
   }
 
   /** Ends the simulation, or waits no longer. */
@@ -127,12 +124,15 @@ export class WebotsSimulation extends HTMLElement {
     return this.getAttribute('name')?.trim() || undefined;
   }
 
-  /** @param {() => void} call */
-  #call(call) {
+  /**
+   * @param {() => void} call
+   * @param {boolean} [isStart]
+   */
+  #call(call, isStart = false) {
     if (this.#runner) {
       call();
     } else {
-      this.#calls.push(call);
+      this.#calls.push({ call, isStart });
       this.#open();
     }
   }
@@ -184,10 +184,9 @@ export class WebotsSimulation extends HTMLElement {
   #openLater() {
     clearTimeout(this.#reopening);
     this.#reopening = setTimeout(() => this.#open(), RELOAD);
+    const starts = this.#calls.filter(({ isStart }) => isStart);
     this.#calls = [];
-    const starts = this.#queuedStarts;
-    this.#queuedStarts = 0;
-    for (let start = 0; start < starts; start += 1) {
+    for (const _ of starts) {
       this.#end({ code: 'session-unreachable' });
     }
   }
@@ -225,7 +224,6 @@ export class WebotsSimulation extends HTMLElement {
   /** Goes on with what this tab has kept, or starts by itself. */
   #begin() {
     const calls = this.#calls.splice(0);
-    this.#queuedStarts = 0;
     const wish = calls.length === 0 ? this.#runner?.restore() : undefined;
     if (wish) {
       // Nobody has seen it run yet.
@@ -233,7 +231,7 @@ export class WebotsSimulation extends HTMLElement {
     } else if (calls.length === 0 && this.hasAttribute('autostart')) {
       this.start();
     }
-    for (const call of calls) {
+    for (const { call } of calls) {
       call();
     }
   }
@@ -247,7 +245,6 @@ export class WebotsSimulation extends HTMLElement {
     this.#runner = undefined;
     this.#panel = undefined;
     this.#calls = [];
-    this.#queuedStarts = 0;
   }
 
   /* events */

@@ -41,7 +41,11 @@ async fn who_comes_back_finds_the_simulation_as_it_runs_at_each_level() {
         // Both connections break, as in a reload of the page.
         drop((client, viewer));
         server.until_away(1).await;
-        assert_eq!(server.simulations().await[0]["stage"], "running");
+        // The server reads in Webots' output that it runs, perhaps later than the viewer sees it.
+        until("it runs without anybody", async || {
+            server.simulations().await[0]["stage"] == "running"
+        })
+        .await;
 
         let mut client = Client::resuming(&server, &first).await;
         let second = client.token().await;

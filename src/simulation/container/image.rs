@@ -305,10 +305,11 @@ impl Images {
         let running = self.running.lock().clone();
         let marks: Vec<BuildMark> = running.keys().cloned().collect();
         let before = running.values().copied().max().unwrap_or_default();
-        let now = spawn_blocking(free_room).await.ok().flatten().unwrap_or_default();
-        match growth::written(&self.docker, &marks).await {
-            Ok(written) => growth::fillers(&marks, &written, before.saturating_sub(now)),
-            Err(_) => marks,
+        let now = spawn_blocking(free_room).await.ok().flatten();
+        match (now, growth::written(&self.docker, &marks).await) {
+            (Some(now), Ok(written)) => growth::fillers(&marks, &written, before.saturating_sub(now)),
+            // Nothing is known: it may be any.
+            _ => marks,
         }
     }
 

@@ -44,8 +44,7 @@ impl QueuePosition {
         (peer, identity): (Peer, ClientIdentity),
         reservation: Option<ReservationId>,
     ) -> Result<Self, Failure> {
-        let client = Client::new(peer, identity);
-        slots.acquire(SimulationRecord::for_client(id, world, client, listener), reservation)?;
+        slots.acquire((id, world), Client::new(peer, identity), listener, reservation)?;
         Ok(Self(Entry {
             id,
             slots: Arc::clone(slots),

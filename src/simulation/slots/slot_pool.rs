@@ -19,7 +19,7 @@ use super::reservations::{Held, LinkId, Reservations, Reserved};
 use super::simulation_record::{
     Away, Client, Holding, Party, Served, SimulationRecord, SlotEvent, SpareKind, Standing,
 };
-use crate::shared::domain::{Failure, Instances, Reason, ReservationId, Stage, View, Wish, Wishes};
+use crate::shared::domain::{Failure, Instances, ProjectUrl, Reason, ReservationId, Stage, View, Wish, Wishes};
 use crate::simulation::ends::Ends;
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::snapshot::{Holdings, Snapshot};
@@ -183,7 +183,9 @@ impl SlotPool {
     /// Why it may not wait: the slots and the queue are full, or its address or its user has reached its limit.
     pub(super) fn acquire(
         &self,
-        mut record: SimulationRecord,
+        (id, world): (SimulationId, &ProjectUrl),
+        mut client: Client,
+        listener: Recipient<SlotEvent>,
         reservation: Option<ReservationId>,
     ) -> Result<(), Failure> {
         let mut slots = self.0.lock();
@@ -194,14 +196,13 @@ impl SlotPool {
             .is_none_or(|reservation| reservation.link().is_some());
         slots.arrivals += u64::from(is_new);
         let limits = (slots.per_address, slots.per_user);
-        let id = record.id;
-        let Standing::Waiting { client, .. } = &mut record.standing else {
-            return Ok(());
-        };
         client.parties = parties(client.address(), client.identity.user.clone(), limits);
         let own = client.parties.clone();
+        client.since = reservation
+            .as_ref()
+            .map_or(client.since, |reservation| reservation.since);
+        let mut record = SimulationRecord::for_client(id, world, client, listener);
         if let Some(reservation) = reservation {
-            client.since = reservation.since;
             // It may count for somebody else than the session server knew.
             if own == reservation.parties || may_have(&slots.lent(), &own) {
                 match reservation.held {
@@ -584,7 +585,6 @@ mod tests {
     use tokio::sync::mpsc::{UnboundedSender, unbounded_channel};
 
     use super::*;
-    use crate::shared::domain::ProjectUrl;
     use crate::shared::http::{Metrics, Peer};
     use crate::simulation::client_identity::ClientIdentity;
     use crate::simulation::slots::QueuePosition;
