@@ -30,7 +30,7 @@ class Viewing(BrowserTest):
     def test_disconnect_ends_the_simulation(self):
         page, server = self.start_world()
         # A page that a test before has closed may come back for some time: its simulation waits.
-        (own,) = (one["id"] for one in server.status()["simulations"] if one["awayUntil"] is None)
+        (own,) = (one["id"] for one in server.status()["simulations"] if not one.get("awayUntil"))
         page.tab.get_by_role("button", name="Disconnect").click()
         expect(page.tab.locator("#stage")).to_contain_text("it has ended")
         until("the simulation is gone", lambda: own not in [one["id"] for one in server.status()["simulations"]])

@@ -47,6 +47,7 @@ async fn a_visitor_who_left_while_waiting_keeps_no_slot() {
     for streaming in ["direct", "relay"] {
         let server = server(streaming, 0.5).start().await;
         let mut before = Client::start(&server, &arm()).await;
+        before.until("loading:").await;
         // Its page was left, and its connection is open.
         let mut left = Client::start(&server, &arm()).await;
         left.until("queue:").await;
