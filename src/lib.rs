@@ -18,7 +18,7 @@
 //! | [`session::fleet`] | the registry and the monitors of simulation servers, and what connects them with the line (`line_keeper`, `slot_link`) |
 //! | [`session::web`] | routes, pages, `/status`, Prometheus metrics (gauges in `metrics`, counters and histograms in `app`) and the WebSocket of the session server with its messages (`web_client`) |
 //! | [`simulation::process`] | process trees: how they start and end (`process_group`: SIGTERM, grace period, SIGKILL; leftovers of a dead server: `process_tree`, `guardian`); directories of simulations |
-//! | [`simulation::machine`] | readings of the machine (`sensors`) and its GPUs (`gpus`), the load and `monitor.csv` (`load_monitor`); which GPU a simulation gets if they are spread over several (`spread`) |
+//! | [`simulation::machine`] | readings of the machine (`sensors`) and its GPUs (`gpus`), the load that follows from them (`sensors`), its mean and `monitor.csv` (`load_monitor`), what each simulation uses (`usage`); which GPU a simulation gets if they are spread over several (`spread`) |
 //! | [`simulation::checkout`] | worlds checked out with git; `timing.checkout` limits a whole checkout (`checkout_service`), each git command, and by a quarter of it a silent remote (`git`); `projectSize` limits its size; the simulation server's `config/mirrors` has GitHub's address and the mirrors of others |
 //! | `simulation::isolation` | how a simulation is launched: its level of isolation (`launcher`), the variables that it inherits, limits; the control group that ends with it (`cgroup`) |
 //! | [`simulation::container`] | simulations in containers: what a project requests, its image, its compose project (`compose_project`, with its GPU and user) |
@@ -37,7 +37,7 @@
 //! `monitor.csv` appears in the charts (`charts.js` groups them by how their headings begin; the others are drawn in
 //! percent); the figures above are in `glance.html`.
 //!
-//! Each server also has a directory `config` (every key: `session_config`, `simulation_config`; durations of the key `timing`: `timing`;
+//! Each server also has a directory `config` (keys: `session_config`, `simulation_config`; nested ones: the file of their group, such as `timing`;
 //! `docs/configuration.md` lists all), its `app` (start and end) and its `state` (what its routes share). Files of
 //! `simulation` are the [`protocol`](simulation::protocol) with the texts of messages to clients (except the reason in
 //! an error and the [`progress`](simulation::progress) of a start, which their causes define: a checkout's is in

@@ -2,7 +2,7 @@
 # Runs all tests: tests/run.sh
 # Or selected tests, within seconds once they are built: tests/run.sh ARGUMENT FOR cargo test...
 # Installs missing packages through apt and prints them.
-set -eu
+set -euo pipefail
 cd "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/.."
 
 command -v cargo >/dev/null || PATH=$PATH:${CARGO_HOME:-$HOME/.cargo}/bin
@@ -98,7 +98,8 @@ run_beside() { # COMMAND...
 }
 run_beside tests/own_network.sh "${CARGO[@]}" --test containers -- --skip on_a_quiet_machine
 run_beside tests/deploy/package.sh
-tests/own_tmp.sh "${CARGO[@]}" --lib --bins --test integration -- --skip on_a_quiet_machine || failed+=('cargo test')
+tests/own_tmp.sh "${CARGO[@]}" --lib --bins --test integration -- --skip on_a_quiet_machine 2>&1 | tee "$logs/cargo test" ||
+    failed+=('cargo test')
 run_beside tests/browser/run
 run_beside "${CARGO[@]}" --test faults -- --skip on_a_quiet_machine
 run_beside "${CARGO[@]}" --test simulation_limits
@@ -128,4 +129,10 @@ finish $guide
 
 echo "tests: $(elapsed), build included"
 ((${#skipped[@]} == 0)) || echo "SKIPPED, not passed: ${skipped[*]}" >&2
-((${#failed[@]} == 0)) || { printf 'FAILED: %s\n' "${failed[@]}" >&2; exit 1; }
+((${#failed[@]} > 0)) || exit 0
+for command in "${failed[@]}"; do
+    printf '\n--- the end of what failed: %s\n' "$command"
+    tail -n 80 "$logs/${command//\//-}"
+done >&2
+printf 'FAILED: %s\n' "${failed[@]}" >&2
+exit 1

@@ -28,12 +28,13 @@ fn commit(forge: &Forge, branch: &str) -> String {
 }
 
 #[actix_rt::test]
-async fn a_fetch_that_hangs_delays_only_those_who_need_it() {
+async fn a_fetch_that_hangs_delays_only_new_commits_of_its_repository() {
     let forge = forge(&["main", "slow", "one"]);
     let webots = reader();
     let main = commit(&forge, "main");
     let slow = commit(&forge, "slow");
     git(&forge.path().join("lab/arm"), &["tag", "as-slow", "slow"]);
+    forge.commit("lab/other", "main", &[("worlds/a.wbt", &world_text("other"))]);
     let wrapper = Wrapper::git(&format!(
         "case \"$*\" in *fetch*+{slow}:*) while echo 'halted: 50%' >&2; do sleep 0.2; done;; esac"
     ));
@@ -54,6 +55,8 @@ async fn a_fetch_that_hangs_delays_only_those_who_need_it() {
     until("it hangs", async || fetches(&slow) == 1).await;
     ask("main", "main").await;
     ask(&main, "main").await;
+    let elsewhere = world("lab/other", "main", "worlds/a.wbt");
+    is_told(&server, &elsewhere, "opened [other]").await;
     // A commit is fetched once, whatever the reference and the world, also if the first client has left.
     let mut by_hash = Client::start(&server, &arm_at(&slow)).await;
     by_hash

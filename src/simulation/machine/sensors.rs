@@ -58,7 +58,8 @@ impl Gpu {
 }
 
 /// The load of a machine: `max(CPU, (swap + memory + GPU memory) / 3, GPU compute)`, all in percent, as in the
-/// original. Of several GPUs, the one that a new client would get counts; without GPUs, an idle one.
+/// original. Of several GPUs, the least busy one counts, as in the original; with `gpus: "spread"` that is the one that the
+/// next simulation gets. Without GPUs, an idle one.
 pub fn load(machine: &Machine, gpu: &Gpu) -> Load {
     let memories = (machine.swap + machine.memory + gpu.memory) / 3.0;
     Load::try_from(machine.cpu.max(memories).max(gpu.compute)).unwrap_or(Load::ZERO)
