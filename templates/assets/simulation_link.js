@@ -110,6 +110,19 @@ export class SimulationLink {
 }
 
 /**
+ * Ends a simulation that waits for this client, if its server can be reached now.
+ * @param {string} server the WebSocket address of the simulation server
+ * @param {string} token
+ */
+export function endAway(server, token) {
+  const socket = new WebSocket(`${server}/client`);
+  socket.addEventListener('open', () => {
+    socket.send(JSON.stringify({ resume: token }));
+    socket.close(1000);
+  });
+}
+
+/**
  * Whether the server refuses pages of this site.
  * @param {string} url
  */

@@ -123,11 +123,12 @@ import { helpsToWait } from './reasons.js';
 
 /**
  * What the page does. `leave` ends the simulation, `detach` lets it wait; both close the viewer. `freeze` keeps what the
- * viewer shows and closes its stream. `probe` finds out whether the session server answers; `reconnect` gives up the
+ * viewer shows and closes its stream. `endAway` ends a simulation to which the page has no connection. `probe` finds out whether the session server answers; `reconnect` gives up the
  * connection to it, which is dead.
  * @typedef {{ do: 'ask', id: number, world: string }
  *   | { do: 'connect', server: string, request: { world: string, pass?: string | undefined } | { resume: string } }
  *   | { do: 'show', address: string, kind: string | undefined, server: string, isBack: boolean }
+ *   | { do: 'endAway', server: string, token: string }
  *   | { do: 'store', kept: Kept }
  *   | { do: 'send', message: object }
  *   | { do: 'stopWaiting' | 'sayTurn' | 'reconnect' }
@@ -188,6 +189,9 @@ export function next(visit, event, now, random) {
   // Whatever the way out: the connection does not outlive the states that hold it.
   if (isConnected(from) && !isConnected(to)) {
     effects.unshift({ do: event.type === 'hidden' && resumptionOf(from) ? 'detach' : 'leave' });
+    if (from.is === 'lost' && (event.type === 'left' || event.type === 'submitted')) {
+      effects.unshift({ do: 'endAway', server: from.server, token: from.resumption.token });
+    }
   }
   const asked = to.is === 'asking' && 'id' in to.request ? to.request.id : visit.asked;
   return { visit: { fleet, state: to, asked, wakeAt: wakeAt(to, visit.wakeAt, now) }, effects };

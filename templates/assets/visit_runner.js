@@ -2,7 +2,7 @@
 // effects on the connections, the store and the panel.
 
 import { SessionServer } from './session_server.js';
-import { SimulationLink } from './simulation_link.js';
+import { endAway, SimulationLink } from './simulation_link.js';
 import { ring } from './turn.js';
 import { BEGIN, next } from './visit.js';
 
@@ -133,6 +133,8 @@ export class VisitRunner {
         return stage.freeze();
       case 'leave':
         return this.#leave();
+      case 'endAway':
+        return endAway(effect.server, effect.token);
       case 'detach':
         this.#link?.detach();
         return this.#close();

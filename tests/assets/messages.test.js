@@ -4,7 +4,7 @@ import assert from 'node:assert/strict';
 import { beforeEach, test } from 'node:test';
 
 import { FleetReader, SimulationReader } from '../../templates/assets/messages.js';
-import { SimulationLink } from '../../templates/assets/simulation_link.js';
+import { endAway, SimulationLink } from '../../templates/assets/simulation_link.js';
 import { Clock, FakeWebSocket } from './fakes.js';
 
 const DRAINING = { code: 'draining', blame: 'server', retry: 'elsewhere' };
@@ -209,6 +209,14 @@ test('a sentence without a reason waits for the close code, but not for long', (
   never.socket.receive('loading: Error: it stops');
   clock.pass(2000);
   assert.deepEqual(never.events, [{ type: 'closed', code: undefined, failure }]);
+});
+
+test('who ends a simulation that waits for it resumes it and closes with 1000', () => {
+  endAway('ws://one:2000', 'secret');
+  const socket = FakeWebSocket.last;
+  assert.deepEqual([socket.url, socket.sent], ['ws://one:2000/client', []]);
+  socket.open();
+  assert.deepEqual([socket.sent, socket.closedWith], [['{"resume":"secret"}'], 1000]);
 });
 
 test('who leaves closes with 1000, who may come back does not, and neither hears more', () => {

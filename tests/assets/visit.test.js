@@ -622,3 +622,25 @@ test('each way out of a connected state closes the connection once', () => {
   visit.did();
   assert.deepEqual(visit.take({ type: 'sceneFailed', why: 'no-webgl' }).did(), ['leave']);
 });
+
+test('who leaves or starts another one while the connection is lost ends the simulation that waits, and nobody else does', () => {
+  for (const [way, ends] of /** @type {[VisitEvent, boolean][]} */ ([
+    [{ type: 'left' }, true],
+    [{ type: 'submitted', world: WORLD }, true],
+    [{ type: 'hidden' }, false],
+  ])) {
+    for (const [state, isLost] of /** @type {[() => Visit, boolean][]} */ ([
+      [() => running().take({ type: 'closed' }), true],
+      [running, false],
+    ])) {
+      const visit = state();
+      const token = visit.state.is === 'lost' ? visit.state.resumption.token : undefined;
+      assert.equal(token !== undefined, isLost);
+      visit.did();
+      visit.take(way);
+      const ended = visit.effects.filter((effect) => effect.do === 'endAway');
+      const expected = ends && isLost ? [{ do: 'endAway', server: SERVER, token }] : [];
+      assert.deepEqual(ended, expected, way.type);
+    }
+  }
+});
