@@ -281,7 +281,7 @@ told 'from the start of each new server to its first client (5 s asked)' "$used"
 full_class 20
 begin=$(now)
 docker service scale --detach fleet_simulation=2 >/dev/null
-within 8 everywhere are 2 up
+within 20 everywhere are 2 up
 told 'from docker service scale 6 -> 2 until two are offered' "$(($(now) - begin)) ms"
 staying=$(servers up)
 for ((number = 0; number < 20; number++)); do

@@ -67,10 +67,10 @@ END
 }
 
 # Redirects the guide's repository, which the machine can't reach, to a local one. Other load on this machine must not make
-# the servers full.
+# the servers full. The client of `simulate` answers no ping, and opens no stream.
 adapt() {
     in_machine test -e /srv/arm || make_project /srv/arm worlds/arm.wbt
-    in_machine sed -i 's|"allowedRepositories"|"gitMirrors": {"https://github.com/your-lab/arm": "file:/srv/arm"}, &|' \
+    in_machine sed -i 's|"allowedRepositories"|"gitMirrors": {"https://github.com/your-lab/arm": "file:/srv/arm"}, "timing": {"arrival": 0, "silence": 3600}, &|' \
         /etc/webots-fleet/simulation/main.json
     in_machine sed -i 's|"simulationServers": \["fleet|"loadThreshold": 1000, &|' /etc/webots-fleet/session/main.json
 }
@@ -78,11 +78,11 @@ adapt() {
 # Whether a page contains these words, through the web server.
 page() { # URL WORDS
     local answer
-    answer=$(in_machine curl --silent --show-error --fail --max-time 3 "$1") && grep --quiet -- "$2" <<<"$answer"
+    answer=$(in_machine curl --silent --show-error --fail --max-time 30 "$1") && grep --quiet -- "$2" <<<"$answer"
 }
 
 status_of() { # URL OPTION...
-    in_machine curl --silent --output /dev/null --max-time 5 --write-out '%{http_code}' "$@" || true
+    in_machine curl --silent --output /dev/null --max-time 30 --write-out '%{http_code}' "$@" || true
 }
 
 # Ports of the machine's services that are not part of the fleet.
@@ -104,7 +104,7 @@ firewall_lets_in() { # ADDRESS ITS MACHINE PORT
     in_machine systemd-run --quiet --unit="open-$3" --working-directory=/srv python3 -m http.server "$3"
     eventually in_machine curl --silent --fail --output /dev/null "http://127.0.0.1:$3/"
     here=$from
-    in_machine curl --silent --fail --max-time 2 --output /dev/null "http://$1:$3/"
+    in_machine curl --silent --fail --max-time 10 --output /dev/null "http://$1:$3/"
 }
 
 # Opens the WebSockets of a class of visitors, several each; all must stay open.
@@ -118,7 +118,7 @@ context, doors = ssl.create_default_context(), []
 asked = (f"GET /session HTTP/1.1\r\nHost: {host}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
          "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n")
 for number in range(count):
-    door = context.wrap_socket(socket.create_connection((host, 443), timeout=10), server_hostname=host)
+    door = context.wrap_socket(socket.create_connection((host, 443), timeout=60), server_hostname=host)
     door.sendall(asked.encode())
     answer = door.recv(100)
     if b" 101 " not in answer:

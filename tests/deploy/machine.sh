@@ -104,7 +104,7 @@ trap finish EXIT
 trap 'exit 130' INT TERM HUP
 
 eventually() { # COMMAND...
-    local patience=150
+    local patience=600
     until "$@" >/dev/null 2>&1; do
         ((patience-- > 0)) || fail "waited in vain: $*"
         sleep 0.2
@@ -126,7 +126,7 @@ boot() { # NAME
             "$SCRIPT" machine "$here" </dev/null
     ) &
     keepers[$here]=$!
-    for _ in {1..50}; do
+    for _ in {1..300}; do
         kill -0 "${keepers[$here]}" 2>/dev/null || skip 'no namespaces or mounts can be made here'
         read -r children <"/proc/${keepers[$here]}/task/${keepers[$here]}/children" || true
         init=${children%% *}
@@ -230,7 +230,7 @@ commands() { # HEADING [NUMBER]
 
 answers() { # PORT PATH WORDS
     local answer
-    answer=$(in_machine curl --silent --fail --max-time 3 "http://127.0.0.1:$1$2") && grep --quiet -- "$3" <<<"$answer"
+    answer=$(in_machine curl --silent --fail --max-time 30 "http://127.0.0.1:$1$2") && grep --quiet -- "$3" <<<"$answer"
 }
 
 property() { # UNIT NAME
@@ -240,7 +240,8 @@ property() { # UNIT NAME
 # Whether a program whose name matches this pattern runs.
 runs() { # PATTERN
     local names
-    names=$(in_machine sh -c 'cat /proc/[0-9]*/comm 2>/dev/null || true')
+    # Without those that have ended and nobody has waited for.
+    names=$(in_machine sh -c 'cat /proc/[0-9]*/stat 2>/dev/null || true' | sed -n 's/^[0-9]* (\(.*\)) [^ZX] .*/\1/p')
     grep --quiet --line-regexp --extended-regexp -- "$1" <<<"$names"
 }
 
@@ -279,10 +280,10 @@ simulate() { # URL
     printf -v text '\\x81\\xfe\\x%02x\\x%02x%s%s' $((${#message} / 256)) $((${#message} % 256)) "$mask" "$message"
     # shellcheck disable=SC2016
     in_machine bash -c '
+        echo $$ >/run/client.pid
         exec 3<>/dev/tcp/127.0.0.1/2000
         printf "GET /client HTTP/1.1\r\nHost: localhost:2000\r\nConnection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n" >&3
         printf "$1" >&3
-        echo $$ >/run/client.pid
         exec cat <&3' simulate "$text" >"$WORK/client.log" 2>/dev/null || true
 }
 

@@ -46,7 +46,7 @@ spared_by_needrestart_begins() {
         set -e
         apt-get install --yes --quiet --no-install-recommends needrestart
         sed "s/1999/1998/; /logDir/d; s/\],$/]/" /etc/webots-fleet/session/main.json >/srv/other.json
-        printf "[Service]\nExecStart=/usr/bin/session-server /srv/other.json\nWorkingDirectory=/run\n" >/etc/systemd/system/other.service
+        printf "[Service]\nType=exec\nExecStart=/usr/bin/session-server /srv/other.json\nWorkingDirectory=/run\n" >/etc/systemd/system/other.service
         systemctl start other' >"$WORK/needrestart.log" 2>&1 || fail "$(<"$WORK/needrestart.log")"
     eventually answers 1998 /health ok
 }
@@ -76,7 +76,8 @@ main() {
 
     echo 'starts both servers, simulation servers first'
     make_project /srv/webots-demo/project worlds/a.wbt
-    in_machine sed -i 's|"webotsHome": .*|"webots": "/usr/bin/demo-simulator", "gitMirrors": {"https://github.com/cyberbotics/demo": "file:/srv/webots-demo/project"},|; s|"xvfb": true|"xvfb": false|' \
+    # The client of `simulate` answers no ping, and opens no stream.
+    in_machine sed -i 's|"webotsHome": .*|"webots": "/usr/bin/demo-simulator", "timing": {"arrival": 0, "silence": 3600}, "gitMirrors": {"https://github.com/cyberbotics/demo": "file:/srv/webots-demo/project"},|; s|"xvfb": true|"xvfb": false|' \
         /etc/webots-fleet/simulation/main.json
     in_machine systemctl enable --quiet webots-session@main webots-simulation@main
     # As at boot.
@@ -119,7 +120,8 @@ main() {
     in_machine sed -i 's/"port": 1999/"port": "many"/; s/, "localhost:2200"//' /etc/webots-fleet/session/main.json
     ! in_machine systemctl reload webots-session@main 2>"$WORK/reload.log" || fail 'a reload of a wrong configuration succeeds'
     grep --quiet 'webots-session@main.service failed' "$WORK/reload.log" || fail "$(<"$WORK/reload.log")"
-    in_machine journalctl --unit=webots-session@main --output=cat | grep --quiet 'main.json.*port' || fail 'nobody is told what is wrong'
+    in_machine journalctl --sync
+    grep --quiet 'main.json.*port' <<<"$(in_machine journalctl --unit=webots-session@main --output=cat)" || fail 'nobody is told what is wrong'
     answers 1999 /status 2200 || fail 'it does not go on as before'
     in_machine mv /srv/good.json /etc/webots-fleet/session/main.json
     in_machine chmod 644 /etc/webots-fleet/session/main.json
@@ -128,7 +130,7 @@ main() {
     old=$(property webots-session@main MainPID)
     in_machine sh -c "kill -KILL $old"
     eventually answers 1999 /health ok
-    is_another webots-session@main "$old" || fail 'it was not started again'
+    eventually is_another webots-session@main "$old"
 
     echo 'upgrades: configurations are kept, simulations run on'
     in_machine sed -i 's/"maxConnections": 20/"maxConnections": 7/' /etc/webots-fleet/simulation/main.json
@@ -178,7 +180,7 @@ main() {
     eventually is_another webots-simulation@main "$old"
     in_machine test -e "/proc/$old" || fail 'the old process has ended'
     in_machine systemctl stop webots-simulation@main
-    in_machine test ! -e "/proc/$old" || fail 'the old process lives on'
+    eventually in_machine test ! -e "/proc/$old"
     ! runs demo-simulator || fail 'a simulation lives on'
     in_machine systemctl start webots-simulation@main
 
@@ -202,11 +204,11 @@ main() {
     echo 'is started again when it hangs'
     old=$(property webots-simulation@main MainPID)
     in_machine mkdir -p /run/systemd/system/webots-simulation@.service.d
-    in_machine sh -c 'printf "[Service]\nWatchdogSec=2\n" >/run/systemd/system/webots-simulation@.service.d/test.conf'
+    in_machine sh -c 'printf "[Service]\nWatchdogSec=8\n" >/run/systemd/system/webots-simulation@.service.d/test.conf'
     in_machine systemctl daemon-reload
     in_machine systemctl restart webots-simulation@main
     old=$(property webots-simulation@main MainPID)
-    sleep 4
+    sleep 12
     [[ $(property webots-simulation@main MainPID) == "$old" ]] || fail 'a healthy server was ended'
     in_machine sh -c "kill -STOP $old"
     eventually is_another webots-simulation@main "$old"
@@ -233,7 +235,7 @@ main() {
     leave
     as_lab test -s /home/lab/.cache/webots-fleet/log/simulation/output.log || fail 'the log is elsewhere'
     # shellcheck disable=SC2016
-    in_machine sh -c 'for process in $(pidof session-server simulation-server); do grep --quiet "^Seccomp:.2" /proc/$process/status || exit 1; done' ||
+    in_machine sh -c 'for process in $(pidof session-server simulation-server); do grep --quiet "^Seccomp:.2" /proc/$process/status 2>/dev/null || [ ! -e /proc/$process ] || exit 1; done' ||
         fail 'they may do everything'
     as_lab systemctl --user stop 'webots-*'
     for _ in 1 2; do
@@ -275,7 +277,7 @@ main() {
     in_machine '/srv/a release/server.sh' start demo >"$WORK/demo.log" 2>&1 || fail "$(<"$WORK/demo.log")"
     eventually answers 1999 /status '"state":"\(up\|full\)"'
     in_machine '/srv/a release/server.sh' stop >"$WORK/demo.log" 2>&1 || fail "$(<"$WORK/demo.log")"
-    nothing_runs || fail 'a server of the demo still runs'
+    eventually nothing_runs
     echo 'ok'
 }
 
