@@ -14,7 +14,7 @@ use crate::support::http::PASSWORD;
 use crate::support::{Builder, Client, Webots, arm, demo_server};
 
 /// Seconds in which a viewer connects on a busy machine, too.
-const ARRIVAL: f64 = 6.0;
+const ARRIVAL: f64 = 12.0;
 
 /// A server that waits this many seconds for viewers of its streams.
 fn server(streaming: &str, arrival: f64) -> Builder {

@@ -39,7 +39,7 @@ async fn a_fetch_that_hangs_delays_only_new_commits_of_its_repository() {
         "case \"$*\" in *fetch*+{slow}:*) while echo 'halted: 50%' >&2; do sleep 0.2; done;; esac"
     ));
     let builder = simulation_server(&webots.path(), forge.path(), 5).env("PATH", &wrapper.path());
-    let server = builder.set("timing.checkout", 18).start().await;
+    let server = builder.set("timing.checkout", 40).start().await;
     let ask = async |name: &str, text: &str| {
         is_told(&server, &arm_at(name), &format!("opened [{text}]")).await;
     };
@@ -77,7 +77,7 @@ async fn a_fetch_that_hangs_delays_only_new_commits_of_its_repository() {
     // The fetch ends at its time limit, for all clients that wait for it.
     let told = heir.until("loading: Error:").await;
     assert!(
-        told.ends_with("Fetching https://github.com/lab/arm took longer than 18 seconds"),
+        told.ends_with("Fetching https://github.com/lab/arm took longer than 40 seconds"),
         "{told}"
     );
     let told = next.until("loading: Error:").await;

@@ -35,7 +35,7 @@ async fn a_client_that_leaves_in_any_way_leaves_nothing_behind() {
     for state in &ALL[..6] {
         for way in ["closes", "breaks", "is half open"] {
             // An unpolled client answers no pings, but its connection stays open.
-            let silence = if way == "is half open" { 1.5 } else { 60.0 };
+            let silence = if way == "is half open" { 4.0 } else { 60.0 };
             let change = |builder| quick(builder).set("timing.ping", 0.1).set("timing.silence", silence);
             let mut scene = Scene::new(state, change).await;
             let mut left = Instant::now();

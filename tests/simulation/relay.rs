@@ -288,7 +288,7 @@ async fn streams_that_nobody_reads_are_few_and_pin_little_memory() {
         let frame = Message::binary(vec![0; 1 << 20]);
         while actix_rt::time::timeout(Duration::from_millis(500), flood.send(frame.clone()))
             .await
-            .is_ok()
+            .is_ok_and(|sent| sent.is_ok())
         {}
         streams.push((viewer, flood));
     }
@@ -320,7 +320,7 @@ async fn streams_that_nobody_reads_are_few_and_pin_little_memory() {
 
 #[actix_rt::test]
 async fn nothing_is_kept_of_a_stream_whose_client_does_not_close_it() {
-    let played = Played::new(|builder| builder.set("timing.ping", 1).set("timing.silence", 2)).await;
+    let played = Played::new(|builder| builder.set("timing.ping", 1).set("timing.silence", 6)).await;
     let (client, path) = start(&played.server).await;
     let files = || {
         std::fs::read_dir(format!("/proc/{}/fd", played.server.pid()))
@@ -333,7 +333,7 @@ async fn nothing_is_kept_of_a_stream_whose_client_does_not_close_it() {
     let frame = Message::binary(vec![0; 1 << 20]);
     while actix_rt::time::timeout(Duration::from_millis(500), flood.send(frame.clone()))
         .await
-        .is_ok()
+        .is_ok_and(|sent| sent.is_ok())
     {}
     let before = files();
     drop((webots, flood));
@@ -445,7 +445,7 @@ async fn a_viewer_that_has_vanished_is_noticed_though_nothing_is_sent() {
     let Some(network) = Network::hide_from_others() else {
         return skip("packets can't be filtered");
     };
-    let played = Played::new(|builder| builder.set("timing.ping", 1).set("timing.silence", 2)).await;
+    let played = Played::new(|builder| builder.set("timing.ping", 1).set("timing.silence", 6)).await;
     let (_client, path) = start(&played.server).await;
     let (viewer, mut webots) = played.connect(&path).await;
     let MaybeTlsStream::Plain(tcp) = viewer.get_ref() else {

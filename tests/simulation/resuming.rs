@@ -191,14 +191,14 @@ async fn a_checkout_ends_with_its_simulation_although_its_client_may_come_back()
 
 #[actix_rt::test]
 async fn a_client_that_waits_gets_the_slot_of_one_that_is_away_for_long() {
-    let server = quick(demo_server(2)).set("timing.yieldAfter", 2.0).start().await;
+    let server = quick(demo_server(2)).set("timing.yieldAfter", 6.0).start().await;
     let (away, token) = Client::resumable(&server).await;
     drop(away);
     server.until_away(1).await;
     let since = Instant::now();
     // Another slot is free: nobody has to leave.
     let second = Client::ready(&server).await;
-    while since.elapsed() < Duration::from_secs(4) {
+    while since.elapsed() < Duration::from_secs(8) {
         actix_rt::time::sleep(Duration::from_millis(100)).await;
         assert_eq!(server.simulations().await.len(), 2);
     }
@@ -364,7 +364,7 @@ async fn who_comes_back_too_late_hears_why_it_has_ended() {
 
 #[actix_rt::test]
 async fn a_server_that_drains_waits_for_who_is_away() {
-    let mut server = quick(demo_server(4)).set("timing.absence", 4.0).start().await;
+    let mut server = quick(demo_server(4)).set("timing.absence", 10.0).start().await;
     let (stays, _) = Client::resumable(&server).await;
     let (comes, token) = Client::resumable(&server).await;
     drop((stays, comes));

@@ -56,7 +56,7 @@ use std::time::{Duration, Instant};
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
 
 /// Timeout for what should happen soon. Far more than necessary, because the machine may be busy.
-pub const SOON: Duration = Duration::from_secs(20);
+pub const SOON: Duration = Duration::from_mins(1);
 
 /// Whether a program that a test needs is installed, see `needs`.
 pub fn is_there(program: &str) -> bool {

@@ -60,7 +60,7 @@ pub fn simulation_server(webots: &Path, repositories: &Path, places: u16) -> Bui
         "webots": webots, "maxConnections": places, "allowedRepositories": ["https://github.com/lab"],
         "gitMirrors": {"https://github.com/": format!("file:{}", repositories.display())},
         // Most tests don't open the stream of a simulation that they keep.
-        "timing": {"arrival": 0},
+        "timing": {"arrival": 0, "silence": 300},
         // The demo simulator may be in a home, which sandboxes hide.
         "environment": ["DEMO_SIMULATOR_BIND"], "sandbox": {"readable": [env!("CARGO_BIN_EXE_demo-simulator")]},
     });
