@@ -96,17 +96,15 @@ class Administrator(BrowserTest):
         teacher.tab.get_by_label("Text for all open viewers").fill(text)
         teacher.tab.get_by_role("button", name="Announce").click()
         # Characters of markup are replaced, so that no page can interpret the text as markup.
-        expect(viewer.tab.locator("#announcement")).to_have_text(
-            text.replace("<", "\u2039").replace(">", "\u203a"), timeout=2000
-        )
-        expect(stranger.tab.locator("#announcement")).to_contain_text(text, timeout=3000)
+        expect(viewer.tab.locator("#announcement")).to_have_text(text.replace("<", "\u2039").replace(">", "\u203a"))
+        expect(stranger.tab.locator("#announcement")).to_contain_text(text)
         for page in (viewer, stranger):
             self.assertEqual(page.tab.locator("#announcement b").count(), 0)
             self.assertEqual(page.faults(), [])
         late = self.open(self.fleet.session.url("viewer"))
         expect(late.tab.locator("#announcement")).to_contain_text("Maintenance")
         teacher.tab.get_by_role("button", name="End it").click()
-        expect(viewer.tab.locator("#announcement")).to_be_hidden(timeout=2000)
+        expect(viewer.tab.locator("#announcement")).to_be_hidden()
         expect(stranger.tab.locator("#announcement")).to_have_text("")
 
     def test_the_labels_of_the_charts_stay_while_the_page_lives(self):

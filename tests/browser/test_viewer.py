@@ -66,12 +66,12 @@ class Viewing(BrowserTest):
         with self.fleet.session.hanging():
             page.tab.get_by_label("URL of a world").fill("https://github.com/stranger/worlds/blob/main/worlds/a.wbt")
             connect.click()
-            expect(page.tab.locator("#problem-text")).to_contain_text("does not answer", timeout=20_000)
+            expect(page.tab.locator("#problem-text")).to_contain_text("does not answer")
             expect(connect).to_be_enabled()
         # The refusal of the first world arrives now, before the answer to this one.
         page.tab.get_by_role("button", name="Playground").click()
         connect.click()
-        expect(page.tab.locator("[data-step=simulation].done")).to_be_visible(timeout=20_000)
+        expect(page.tab.locator("[data-step=simulation].done")).to_be_visible()
         expect(page.tab.locator("#problem")).to_be_hidden()
 
     def test_the_scene_is_requested_once_by_the_kind_that_the_server_tells(self):
