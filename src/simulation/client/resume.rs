@@ -4,7 +4,7 @@ use actix::prelude::*;
 use futures_util::stream::{self, StreamExt};
 
 use super::session::{
-    Attachment, Client, Comeback, LaunchedSimulation, ReadySimulation, Session, State, seconds_until,
+    Absence, Attachment, Client, Comeback, LaunchedSimulation, ReadySimulation, Session, State, seconds_until,
 };
 use crate::shared::domain::Failure;
 use crate::shared::run::seconds_since_1970;
@@ -15,18 +15,22 @@ use crate::simulation::protocol;
 impl Session {
     /// Waits for a client that may return; ends the session if it can't be resumed.
     pub(super) fn await_client(&mut self, ctx: &mut Context<Self>) {
-        let Comeback::With(_) = self.comeback else {
-            return self.leave(StopReason::Left, ctx);
+        let (peer, token) = match self.client {
+            Client::Connected(Attachment {
+                peer,
+                comeback: Comeback::With(token),
+                ..
+            }) => (peer, token),
+            Client::Away(_) => return,
+            Client::Connected(_) | Client::Expected(_) => return self.leave(StopReason::Left, ctx),
         };
-        if let Client::Away(_) = self.client {
-            return;
-        }
         let absence = self.server.config.timing.absence;
         if !matches!(self.state, State::Over(_)) {
             log::info!("{}: away; it may come back within {} s", self.name(), absence.as_secs());
             self.show_away(Some(seconds_since_1970() + absence.as_secs()));
         }
-        self.client = Client::Away(ctx.run_later(absence, |this, ctx| this.leave(StopReason::Away, ctx)));
+        let timer = ctx.run_later(absence, |this, ctx| this.leave(StopReason::Away, ctx));
+        self.client = Client::Away(Absence { peer, token, timer });
     }
 
     fn show_away(&self, until: Option<u64>) {
@@ -34,14 +38,18 @@ impl Session {
     }
 
     /// Attaches a connection to a session.
-    pub(super) fn attached(connection: Connection, ctx: &mut Context<Self>) -> Attachment {
+    pub(super) fn attached(connection: Connection, comeback: Comeback, ctx: &mut Context<Self>) -> Attachment {
         let Connection {
-            client, mut actions, ..
+            peer,
+            client,
+            mut actions,
         } = connection;
         let actions = stream::poll_fn(move |context| actions.poll_recv(context));
         let (actions, handle) = stream::abortable(actions.chain(stream::iter([ClientAction::Disconnect])));
         ctx.add_stream(actions);
         Attachment {
+            peer,
+            comeback,
             client,
             actions: handle,
         }
@@ -61,18 +69,30 @@ impl Session {
 
     /// Sends the client the token with which it may come back, if it has one.
     pub(super) fn offer_comeback(&self) {
-        if let Comeback::With(token) = &self.comeback {
+        if let Some(token) = self.token() {
             self.text(protocol::absence(self.server.config.timing.absence.as_secs()));
-            self.text(protocol::resume(token));
+            self.text(protocol::resume(&token));
+        }
+    }
+
+    /// The token with which the client comes back, if it has one.
+    fn token(&self) -> Option<Token> {
+        match self.client {
+            Client::Connected(Attachment {
+                comeback: Comeback::With(token),
+                ..
+            })
+            | Client::Away(Absence { token, .. }) => Some(token),
+            Client::Connected(_) | Client::Expected(_) => None,
         }
     }
 
     /// Why a client with this token may not return; `None` if it may.
     fn refusal(&self, token: Token) -> Option<Failure> {
-        match (self.comeback, &self.state) {
-            (Comeback::With(last), State::Over(failure)) if last == token => Some(protocol::ended(Some(failure))),
-            (Comeback::With(last), _) if last == token => None,
-            _ => Some(protocol::taken_over()),
+        match &self.state {
+            _ if self.token() != Some(token) => Some(protocol::taken_over()),
+            State::Over(failure) => Some(protocol::ended(Some(failure))),
+            _ => None,
         }
     }
 
@@ -84,14 +104,14 @@ impl Session {
                 self.offer_comeback();
                 self.texts(ahead.iter().copied().flat_map(protocol::queue));
             }
-            State::CheckingOut { .. } => {
+            State::CheckingOut { progress, .. } => {
                 self.offer_comeback();
-                self.texts(self.progress.iter().flatten().cloned());
+                self.texts(progress.iter().flatten().cloned());
             }
-            State::Launching(launched) => {
+            State::Launching { launched, progress } => {
                 self.offer_comeback();
                 self.tell_launched(launched);
-                self.texts(self.progress.iter().flatten().cloned());
+                self.texts(progress.iter().cloned());
             }
             State::Ready(ready) => {
                 self.tell_launched(&ready.launched);
@@ -127,17 +147,15 @@ impl Handler<Resume> for Session {
             return connection.client.do_send(ToClient::Close(refusal));
         }
         log::info!("{}: goes on as client {peer}", self.name());
-        self.peer = Some(peer);
-        let attached = Self::attached(connection, ctx);
+        let attached = Self::attached(connection, Comeback::With(token.next()), ctx);
         match std::mem::replace(&mut self.client, Client::Connected(attached)) {
             Client::Connected(before) => before.client.do_send(ToClient::Close(protocol::taken_over())),
-            Client::Away(deadline) => {
-                ctx.cancel_future(deadline);
+            Client::Away(Absence { timer, .. }) => {
+                ctx.cancel_future(timer);
             }
             // It has no token before it has a client.
             Client::Expected(_) => {}
         }
-        self.comeback = Comeback::With(token.next());
         self.show_away(None);
         self.await_viewer_again(ctx);
         self.tell_again();

@@ -33,17 +33,10 @@ pub struct Session {
     pub(super) server: Arc<AppState>,
     /// The id of the simulation.
     pub(super) id: SimulationId,
-    /// The address of its last connection; `None` if it is kept ready and never had one.
-    pub(super) peer: Option<Peer>,
     pub(super) client: Client,
     pub(super) state: State,
     /// How its client wants to see it.
     pub(super) view: View,
-    pub(super) comeback: Comeback,
-    /// The last progress of the start, as it was sent, for a client that comes back.
-    pub(super) progress: Option<[String; 2]>,
-    /// Whether a controller is being reset.
-    pub(super) is_resetting: bool,
 }
 
 /// The client of a session.
@@ -52,8 +45,8 @@ pub(super) enum Client {
     Expected(Expected),
     /// It is connected.
     Connected(Attachment),
-    /// It may come back until this timer ends the session.
-    Away(SpawnHandle),
+    /// It may come back.
+    Away(Absence),
 }
 
 /// What a simulation is kept ready for.
@@ -93,6 +86,9 @@ impl Comeback {
 
 /// A connection that is attached to a session. Dropping it detaches the connection at once.
 pub(super) struct Attachment {
+    /// The address of the client.
+    pub(super) peer: Peer,
+    pub(super) comeback: Comeback,
     /// Receives what is for the client.
     pub(super) client: Recipient<ToClient>,
     /// Ends the stream of the client's actions.
@@ -104,6 +100,19 @@ impl Drop for Attachment {
         self.actions.abort();
     }
 }
+
+/// The absence of a client.
+pub(super) struct Absence {
+    /// The address of its last connection.
+    pub(super) peer: Peer,
+    /// With this token it comes back.
+    pub(super) token: Token,
+    /// Ends the session.
+    pub(super) timer: SpawnHandle,
+}
+
+/// The last progress of a start, as it was sent, for a client that comes back.
+pub(super) type SentProgress = [String; 2];
 
 /// The life cycle of a simulation, as its session knows it. Each state holds what exists only in it; dropping a state
 /// releases that.
@@ -119,11 +128,16 @@ pub(super) enum State {
     CheckingOut {
         /// The slot in which the simulation will run.
         slot: Slot,
+        /// `None` before the first step.
+        progress: Option<SentProgress>,
         /// Cancels the checkout when it is dropped.
         _checkout: DropGuard,
     },
     /// Webots was requested, and is not ready.
-    Launching(LaunchedSimulation),
+    Launching {
+        launched: LaunchedSimulation,
+        progress: SentProgress,
+    },
     /// Webots is ready.
     Ready(ReadySimulation),
     /// The simulation has ended, or was not admitted. A client that may come back hears why.
@@ -141,6 +155,8 @@ pub(super) struct LaunchedSimulation {
     pub(super) texts: Vec<String>,
     /// When its time limit has begun: with the start of Webots, or with its client.
     pub(super) started: Option<Instant>,
+    /// Whether a controller is being reset.
+    pub(super) is_resetting: bool,
 }
 
 /// A simulation whose Webots is ready.
@@ -191,7 +207,14 @@ impl State {
 
     pub(super) fn launched(&self) -> Option<&LaunchedSimulation> {
         match self {
-            Self::Launching(launched) | Self::Ready(ReadySimulation { launched, .. }) => Some(launched),
+            Self::Launching { launched, .. } | Self::Ready(ReadySimulation { launched, .. }) => Some(launched),
+            Self::Waiting { .. } | Self::CheckingOut { .. } | Self::Over(_) => None,
+        }
+    }
+
+    pub(super) fn launched_mut(&mut self) -> Option<&mut LaunchedSimulation> {
+        match self {
+            Self::Launching { launched, .. } | Self::Ready(ReadySimulation { launched, .. }) => Some(launched),
             Self::Waiting { .. } | Self::CheckingOut { .. } | Self::Over(_) => None,
         }
     }
@@ -267,15 +290,11 @@ impl Session {
                 Err(failure) => State::Over(failure),
             };
             let mut session = Self {
-                comeback: Comeback::asked(resumable),
-                progress: None,
                 server,
                 id,
-                peer: Some(peer),
-                client: Client::Connected(Self::attached(connection, ctx)),
+                client: Client::Connected(Self::attached(connection, Comeback::asked(resumable), ctx)),
                 state,
                 view,
-                is_resetting: false,
             };
             session.text(protocol::simulation_id(id));
             if let State::Over(failure) = &session.state {
@@ -291,10 +310,23 @@ impl Session {
     }
 
     pub(super) fn name(&self) -> String {
-        match self.peer {
+        match self.peer() {
             Some(peer) => format!("{}: client {peer}", self.id),
             None => format!("{}: kept ready", self.id),
         }
+    }
+
+    /// The address of the client's last connection; `None` before it has a client.
+    pub(super) fn peer(&self) -> Option<Peer> {
+        match &self.client {
+            Client::Expected(_) => None,
+            Client::Connected(Attachment { peer, .. }) | Client::Away(Absence { peer, .. }) => Some(*peer),
+        }
+    }
+
+    /// Whether a client has taken the simulation, be it away or not.
+    pub(super) fn has_client(&self) -> bool {
+        !matches!(self.client, Client::Expected(_))
     }
 
     fn send(&self, message: ToClient) {
@@ -346,7 +378,10 @@ impl Session {
         match &self.state {
             State::Waiting { position, .. } => position.end(Failure::from(reason)),
             State::CheckingOut { slot, .. } => slot.end(Failure::from(reason)),
-            State::Launching(LaunchedSimulation { webots, .. })
+            State::Launching {
+                launched: LaunchedSimulation { webots, .. },
+                ..
+            }
             | State::Ready(ReadySimulation {
                 launched: LaunchedSimulation { webots, .. },
                 ..
@@ -364,17 +399,20 @@ impl Session {
     }
 
     fn reset_controller(&mut self, file: String, ctx: &mut Context<Self>) {
-        let Some(project) = self.state.launched().and_then(|launched| launched.project.upgrade()) else {
+        let launched = self.state.launched_mut();
+        let Some((launched, project)) = launched.and_then(|it| it.project.upgrade().map(|project| (it, project)))
+        else {
             return self.texts(protocol::failure(&protocol::nothing_to_reset()));
         };
-        if self.is_resetting {
+        if std::mem::replace(&mut launched.is_resetting, true) {
             return log::info!("{}: a controller is being reset already", self.name());
         }
-        self.is_resetting = true;
         let checkouts = Arc::clone(&self.server.checkouts);
         let restored = async move { checkouts.restore_controller(&project, &file).await.map(|()| file) };
         let restored = restored.into_actor(self).map(|restored, this, _| {
-            this.is_resetting = false;
+            if let Some(launched) = this.state.launched_mut() {
+                launched.is_resetting = false;
+            }
             match restored {
                 Ok(file) => this.text(protocol::reset_controller(&file)),
                 // This error does not end the simulation.
@@ -386,7 +424,7 @@ impl Session {
 
     fn become_ready(&mut self, port: u16, url: String, ctx: &mut Context<Self>) {
         let launched = match std::mem::replace(&mut self.state, State::lost()) {
-            State::Launching(launched) => launched,
+            State::Launching { launched, .. } => launched,
             // It has ended meanwhile.
             other => return self.state = other,
         };
@@ -420,8 +458,12 @@ impl Session {
 
     /// Lets the client come back from now on, if it may and has no token yet.
     pub(super) fn issue_token(&mut self, ctx: &mut Context<Self>) {
-        if let Comeback::OnceReady = self.comeback {
-            self.comeback = Comeback::With(self.server.sessions.register(ctx.address().recipient()));
+        if let Client::Connected(Attachment {
+            comeback: comeback @ Comeback::OnceReady,
+            ..
+        }) = &mut self.client
+        {
+            *comeback = Comeback::With(self.server.sessions.register(ctx.address().recipient()));
             let absence = self.server.config.timing.absence.as_secs();
             // While Webots is busy it sends nothing, and its client would assume a lost connection.
             ctx.run_interval(SIGN_OF_LIFE, move |this, _| this.hint(protocol::absence(absence)));
@@ -434,13 +476,17 @@ impl Session {
         for text in &texts {
             self.hint(text.clone());
         }
-        self.progress = Some(texts);
+        match &mut self.state {
+            State::CheckingOut { progress, .. } => *progress = Some(texts),
+            State::Launching { progress, .. } => *progress = texts,
+            State::Waiting { .. } | State::Ready(_) | State::Over(_) => {}
+        }
     }
 
     fn exited(&mut self, failure: Failure, ctx: &mut Context<Self>) {
         match self.state {
             State::Ready(_) => self.finish(failure, ctx),
-            State::Launching(_) => self.fail(failure, ctx),
+            State::Launching { .. } => self.fail(failure, ctx),
             // The session has ended it; the client knows why.
             State::Over(_) | State::Waiting { .. } | State::CheckingOut { .. } => {}
         }
@@ -532,13 +578,13 @@ impl Handler<WebotsEvent> for Session {
             WebotsEvent::Progress(progress) => self.show_progress(&progress),
             WebotsEvent::Text(text) => {
                 let text = protocol::of_project(&text);
-                if let State::Launching(launched) = &mut self.state {
+                if let State::Launching { launched, .. } = &mut self.state {
                     launched.texts.push(text.clone());
                 }
                 self.text(text);
             }
             WebotsEvent::Started(at) => {
-                if let State::Launching(launched) = &mut self.state {
+                if let State::Launching { launched, .. } = &mut self.state {
                     launched.started = Some(at);
                 }
                 self.text(protocol::shutdown_timeout(self.server.config.timeout));

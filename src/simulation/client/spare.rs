@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use actix::prelude::*;
 
-use super::session::{Client, Comeback, Expected, ReadySimulation, Session, SpareEvent, State};
+use super::session::{Client, Comeback, Expected, Session, SpareEvent, State};
 use crate::shared::domain::{Failure, Reason, ReservationId};
 use crate::simulation::attachment::NewClient;
 use crate::simulation::checkout::Tip;
@@ -31,13 +31,9 @@ impl Session {
             let mut session = Self {
                 server,
                 id,
-                peer: None,
                 view: kind.view,
                 client: Client::Expected(Expected { kind, keeper }),
                 state: State::lost(),
-                comeback: Comeback::Never,
-                progress: None,
-                is_resetting: false,
             };
             if let Some(slot) = slot {
                 log::info!("{id}: is kept ready with {world}");
@@ -82,15 +78,13 @@ impl Session {
         } = client;
         let peer = connection.peer;
         log::info!("{}: client {peer}: takes it{identity}", self.id);
-        self.peer = Some(peer);
-        self.comeback = Comeback::asked(resumable);
-        self.client = Client::Connected(Self::attached(connection, ctx));
+        self.client = Client::Connected(Self::attached(connection, Comeback::asked(resumable), ctx));
         self.text(protocol::simulation_id(self.id));
         if early {
             self.issue_token(ctx);
             self.offer_comeback();
         }
-        if let State::Launching(launched) | State::Ready(ReadySimulation { launched, .. }) = &mut self.state {
+        if let Some(launched) = self.state.launched_mut() {
             launched.started = Some(Instant::now());
         }
         if let Some(launched) = self.state.launched() {

@@ -7,7 +7,7 @@ use std::time::Instant;
 use actix::prelude::*;
 use tokio_util::sync::CancellationToken;
 
-use super::session::{Client, LaunchedSimulation, Session, State, WebotsHandle};
+use super::session::{LaunchedSimulation, Session, State, WebotsHandle};
 use crate::shared::domain::{Blame, Failure, ProjectUrl, Reason, ReservationId, View};
 use crate::shared::http::Peer;
 use crate::simulation::checkout::{Project, Tip};
@@ -53,8 +53,7 @@ impl Session {
         if let State::Over(_) = self.state {
             return;
         }
-        let has_client = !matches!(self.client, Client::Expected(_));
-        if failure.reason.blame() == Blame::Server && has_client {
+        if failure.reason.blame() == Blame::Server && self.has_client() {
             self.server
                 .failed_starts
                 .add(&format!("{}: {failure} ({})", self.name(), failure.reason));
@@ -70,6 +69,7 @@ impl Session {
         let cancelled = CancellationToken::new();
         self.state = State::CheckingOut {
             slot,
+            progress: None,
             _checkout: cancelled.clone().drop_guard(),
         };
         let me = ctx.address();
@@ -125,9 +125,8 @@ impl Session {
             let event = format!("it gets GPU {}, {}", gpu.index, gpu.name);
             slot.log(log::Level::Info, &event, &event);
         }
-        let texts = protocol::progress(&Progress::new(Step::Launch, "webots is starting"));
-        self.texts(texts.clone());
-        self.progress = Some(texts);
+        let progress = protocol::progress(&Progress::new(Step::Launch, "webots is starting"));
+        self.texts(progress.clone());
         let project = Arc::new(project);
         let project_of_webots = Arc::downgrade(&project);
         let spec = LaunchSpec {
@@ -142,19 +141,23 @@ impl Session {
             view: self.view,
             gpu,
             slot,
-            address: self.peer.and_then(Peer::rate_limit_key),
-            is_spare: matches!(self.client, Client::Expected(_)),
+            address: self.peer().and_then(Peer::rate_limit_key),
             events: ctx.address().recipient(),
         };
         let thread = self.server.webots_thread(spec.slot.port);
-        let webots = Webots::start_in_arbiter(thread, |ctx| Webots::create(spec, ctx));
-        self.state = State::Launching(LaunchedSimulation {
-            webots: WebotsHandle(webots),
-            project: project_of_webots,
-            scene,
-            texts: Vec::new(),
-            started: None,
-        });
+        let has_client = self.has_client();
+        let webots = Webots::start_in_arbiter(thread, move |ctx| Webots::create(spec, has_client, ctx));
+        self.state = State::Launching {
+            launched: LaunchedSimulation {
+                webots: WebotsHandle(webots),
+                project: project_of_webots,
+                scene,
+                texts: Vec::new(),
+                started: None,
+                is_resetting: false,
+            },
+            progress,
+        };
     }
 
     /// Assigns a GPU to a simulation, if simulations are spread over GPUs and one answers.

@@ -431,7 +431,9 @@ impl SimulationRecord {
 
     /// Grants it a port, if it waits for one.
     pub(super) fn lend(&mut self, port: u16) {
-        let Some(client) = self.waiting().cloned() else { return };
+        let Some(client) = self.waiting().cloned() else {
+            return self.refuse("a slot");
+        };
         self.standing = Standing::Holding(Holding {
             port,
             runs_for: RunsFor::Client(Served {
@@ -453,7 +455,9 @@ impl SimulationRecord {
     /// A client takes it, which was kept ready. Its time limit begins now.
     pub(super) fn take(&mut self, client: Client, reservation: ReservationId) {
         let now = seconds_since_1970();
-        let Some(holding) = self.holding_mut() else { return };
+        let Some(holding) = self.holding_mut() else {
+            return self.refuse("a client that takes it");
+        };
         if let Run::Launched(launch) = &mut holding.run {
             launch.at = now;
         }
@@ -475,6 +479,8 @@ impl SimulationRecord {
         }) = self.holding_mut()
         {
             *run = Run::Preparing(prepared);
+        } else {
+            self.refuse("a checkout that is done");
         }
     }
 
@@ -490,6 +496,8 @@ impl SimulationRecord {
                 log,
                 phase: Phase::Launching,
             });
+        } else {
+            self.refuse("a launch");
         }
     }
 
@@ -505,6 +513,8 @@ impl SimulationRecord {
         if let Some(phase @ Phase::Launching) = self.phase_mut() {
             *phase = Phase::Ready { stream, is_running };
             self.time.set_running(is_running);
+        } else {
+            self.refuse("a stream");
         }
     }
 
@@ -555,6 +565,11 @@ impl SimulationRecord {
             Phase::Ready { stream, .. } | Phase::Stopping(Some(stream)) => Some(stream),
             Phase::Launching | Phase::Stopping(None) => None,
         }
+    }
+
+    /// The transition is none of its state: its owners, which report each of their steps once and in order, have a fault.
+    fn refuse(&self, what: &str) {
+        log::error!("{}: in the state {:?} it does not expect {what}", self.id, self.stage());
     }
 
     /// Its state, as pages and programs see it.

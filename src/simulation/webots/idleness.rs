@@ -33,7 +33,7 @@ impl Webots {
         }
         let minutes = self.spec.config.idle_timeout;
         let limit = Duration::from_secs_f64(60.0 * minutes);
-        if limit.is_zero() || is_running || self.spec.is_spare {
+        if limit.is_zero() || is_running || !self.has_client {
             return;
         }
         let notice = NOTICE.min(limit / 2);

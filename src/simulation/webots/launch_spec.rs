@@ -45,8 +45,6 @@ pub struct LaunchSpec {
     pub slot: Slot,
     /// The address of its client, which has a share of the builders of images.
     pub address: Option<IpAddr>,
-    /// Whether it is kept ready, and has no client yet.
-    pub is_spare: bool,
     /// Receives the events.
     pub events: Recipient<WebotsEvent>,
 }

@@ -36,6 +36,8 @@ pub struct HasClient;
 /// The actor.
 pub struct Webots {
     pub(super) spec: LaunchSpec,
+    /// Whether it has had a client; it is kept ready otherwise.
+    pub(super) has_client: bool,
     pub(super) state: State,
 }
 
@@ -111,7 +113,7 @@ impl State {
 
 impl Webots {
     /// Creates the actor, and prepares the containers of this Webots, if it has any; then it is launched.
-    pub fn create(spec: LaunchSpec, ctx: &mut Context<Self>) -> Self {
+    pub fn create(spec: LaunchSpec, has_client: bool, ctx: &mut Context<Self>) -> Self {
         let containers = spec.containers.clone();
         let session = spec.events.clone();
         let request = spec.request();
@@ -128,6 +130,7 @@ impl Webots {
         });
         Self {
             spec,
+            has_client,
             state: State::Preparing(ctx.spawn(job)),
         }
     }
@@ -160,7 +163,7 @@ impl Webots {
             self.follow_startup(ctx);
         }
         ctx.run_later(self.spec.config.timing.launch, Self::check_launch);
-        if !self.spec.is_spare {
+        if self.has_client {
             self.limit_time(ctx);
         }
     }
@@ -290,7 +293,7 @@ impl Webots {
         if failure.reason.blame() == Blame::User || failure.reason == Reason::ServerStopped {
             self.spec.slot.ending(&failure.message);
         }
-        if is_excess || self.spec.is_spare {
+        if is_excess || !self.has_client {
             drop(group);
         } else {
             group.terminate();
@@ -443,7 +446,7 @@ impl Handler<HasClient> for Webots {
     type Result = ();
 
     fn handle(&mut self, _: HasClient, ctx: &mut Self::Context) {
-        self.spec.is_spare = false;
+        self.has_client = true;
         if self.state.process().is_some() {
             self.limit_time(ctx);
         }
