@@ -3,6 +3,7 @@
 import os
 import pathlib
 import re
+import signal
 import subprocess
 import sys
 import tempfile
@@ -224,6 +225,26 @@ class PrintedPages(Embedding):
         end = tab.evaluate("window.end")
         self.assertEqual((end["code"], end["blame"], end["retry"]), ("world-not-found", "user", "no"))
         expect(tab.locator("#told")).to_contain_text("missing.wbt")
+
+    def test_a_page_goes_on_by_the_code_of_an_end(self):
+        page = self.visit("codes", printed("A page").replace("</html>", printed("How it ends")))
+        tab = page.tab
+        tab.evaluate("window.ready = 0; robot.addEventListener('ready', () => { ready += 1; })")
+        expect(tab.locator("#availability.on")).to_be_visible()
+        tab.get_by_role("button", name="Connect").click()
+        for number in (1, 2, 3):
+            tab.wait_for_function("number => window.ready === number", arg=number)
+            (one,) = self.simulations()
+            os.kill(one["pid"], signal.SIGKILL)
+        # Not for ever.
+        expect(tab.locator("#told")).to_contain_text("SIGKILL")
+        expect(tab.locator("#problem")).to_be_visible()
+        until("nothing runs", lambda: not self.simulations())
+        tab.get_by_role("button", name="Connect").click()
+        expect(tab.locator(SHOWN)).to_be_visible()
+        tab.get_by_role("button", name="Disconnect").click()
+        expect(tab.locator("#told")).to_have_text("What did the robot do? Please write it down.")
+        until("it is gone", lambda: not self.simulations())
 
     def test_two_elements_are_two_simulations_and_the_removal_of_one_ends_it(self):
         page = self.visit("race", printed("Two simulations"))
