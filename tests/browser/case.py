@@ -1,10 +1,13 @@
 """The base of all browser tests: one fleet per class, one browser per file; logs are printed if a test fails."""
 
+import base64
+import json
 import pathlib
 import shutil
 import sys
 import tempfile
 import unittest
+import urllib.request
 
 from browser import Browser
 from fleet import BIN, SOON, Fleet, until
@@ -112,6 +115,25 @@ def seconds(page):
     """The simulated time that the page shows, in seconds."""
     minutes, rest = page.tab.locator("#clock").inner_text().split(":")
     return 60 * int(minutes) + float(rest)
+
+
+class Administered(BrowserTest):
+    """Tests with an administrator, whose password the servers have as `adminPassword`."""
+
+    password = "a secret"
+
+    def ask(self, server, path, **options):
+        """The answer to a request of the administrator."""
+        credentials = base64.b64encode(f"admin:{self.password}".encode()).decode()
+        headers = {"Authorization": f"Basic {credentials}", "Content-Type": "application/json"}
+        with urllib.request.urlopen(urllib.request.Request(server.url(path), headers=headers, **options)) as answer:
+            return answer.read().decode()
+
+    def act(self, server, path, body=None):
+        self.ask(server, path, data=b"" if body is None else json.dumps(body).encode(), method="POST")
+
+    def simulations(self, server):
+        return json.loads(self.ask(server, "status"))["simulations"]
 
 
 class Running(BrowserTest):

@@ -3,12 +3,15 @@
     resources/web/wwi/   the viewer, as Webots' sources have it: WebotsView.js, wrenjs.js, wrenjs.wasm, wrenjs.data ...
     project/             worlds/NAME.wbt, preview/scene.x3d or scene.w3d, preview/animation.json
 
-What scenes load from other sites is replaced: textures by one of a single colour, so that no test needs the internet.
+The viewer may be of R2023b or later; it knows solids as `<Solid>`, which exports of before R2023b have as
+`<Transform type='solid'>`. What scenes load from other sites is replaced: textures by one of a single colour,
+so that no test needs the internet.
 """
 
 import json
 import os
 import pathlib
+import re
 import shutil
 import struct
 import zlib
@@ -20,21 +23,30 @@ PARTS = pathlib.Path(os.environ.get("WEBOTS_REAL_PARTS", "/nonexistent"))
 # In seconds: without a GPU the engine is slow.
 PATIENCE = 5 * SOON
 MISSING = "WEBOTS_REAL_PARTS names no folder with Webots' viewer and an export, see tests/browser/real.py"
+
+
+def release():
+    """The release of the viewer, which its component names in the addresses of its files."""
+    component = PARTS / "resources/web/wwi/WebotsView.js"
+    return re.search("/wwi/(R[0-9]+[ab])/", component.read_text())[1] if component.exists() else None
+
+
+RELEASE = release()
 # Where Webots' viewer loads its own files from; the page that draws an export from its files is there too.
-SITE = "https://cyberbotics.com/wwi/R2025a/"
-PAGE = f"""<!doctype html><meta charset="utf-8">
-<style>html, body, webots-view {{ margin: 0; width: 100%; height: 100%; display: block; overflow: hidden; }}</style>
-<script type="module" src="{SITE}WebotsView.js"></script>
-<webots-view data-scene="{SITE}export/scene" data-animation="{SITE}export/animation.json" data-autoplay="false">
-</webots-view>"""
+SITE = f"https://cyberbotics.com/wwi/{RELEASE}/"
+FILES = f'data-scene="{SITE}export/scene" data-animation="{SITE}export/animation.json" data-autoplay="false"'
+# How it tells an abnormal end of a stream.
+CRASH = "Streaming server error"
 TYPES = {".js": "text/javascript", ".css": "text/css", ".wasm": "application/wasm", ".svg": "image/svg+xml"}
 FREE = {"Access-Control-Allow-Origin": "*"}
+# The scene of a viewer; its name has changed with R2025a.
+SCENE = "(({ w3dScene, x3dScene }) => w3dScene ?? x3dScene)(document.querySelector('webots-view')._view)"
 # Draws the scene and returns the picture in the same turn: later the browser has discarded it.
-DRAW = """() => {
-    const { w3dScene } = document.querySelector('webots-view')._view;
-    w3dScene.renderer.render();
-    return w3dScene.domElement.querySelector('canvas').toDataURL();
-}"""
+DRAW = f"""() => {{
+    const scene = {SCENE};
+    scene.renderer.render();
+    return scene.domElement.querySelector('canvas').toDataURL();
+}}"""
 # The share of pixels that two pictures have in common, and of those of the first that differ from its first pixel.
 COMPARE = """async pictures => {
     const [one, other] = await Promise.all(pictures.map(async picture => {
@@ -56,6 +68,14 @@ COMPARE = """async pictures => {
 }"""
 
 
+def page(attributes):
+    """A page with the viewer alone, which has these attributes."""
+    return f"""<!doctype html><meta charset="utf-8">
+<style>html, body, webots-view {{ margin: 0; width: 100%; height: 100%; display: block; overflow: hidden; }}</style>
+<script type="module" src="{SITE}WebotsView.js"></script>
+<webots-view {attributes}></webots-view>"""
+
+
 def exported():
     """The scene of the export."""
     folder = PARTS / "project/preview"
@@ -63,7 +83,7 @@ def exported():
 
 
 def is_there():
-    return (PARTS / "resources/web/wwi/WebotsView.js").exists() and exported() is not None
+    return RELEASE is not None and exported() is not None
 
 
 def world():
@@ -102,7 +122,7 @@ def answer(route):
     name = url.removeprefix(SITE)
     file = PARTS / "resources/web/wwi" / name
     if url == f"{SITE}files.html":
-        route.fulfill(body=PAGE, content_type="text/html")
+        route.fulfill(body=page(FILES), content_type="text/html")
     elif name == "export/scene":
         route.fulfill(path=exported(), headers=FREE, content_type="text/plain")
     elif name == "export/animation.json":
@@ -122,6 +142,9 @@ class Real:
 
     def _project(self, work):
         shutil.copytree(PARTS / "project", work, ignore=shutil.ignore_patterns(".git"))
+        # A Webots streams only to a viewer of its own kind, and a project's world may be for an older Webots.
+        for file in (pathlib.Path(work) / "worlds").glob("*.wbt"):
+            file.write_text(re.sub("^#VRML_SIM R[0-9]+[ab]", f"#VRML_SIM {RELEASE}", file.read_text()))
 
 
 class RealFleet(Real, Fleet):

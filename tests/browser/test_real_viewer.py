@@ -1,4 +1,5 @@
-"""Webots' own viewer draws an export of Webots that the demo simulator streams, as it draws it from its files."""
+"""Webots' own viewer draws an export of Webots that the demo simulator streams, as it draws it from its files, and
+takes each end of a simulation as what it is."""
 
 import os
 import re
@@ -6,9 +7,10 @@ import signal
 import unittest
 
 import real
-from case import BrowserTest
+from case import Administered, BrowserTest
 from fleet import WORLD, until
 from playwright.sync_api import expect
+from site_of_others import Site
 
 # Pictures of one scene differ a little: ambient occlusion is noise that is averaged over several frames.
 SAME = 0.985
@@ -152,6 +154,97 @@ class BehindApache(BehindWebServer, BrowserTest):
 @unittest.skipUnless(real.is_there(), real.MISSING)
 class BehindNginx(BehindWebServer, BrowserTest):
     program = "nginx"
+
+
+class Ending(Administered):
+    """Simulations end while the viewer alone shows them, without a page of the fleet, as it was made for.
+
+    The streams are relayed: only then the server chooses the code with which they close.
+    """
+
+    @classmethod
+    def setUpClass(cls):
+        super().setUpClass()
+        cls.site = cls.enterClassContext(Site(cls.fleet))
+
+    @classmethod
+    def make_fleet(cls):
+        keys = {**RealViewer.keys, "streaming": "relay", "adminPassword": cls.password}
+        return real.RealFleet(simulation={**keys, **cls.simulation})
+
+    def keeps_to_the_rules(self, _):
+        """The page is not ours."""
+
+    def walk(self):
+        """A page whose robot drives, its simulation server, and the simulation."""
+        page = self.open("about:blank", width=320, height=240)
+        page.context.set_default_timeout(1000 * real.PATIENCE)
+        page.context.route(re.compile("^https://"), real.answer)
+        page.dialogs = []
+        page.tab.on("dialog", lambda dialog: (page.dialogs.append(dialog.message), dialog.dismiss()))
+        address = self.fleet.session.url(f"session?url={WORLD.format(real.world())}")
+        page.tab.goto(self.site.put("viewer", real.page(f'data-server="{address}"')))
+        page.tab.wait_for_selector("#play-button", state="attached")
+        page.tab.evaluate(
+            "document.querySelector('webots-view')._view.stream.socket.addEventListener('close', ({ code }) => {"
+            "window.code = code; })"
+        )
+        self.press(page)
+        page.tab.wait_for_function("document.querySelector('webots-view')._view.time > 500")
+        servers = [server for server in (self.fleet.simulation, self.fleet.other) if server.process.poll() is None]
+        ((server, simulation),) = [(server, one) for server in servers for one in self.simulations(server)]
+        return page, server, simulation
+
+    def press(self, page):
+        page.tab.locator("#play-button").dispatch_event("click")
+
+    def code(self, page):
+        """The code with which the page's stream closes; its dialogs until then are in `page.dialogs`."""
+        return page.tab.wait_for_function("window.code", timeout=400_000).json_value()
+
+
+@unittest.skipUnless(real.is_there(), real.MISSING)
+class Ends(Ending):
+    # Half a minute.
+    simulation = {"idleTimeout": 0.5}
+
+    def test_an_administrator_stops_it(self):
+        page, server, simulation = self.walk()
+        self.act(server, f"simulations/{simulation['id']}/stop", {"reason": "The lesson is over"})
+        self.assertEqual((self.code(page), page.dialogs), (1000, []))
+
+    def test_it_is_paused_for_too_long(self):
+        page, _, _ = self.walk()
+        self.press(page)
+        self.assertEqual((self.code(page), page.dialogs), (1000, []))
+
+    def test_its_server_is_drained_and_stops(self):
+        page, server, simulation = self.walk()
+        self.act(server, "drain")
+        until("the server is full", lambda: server.get("load") == "100")
+        self.assertEqual([one["id"] for one in self.simulations(server)], [simulation["id"]])
+        server.process.terminate()
+        self.assertEqual((self.code(page), page.dialogs), (1000, []))
+
+    def test_it_crashes(self):
+        page, _, simulation = self.walk()
+        os.kill(simulation["pid"], signal.SIGKILL)
+        self.assertNotEqual(self.code(page), 1000)
+        (question,) = page.dialogs
+        self.assertIn(real.CRASH, question)
+
+
+@unittest.skipUnless(real.is_there(), real.MISSING)
+class TimeLimit(Ending):
+    # The shortest that there is.
+    simulation = {"timeout": 360}
+
+    def test_its_time_is_over(self):
+        page, _, _ = self.walk()
+        self.assertEqual(self.code(page), 1000)
+        # The viewer's own announcement, five minutes before.
+        (announcement,) = page.dialogs
+        self.assertIn("The simulation will be automatically closed in 5 minutes", announcement)
 
 
 if __name__ == "__main__":

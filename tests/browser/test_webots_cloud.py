@@ -1,7 +1,5 @@
 """The pages of webots.cloud in front of a fleet, set up as docs/webots-cloud.md says, with Webots' own viewer."""
 
-import base64
-import json
 import os
 import re
 import signal
@@ -13,21 +11,17 @@ import urllib.request
 
 import real
 import webots_site
-from case import BrowserTest
+from case import Administered
 from door import OneDoor
 from fleet import WORLD, until
 from playwright.sync_api import expect
-
-PASSWORD = "a secret"
-# How Webots' viewer tells an abnormal end of a stream.
-CRASH = "Streaming server error"
 
 
 class Behind(real.Real, OneDoor):
     """A fleet behind one https door, and the site in front of it."""
 
     def __init__(self):
-        super().__init__(places=1, simulation={"adminPassword": PASSWORD}, signs_in=False)
+        super().__init__(places=1, simulation={"adminPassword": Administered.password}, signs_in=False)
         try:
             self.site = webots_site.Site(self.url(""), self.web.authority)
         except BaseException:
@@ -39,7 +33,7 @@ class Behind(real.Real, OneDoor):
         return super().logs() + self.site.logs()
 
 
-class Cloud(BrowserTest):
+class Cloud(Administered):
     # The browser knows the site's name.
     switches = (f"--host-resolver-rules=MAP {webots_site.NAME} 127.0.0.1",)
 
@@ -61,7 +55,7 @@ class Cloud(BrowserTest):
 
     def run_world(self, world):
         url = WORLD.format(world)
-        return self.visit(f"run?version=R2025a&type=demo&url={url}")
+        return self.visit(f"run?version={real.RELEASE}&type=demo&url={url}")
 
     def time(self, page):
         return page.tab.evaluate("document.querySelector('webots-view')?._view?.time ?? -1")
@@ -87,19 +81,6 @@ class Cloud(BrowserTest):
 
     def servers(self):
         return [self.fleet.simulation, self.fleet.other]
-
-    def ask(self, server, path, **options):
-        """The answer to a request of the administrator."""
-        credentials = base64.b64encode(f"admin:{PASSWORD}".encode()).decode()
-        headers = {"Authorization": f"Basic {credentials}", "Content-Type": "application/json"}
-        with urllib.request.urlopen(urllib.request.Request(server.url(path), headers=headers, **options)) as answer:
-            return answer.read().decode()
-
-    def act(self, server, path, body=None):
-        self.ask(server, path, data=b"" if body is None else json.dumps(body).encode(), method="POST")
-
-    def simulations(self, server):
-        return json.loads(self.ask(server, "status"))["simulations"]
 
     def answer(self):
         """The answer of session.php."""
@@ -137,15 +118,15 @@ class Visitors(Cloud):
         until("it has ended", lambda: not self.fleet.simulation.status()["simulations"])
         pages.remove(stopped)
         os.kill(other[0]["pid"], signal.SIGKILL)
-        until("the crash is told", lambda: any(CRASH in said for said in self.said(pages[0])))
-        self.assertFalse(any(CRASH in said for said in self.said(stopped)), stopped.dialogs)
+        until("the crash is told", lambda: any(real.CRASH in said for said in self.said(pages[0])))
+        self.assertFalse(any(real.CRASH in said for said in self.said(stopped)), stopped.dialogs)
 
     def test_the_page_of_a_competition_lets_its_visitors_try(self):
         self.wait_for_places()
         # The site tries a competition on its branch of this name.
         repository = self.fleet.forge / "demo/worlds"
         subprocess.run(["git", "-C", repository, "branch", "--force", "competition", "main"], check=True)
-        page = self.visit(f"run?version=R2025a&type=competition&url={WORLD.format(real.world())}")
+        page = self.visit(f"run?version={real.RELEASE}&type=competition&url={WORLD.format(real.world())}")
         page.tab.locator("#try-competition").click()
         self.runs(page)
         (running,) = [one for server in self.servers() for one in self.simulations(server)]
