@@ -19,8 +19,9 @@ export interface StateDetail {
 /**
  * How a simulation has ended. `code`: a reason of the servers (docs/protocol.md, "Reasons"), or of the element itself:
  * `session-unreachable`, `session-silent`, `server-unreachable`, `server-lost`, `broken-before`, `broken`, `absent`,
- * `simulator-unreachable`, `no-scene`, `origin-refused`. Later versions may add codes. `left`: it was stopped.
- * `message` is for people, in the element's language. `blame`, `retry` and `output` come with reasons of the servers.
+ * `simulator-unreachable`, `no-scene`, `origin-refused`, `left` (it was stopped), `unknown` (the server has told a sentence
+ * without a code). Later versions may add codes. `message` is for people, in the element's language. `blame`, `retry` and
+ * `output` come with reasons of the servers.
  */
 export interface EndedDetail {
   code: string;
@@ -51,7 +52,8 @@ export interface SimulationEvents {
 /**
  * Attributes: `world` (its URL), `autostart`, `autoplay`, `name` (the visitor's, for administrators), `viewer` (`small` or
  * `webots`; without it, the one that fits), `viewer-script` (URL of Webots' own viewer, for servers that don't have it),
- * `lang` (`en`, `de`, `fr`, `es`, `zh` or `ja`; without it, that of the browser).
+ * `lang` (`en`, `de`, `fr`, `es`, `zh` or `ja`; without it, that of the browser). `lang` and `autostart` are read only when the
+ * element comes into its page, `world` and `autoplay` at each start, `viewer` and `viewer-script` when a scene is shown.
  *
  * CSS parts: `availability`, `announcement`, `start`, `leave`, `full-screen`, `notice`, `problem`, `steps`, `stage`.
  */
