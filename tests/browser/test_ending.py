@@ -77,6 +77,24 @@ class Idle(Running):
         page.tab.get_by_role("button", name="Disconnect").click()
 
 
+class Killed(Running):
+    # The page's connections break.
+    may_complain = True
+
+    def test_whose_server_was_killed_is_told_that_it_was_lost_and_what_helps(self):
+        page, server = self.running()
+        pid = self.pid(server)
+        server.kill()
+        expect(page.tab.locator("#problem-text")).to_have_text(
+            "The server was lost. Your simulation is over; start it again."
+        )
+        expect(page.tab.locator("#problem-advice")).to_contain_text("Connect again")
+        until("nothing is left of it", lambda: not pathlib.Path(f"/proc/{pid}").exists())
+        # The other server runs the next one.
+        page.tab.get_by_role("button", name="Connect", exact=True).click()
+        expect(page.tab.locator("[data-step=simulation].done")).to_be_visible()
+
+
 class Gone(Running):
     simulation = {"timing": {"absence": 2}}
 
