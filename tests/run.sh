@@ -13,7 +13,7 @@ command -v cargo >/dev/null || {
 # On Debian, web servers are in /usr/sbin, which only root has in its PATH.
 PATH=$PATH:/usr/sbin
 # The C compiler links the programs; python3 and openssl make counterparts for mail and TLS; xvfb provides a display,
-# bubblewrap sandboxes, pasta their networks; the fleet is tested behind both web servers, also with a real browser; its package and the guide
+# bubblewrap sandboxes, pasta their networks; the fleet is tested behind both web servers, also with real browsers; its package and the guide
 # are tested in a Debian made by mmdebstrap; nft loads the packet filter; promtool checks the alerts, dnsmasq resolves names of simulation servers,
 # and kubectl renders the files for Kubernetes.
 tests/install.sh cc=gcc,libc6-dev node=nodejs git=git git-lfs=git-lfs flock=util-linux openssl=openssl python3=python3 python3-venv=python3-venv \
@@ -23,6 +23,8 @@ tests/install.sh cc=gcc,libc6-dev node=nodejs git=git git-lfs=git-lfs flock=util
 # The headless build of the browser takes half of the processor time, if the distribution has it.
 ! apt-cache show chromium-headless-shell >/dev/null 2>&1 ||
     tests/install.sh chromium-headless-shell=chromium-headless-shell || echo 'the browser tests take longer' >&2
+# Not each distribution has it.
+tests/install.sh firefox-esr=firefox-esr || echo 'the browser tests in Firefox are skipped' >&2
 # udev does this; without udev the device may be missing or accessible to root only.
 if ((EUID == 0)) && [[ ! -c /dev/net/tun || $(stat --format=%a /dev/net/tun) != 666 ]]; then
     echo 'lets everybody open /dev/net/tun, as udev does'
