@@ -54,7 +54,7 @@
 //! - **session**: the [`simulation::client::Session`] of one simulation. The *session server* is the other program.
 //! - **simulation**: what a client requests: a slot, a checkout, a Webots. It has an id.
 //! - **slot**: a streaming port for one simulation, or the right to have one. Texts for users, keys and `/status` say *place*.
-//! - **queue**: the clients that wait for a slot of one simulation server.
+//! - **queue**: the clients that wait for a slot of one simulation server (its key is `waitingLine`).
 //! - **line**: the clients that wait at a session server for a slot of the fleet. Each has a [`session::line::Place`] in
 //!   it, which its **ticket** proves; a **pass** entitles it to one slot of one server.
 //! - **connection**: a TCP connection or a WebSocket, never a slot (the key `maxConnections` has its name from the original).
@@ -100,7 +100,7 @@
 //! guards. Dropping it frees all three, whatever its state, even after a panic. When the simulation server exits, for
 //! whatever reason, its [`simulation::process::guardian`] process ends everything that the server has started.
 //! One `simulation::isolation::DiskMonitor` enforces what the kernel does not: how much simulations write. One thread copies
-//! all relayed streams except those of watchers; the server exits if that thread panics.
+//! all relayed streams except those of watchers.
 //!
 //! # What ends, and what restarts
 //!
@@ -114,15 +114,15 @@
 //! | Webots | with its process tree; it is never restarted, its client is notified | its process tree is killed at once, its directory removed, its slot released |
 //!
 //! The `SlotPool` is not an actor: a mutex guards it. [`shared::run::permanent::restarted`] restarts the tasks; after
-//! more than five panics of one task, or of all monitors together, within a minute the server exits with code 1.
+//! more than five panics of one task, or of all monitors together, within a minute the server exits with code 1. So it
+//! does after the first panic of a thread that it needs ([`shared::run::permanent::thread`]).
 //!
 //! # Facts about actix 0.13 that this relies on
 //!
-//! 1. actix's own `Supervisor` restarts a stopped actor and reuses its value: the actor must reset its own state.
-//! 2. After a panic in a handler the actor is dropped, not restarted, and every later message fails as 'closed'.
-//! 3. When the system ends, an actor is dropped without `stopped`. Only `Drop` always runs.
-//! 4. tokio's `kill_on_drop` reaches the direct child only; Webots' launcher has a child of its own.
-//! 5. If a WebSocket's peer stops reading, the buffers fill, and from then on the connection's actor is no longer polled.
+//! 1. After a panic in a handler the actor is dropped, not restarted, and every later message fails as 'closed'.
+//! 2. When the system ends, an actor is dropped without `stopped`. Only `Drop` always runs.
+//! 3. tokio's `kill_on_drop` reaches the direct child only; Webots' launcher has a child of its own.
+//! 4. If a WebSocket's peer stops reading, the buffers fill, and from then on the connection's actor is no longer polled.
 //!    The connection must be closed before that happens, see [`shared::http::liveness`].
 
 pub mod session;

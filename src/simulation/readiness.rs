@@ -1,7 +1,6 @@
 //! Whether the server can start simulations at all. It is checked every five seconds, because Webots may be
 //! reinstalled, and a disk or a display may fail and recover.
 
-use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -11,9 +10,10 @@ use tokio::sync::{oneshot, watch};
 use which::which;
 
 use super::config::SimulationConfig;
-use crate::simulation::container::{daemon_fault, data_folder};
+use crate::shared::domain::Failure;
+use crate::simulation::container::{daemon_fault, docker_disk_fault};
 use crate::simulation::machine::{Readings, display};
-use crate::simulation::process::DiskRoom;
+use crate::simulation::process::disk_fault;
 
 /// Interval between two checks.
 const PERIOD: Duration = Duration::from_secs(5);
@@ -22,8 +22,6 @@ const PERIOD_WHILE_NOT_READY: Duration = Duration::from_secs(1);
 /// Timeout of a check: a disk that does not answer blocks its writers. The next check starts only after this one has
 /// ended.
 const HUNG: Duration = Duration::from_mins(1);
-/// Bytes that each check writes to the disk. An empty file can be created on a full disk.
-const WRITTEN: usize = 1 << 20;
 
 /// Number of consecutive failed starts of which this server is the cause. A start that failed because of its world or
 /// its client does not change it. Session servers prefer servers without failed starts.
@@ -117,16 +115,15 @@ fn publish(sender: &watch::Sender<Option<String>>, found: Option<String>, failed
 /// Checks everything that each simulation needs. Blocks for up to two seconds per display, and as long as the disk.
 fn check(config: &SimulationConfig, run: &Path, readings: Option<&Readings>) -> Result<(), String> {
     readings.map_or(Ok(()), |readings| check_gpus(config, readings))?;
+    let none = |fault: Option<Failure>| fault.map_or(Ok(()), |failure| Err(failure.in_full()));
     if config.docker {
-        daemon_fault().map_or(Ok(()), Err)?;
+        none(daemon_fault())?;
     }
     webots_program(config)?;
     which("git").map_err(|_| "This simulation server has no git".to_owned())?;
-    let written = write(run);
-    check_room(run, "disk", config.disk_reserve)?;
-    written.map_err(|error| format!("This simulation server can't write in its cache: {error}"))?;
-    if let Some(folder) = config.docker.then(data_folder).flatten() {
-        check_room(&folder, "disk of Docker", config.disk_reserve)?;
+    none(disk_fault(run, config.disk_reserve))?;
+    if config.docker {
+        none(docker_disk_fault(config.disk_reserve))?;
     }
     if config.xvfb && !config.docker {
         find_xvfb()?;
@@ -150,22 +147,6 @@ fn check_gpus(config: &SimulationConfig, readings: &Readings) -> Result<(), Stri
         )),
         _ => Ok(()),
     }
-}
-
-/// Checks that the disk of a directory has `reserve` MiB and some inodes left for users. `disk` is its name.
-fn check_room(folder: &Path, disk: &str, reserve: u64) -> Result<(), String> {
-    let room =
-        DiskRoom::of(folder).map_err(|error| format!("This simulation server's {disk} can't be used: {error}"))?;
-    let full = |left| Err(format!("This simulation server's {disk} is full: less than {left}"));
-    room.shortage(reserve).map_or(Ok(()), full)
-}
-
-/// Writes an unnamed file, and waits until it is on the disk.
-fn write(folder: &Path) -> io::Result<()> {
-    std::fs::create_dir_all(folder)?;
-    let mut file = tempfile::tempfile_in(folder)?;
-    file.write_all(&vec![0; WRITTEN])?;
-    file.sync_all()
 }
 
 /// Finds the program for virtual displays.

@@ -62,6 +62,8 @@ pub struct Control {
 const START: Duration = Duration::from_secs(20);
 /// Time for the requests that have come before the port is handed over.
 const REST: Duration = Duration::from_millis(200);
+/// Pause after a connection that can't be accepted.
+const PAUSE: Duration = Duration::from_millis(100);
 /// Timeout of a request.
 const REQUEST: Duration = Duration::from_secs(5);
 /// Timeout of a whole upgrade, for whoever asks for it: a check, a start, and a moment.
@@ -104,7 +106,7 @@ impl Control {
                     });
                 }
                 // Too many open files, for a moment.
-                Err(_) => actix_rt::time::sleep(REQUEST).await,
+                Err(_) => actix_rt::time::sleep(PAUSE).await,
             }
         }
     }
@@ -112,7 +114,7 @@ impl Control {
     async fn answer(&self, socket: UnixStream) -> io::Result<()> {
         let mut socket = BufReader::new(socket);
         let reply = match timeout(REQUEST, read(&mut socket)).await? {
-            Ok(Request::Look) => Reply::Holdings(self.server.slots.holdings()),
+            Ok(Request::Look) => Reply::Holdings(self.server.slots.give_up_free()),
             Ok(Request::Stop(StopOrder { ids, reason, by })) => {
                 Reply::Done(self.server.stop_here(&ids, &reason, &by).join(" "))
             }

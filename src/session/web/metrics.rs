@@ -1,4 +1,5 @@
-//! The Prometheus metrics of `/metrics` that follow from the status of the fleet. Counters are in `app`.
+//! The Prometheus metrics of `/metrics` that follow from the status of the fleet. Counters and histograms
+//! are in `app`.
 
 use crate::session::fleet::{FleetStatus, NameStatus, ServerStatus, StateName};
 use crate::shared::http::Gauge;

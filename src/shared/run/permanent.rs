@@ -1,6 +1,7 @@
-//! Actors and tasks that must run as long as the server.
+//! Actors, tasks and threads that must run as long as the server.
 
-use std::panic::AssertUnwindSafe;
+use std::io;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::{Duration, Instant};
 
 use actix::prelude::*;
@@ -63,6 +64,22 @@ pub async fn restarted(name: &str, mut task: impl AsyncFnMut()) {
         panics.count(name);
         actix_rt::time::sleep(INTERVAL).await;
     }
+}
+
+/// Starts a thread that the server needs as long as it runs. If it panics, the server exits with code 1, so that its
+/// service manager restarts it.
+///
+/// # Errors
+/// When the system can't start a thread.
+pub fn thread(name: &'static str, run: impl FnOnce() + Send + 'static) -> io::Result<()> {
+    let watched = move || {
+        if catch_unwind(AssertUnwindSafe(run)).is_err() {
+            log::error!("the thread {name} has panicked");
+            std::process::exit(1);
+        }
+    };
+    std::thread::Builder::new().name(name.to_owned()).spawn(watched)?;
+    Ok(())
 }
 
 #[cfg(test)]

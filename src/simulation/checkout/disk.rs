@@ -45,11 +45,12 @@ fn unfinished_packs(repository: &Path) -> impl Iterator<Item = PathBuf> {
         .map(|pack| pack.path())
 }
 
-/// Waits until one of the directories exceeds its limit, in bytes, or contains a directory that can't be read.
-pub async fn outgrown(folders: Vec<(PathBuf, u64)>) {
+/// Waits until one of these directories exceeds its limit of this moment, in bytes, or contains a directory that can't be
+/// read.
+pub async fn outgrown(limits: impl Fn() -> Vec<(PathBuf, u64)>) {
     loop {
         actix_rt::time::sleep(CHECK_INTERVAL).await;
-        let looked_at = folders.clone();
+        let looked_at = limits();
         let is_beyond = |(folder, most): &(PathBuf, u64)| {
             let mut size = DiskUsage::new(measure, *most);
             !size.add_folder(folder) || size.total > *most

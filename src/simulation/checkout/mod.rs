@@ -8,6 +8,7 @@ mod disk;
 mod file_restore;
 mod git;
 mod http_trace;
+mod overlap;
 mod project;
 mod redirect;
 mod repository;

@@ -20,6 +20,7 @@ use tokio::sync::{OwnedMutexGuard, Semaphore};
 use super::disk::{has_unfinished_pack, remove_leftovers, spawn_blocking_io};
 use super::git::{Git, GitError, GitExit, LITTLE_MEMORY, stall_timeout};
 use super::http_trace::{HttpTrace, TRACE};
+use super::overlap::Overlap;
 use super::single_flight::{SingleFlight, Steps};
 use crate::shared::domain::{Failure, ProjectUrl, Reason};
 use crate::simulation::config::Remote;
@@ -35,6 +36,8 @@ pub struct Repository {
     pub git: Arc<Git>,
     /// Whether a fetch or a checkout may have enlarged it.
     pub has_grown: AtomicBool,
+    /// Its checkouts.
+    pub checkouts: Overlap,
     /// The number of its generation: another one after it was replaced or discarded.
     generation: AtomicU64,
     /// Notified on drop if the repository has grown.
@@ -108,6 +111,7 @@ impl Repository {
             remote: Mutex::new(remote),
             git,
             has_grown: AtomicBool::default(),
+            checkouts: Overlap::default(),
             generation: AtomicU64::new(next_generation()),
             growth,
             lock: Arc::default(),

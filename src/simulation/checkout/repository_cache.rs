@@ -16,6 +16,7 @@ use tokio::sync::Mutex;
 use super::disk::{spawn_blocking_io, sum};
 use super::git::Git;
 use super::repository::Repository;
+use crate::shared::run::permanent;
 use crate::simulation::config::Remote;
 use crate::simulation::process::{disk_usage, has_several_runs, remove_tree};
 
@@ -100,8 +101,7 @@ impl RepositoryCache {
             growth,
         });
         let kept = Arc::downgrade(&cache);
-        let keep = move || keep_within_budget(&kept, &grown);
-        std::thread::Builder::new().name("cache".to_owned()).spawn(keep)?;
+        permanent::thread("cache", move || keep_within_budget(&kept, &grown))?;
         Ok(cache)
     }
 

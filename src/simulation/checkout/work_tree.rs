@@ -88,13 +88,15 @@ pub async fn write(
     };
     let mut call = checkout_command(repository, revision, &paths, (instance.path(), &root), &settings)?;
     call.may_block = true;
-    // git-lfs stores its downloads here, shared with concurrent checkouts, and copies them into the project.
+    // git-lfs stores its downloads here, shared with concurrent checkouts, and copies them into the project. Each checkout
+    // downloads a file that is not there yet, and renames it then.
     let kept = repository.path.join("lfs");
+    let running = repository.checkouts.begin();
     let before = disk::room_of(&kept);
-    let growing = vec![
-        (root.clone(), most),
-        (kept.clone(), before.saturating_add(most.saturating_mul(2))),
-    ];
+    let growing = || {
+        let growth = most.saturating_mul(2).saturating_mul(running.overlapping());
+        vec![(root.clone(), most), (kept.clone(), before.saturating_add(growth))]
+    };
     let written = tokio::select! {
         written = repository.git.run(call, on_line) => match written {
             Ok(_) => true,

@@ -1,17 +1,20 @@
 //! How a session starts its simulation: a slot, the checkout, Webots; and how a failed start ends.
 
-use std::io::{self, ErrorKind};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Instant;
 
 use actix::prelude::*;
+use actix_rt::task::spawn_blocking;
 use tokio_util::sync::CancellationToken;
 
 use super::session::{LaunchedSimulation, Session, State, WebotsHandle};
 use crate::shared::domain::{Blame, Failure, ProjectUrl, Reason, ReservationId, View};
 use crate::shared::http::Peer;
 use crate::simulation::checkout::{Project, Tip};
+use crate::simulation::isolation::RepositoryAssets;
 use crate::simulation::machine::sensors::Gpu;
+use crate::simulation::process::own_call_failed;
 use crate::simulation::progress::{Progress, Step};
 use crate::simulation::protocol::{self, Start};
 use crate::simulation::readiness;
@@ -19,6 +22,15 @@ use crate::simulation::slots::{Prepared, Slot};
 use crate::simulation::snapshot::SceneKind;
 use crate::simulation::state::AppState;
 use crate::simulation::webots::{LaunchSpec, Release, Webots, WebotsEvent};
+
+/// A project that was checked out, and what the server has for it.
+pub(super) struct CheckedOut {
+    project: Project,
+    /// Webots.
+    program: PathBuf,
+    release: Option<Release>,
+    assets: Option<Arc<RepositoryAssets>>,
+}
 
 impl Session {
     /// Checks whether a client may request a simulation. Returns the slot that is reserved for it, if it has a pass.
@@ -77,18 +89,21 @@ impl Session {
         let progress = move |progress| drop(me.try_send(WebotsEvent::Progress(progress)));
         let server = Arc::clone(&self.server);
         let checkout = async move {
-            let instance = server.run.instance().map_err(|error| no_room(&error))?;
+            let run = Arc::clone(&server.run);
+            let instance = spawn_blocking(move || run.instance())
+                .await
+                .map_err(|error| broke_off(&error))?;
+            let instance = instance.map_err(|error| own_call_failed(&error))?;
             let job = server.checkouts.start(world, tip, instance, Arc::new(progress));
-            job.await.unwrap_or_else(|error| {
-                let message = format!("The checkout broke off: {error}");
-                Err(Failure::new(Reason::ServerFault, message))
-            })
+            let project = job.await.unwrap_or_else(|error| Err(broke_off(&error)))?;
+            let checked_out = spawn_blocking(move || CheckedOut::new(&server, project)).await;
+            checked_out.unwrap_or_else(|error| Err(broke_off(&error)))
         };
         cancelled
             .run_until_cancelled_owned(checkout)
             .into_actor(self)
             .map(|result, this, ctx| match result {
-                Some(Ok(project)) => this.launch(project, ctx),
+                Some(Ok(checked_out)) => this.launch(checked_out, ctx),
                 Some(Err(failure)) => this.fail(failure, ctx),
                 // The simulation has ended meanwhile.
                 None => {}
@@ -96,11 +111,13 @@ impl Session {
             .spawn(ctx);
     }
 
-    pub(super) fn launch(&mut self, project: Project, ctx: &mut Context<Self>) {
-        let program = match readiness::webots_program(&self.server.config) {
-            Ok(program) => program,
-            Err(why) => return self.fail(Failure::new(Reason::LaunchFailed, why), ctx),
-        };
+    fn launch(&mut self, checked_out: CheckedOut, ctx: &mut Context<Self>) {
+        let CheckedOut {
+            project,
+            program,
+            release,
+            assets,
+        } = checked_out;
         let slot = match std::mem::replace(&mut self.state, State::lost()) {
             State::CheckingOut { slot, .. } => slot,
             // It has ended meanwhile.
@@ -113,7 +130,6 @@ impl Session {
             project.world.version
         );
         let version = project.world.version.clone();
-        let release = Release::of_simulation(&program, &project.world.version);
         let scene = (self.view != View::Mjpeg).then(|| SceneKind::of(release));
         let gpu = self.take_gpu();
         slot.prepared(Prepared {
@@ -135,7 +151,7 @@ impl Session {
             launcher: Arc::clone(&self.server.launcher),
             disk_monitor: self.server.disk_monitor.clone(),
             program,
-            assets: self.server.launcher.assets_of(&project.repository()),
+            assets,
             project,
             release,
             view: self.view,
@@ -167,14 +183,23 @@ impl Session {
     }
 }
 
-/// Why there is no directory for a project.
-fn no_room(error: &io::Error) -> Failure {
-    let reason = if matches!(error.kind(), ErrorKind::StorageFull | ErrorKind::QuotaExceeded) {
-        Reason::DiskFull
-    } else {
-        Reason::ServerFault
-    };
-    Failure::new(reason, format!("No room for a project: {error}"))
+impl CheckedOut {
+    /// Reads from the disk what a launch needs besides the project. Blocks.
+    fn new(server: &AppState, project: Project) -> Result<Self, Failure> {
+        let program = readiness::webots_program(&server.config);
+        let program = program.map_err(|why| Failure::new(Reason::LaunchFailed, why))?;
+        Ok(Self {
+            release: Release::of_simulation(&program, &project.world.version),
+            assets: server.launcher.assets_of(&project.repository()),
+            program,
+            project,
+        })
+    }
+}
+
+/// A task of a checkout has panicked.
+fn broke_off(error: &actix_rt::task::JoinError) -> Failure {
+    Failure::new(Reason::ServerFault, format!("The checkout broke off: {error}"))
 }
 
 fn count(server: &AppState, outcome: &str) {

@@ -13,7 +13,7 @@ keys! {
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "camelCase", default, deny_unknown_fields)]
 pub struct Timing {
-    /// Timeout of a checkout. Default: 120.
+    /// Timeout of a whole checkout, and of each of its git commands. Default: 120.
     #[serde(with = "Seconds")]
     pub checkout: Duration = Duration::from_mins(2),
     /// Timeout of pulling and building an image. Default: 900.

@@ -118,7 +118,7 @@ pub async fn export(
     let size = config.project_size;
     let copied = tokio::select! {
         copied = docker.run(&words, COPY_TIMEOUT) => copied,
-        () = outgrown(vec![(through.clone(), size << 20)]) => {
+        () = outgrown(|| vec![(through.clone(), size << 20)]) => {
             let message = format!("The project in its image is larger than {size} MiB (projectSize)");
             return Err(Failure::new(Reason::ProjectTooLarge, message));
         }

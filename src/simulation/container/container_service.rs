@@ -187,7 +187,7 @@ impl ContainerService {
 /// What is missing, as text for an administrator.
 pub fn check(config: &SimulationConfig) -> Result<String, String> {
     Docker::find(Path::new("/"))?;
-    daemon_fault().map_or(Ok(()), Err)?;
+    daemon_fault().map_or(Ok(()), |failure| Err(failure.in_full()))?;
     network::check(config.container.network.name())?;
     packet_filter::missing().map_or(Ok(()), Err)?;
     Ok(format!(

@@ -115,7 +115,7 @@ impl Docker {
             DockerError::Slow { .. } => String::new(),
             DockerError::Failed { output, .. } => output,
         };
-        let fault = spawn_blocking(move || daemon_fault().map(unavailable).or_else(|| docker_disk_fault(reserve)));
+        let fault = spawn_blocking(move || daemon_fault().or_else(|| docker_disk_fault(reserve)));
         fault
             .await
             .ok()
@@ -161,14 +161,16 @@ pub fn docker_output(arguments: &[&str], limit: Duration) -> Result<String, Dock
     result(name, ran, reason)
 }
 
-/// Why the daemon can't be used now, as text for clients and administrators. It is asked twice, because a busy one may
-/// answer once too late. Blocks for ten seconds at most.
-pub fn daemon_fault() -> Option<String> {
+/// Why the daemon can't be used now. It is asked twice, because a busy one may answer once too late. Blocks for ten
+/// seconds at most.
+pub fn daemon_fault() -> Option<Failure> {
     let ask = || docker_output(&["version", "--format", "{{.Server.Version}}"], ANSWER_TIMEOUT);
     let error = ask().or_else(|_| ask()).err()?;
     Some(match error {
-        DockerError::Failed { output, .. } => format!("Docker does not answer on this simulation server: {output}"),
-        error => error.to_string(),
+        DockerError::Failed { output, .. } => {
+            unavailable("Docker does not answer on this simulation server".to_owned()).with_output(output)
+        }
+        error => error.into(),
     })
 }
 

@@ -22,7 +22,7 @@ mod webots_yml;
 pub use built_image::RUNS;
 pub use compose_project::ContainerRequest;
 pub use container_service::{ContainerService, check};
-pub use docker::{daemon_fault, data_folder};
+pub use docker::{daemon_fault, data_folder, docker_disk_fault};
 pub use owned_resources::{ResourceOwner, sweep_all};
 pub use simulation_containers::{Cause, SimulationContainers};
 pub use usage::measure;

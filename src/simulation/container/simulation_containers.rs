@@ -11,7 +11,7 @@ use super::compose_project::{CONTROLLER, WEBOTS, container_of};
 use super::docker::{Docker, DockerError, SHORT_TIMEOUT, daemon_fault};
 use super::failures::refused_by_docker;
 use super::owned_resources::ProjectGuard;
-use crate::shared::domain::{Failure, Reason};
+use crate::shared::domain::Failure;
 use crate::simulation::process::{ExitReason, SpawnSpec};
 
 /// The containers of one simulation.
@@ -48,17 +48,6 @@ pub enum Cause {
 
 /// Shortest time between two restarts of a participant's controller.
 const RESTART_INTERVAL: Duration = Duration::from_secs(1);
-
-impl Cause {
-    /// The reason of the end.
-    pub fn reason(self) -> Reason {
-        match self {
-            Self::OutOfMemory => Reason::MemoryLimit,
-            Self::Docker => Reason::DockerUnavailable,
-            Self::NotStarted => Reason::LaunchFailed,
-        }
-    }
-}
 
 impl SimulationContainers {
     fn container(&self, service: &str) -> String {

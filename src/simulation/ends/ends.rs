@@ -14,6 +14,7 @@ use super::ended::Ended;
 use super::{csv, kept_output};
 use crate::shared::domain::Reason;
 use crate::shared::http::Metrics;
+use crate::shared::run::permanent;
 
 /// Records how simulations end. Clones share the records.
 #[derive(Debug, Clone)]
@@ -51,9 +52,7 @@ impl Ends {
             counter.with_label_values(&[reason.code()]);
         }
         let (writer, jobs) = channel();
-        std::thread::Builder::new()
-            .name("ends".to_owned())
-            .spawn(move || write_all(&logs, &level, months, &jobs))?;
+        permanent::thread("ends", move || write_all(&logs, &level, months, &jobs))?;
         Ok(Self {
             counter,
             latest: Arc::default(),

@@ -8,7 +8,6 @@
 //! the longer a tick takes, the longer the pause after it.
 
 use std::io;
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::time::{Duration, Instant};
@@ -17,6 +16,7 @@ use nix::time::{ClockId, clock_gettime};
 use tokio::sync::oneshot;
 
 use super::disk::{Disk, DiskUse};
+use crate::shared::run::permanent;
 
 /// Monitors simulations. Its thread ends when the last clone is dropped.
 #[derive(Debug, Clone)]
@@ -47,15 +47,7 @@ impl DiskMonitor {
             disk: Disk::new(run, reserve),
             all: Vec::new(),
         };
-        std::thread::Builder::new()
-            .name("disk-monitor".to_owned())
-            .spawn(move || {
-                // Without this thread no limit of the disk would hold: the server aborts, and the service manager restarts it.
-                let run = AssertUnwindSafe(|| table.run(&receiver));
-                if catch_unwind(run).is_err() {
-                    std::process::abort();
-                }
-            })?;
+        permanent::thread("disk-monitor", move || table.run(&receiver))?;
         Ok(Self(watches))
     }
 

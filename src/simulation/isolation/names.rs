@@ -16,6 +16,8 @@ use tokio::runtime::Builder;
 use tokio::sync::Semaphore;
 use tokio_util::codec::{Framed, LengthDelimitedCodec};
 
+use crate::shared::run::permanent;
+
 /// Limit of connections at a time. More of them wait.
 const CONNECTIONS: usize = 1024;
 /// Timeout of a program that asks nothing, or does not read its answer.
@@ -40,12 +42,11 @@ pub fn start(address: IpAddr) -> io::Result<u16> {
     listener.set_nonblocking(true)?;
     let port = listener.local_addr()?.port();
     let runtime = Builder::new_current_thread().enable_all().build()?;
-    let run = move || {
+    permanent::thread("names", move || {
         if let Err(error) = runtime.block_on(serve(listener)) {
             log::error!("programs in networks of their own can resolve no names: {error}");
         }
-    };
-    std::thread::Builder::new().name("names".to_owned()).spawn(run)?;
+    })?;
     Ok(port)
 }
 

@@ -9,6 +9,7 @@ use nvml_wrapper::error::NvmlError;
 use tokio::sync::watch;
 
 use super::sensors::{Gpu, percent};
+use crate::shared::run::permanent;
 
 /// Interval between two readings.
 const PERIOD: Duration = Duration::from_secs(1);
@@ -33,9 +34,7 @@ pub(super) struct GpuReading {
 /// Starts the thread, and returns the receiver of its last reading. The thread ends when the receiver is dropped.
 pub(super) fn follow() -> std::io::Result<watch::Receiver<Option<GpuReading>>> {
     let (sender, last) = watch::channel(None);
-    std::thread::Builder::new()
-        .name("gpus".to_owned())
-        .spawn(move || read(&sender))?;
+    permanent::thread("gpus", move || read(&sender))?;
     Ok(last)
 }
 

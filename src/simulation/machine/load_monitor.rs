@@ -46,7 +46,7 @@ struct Sample<'a> {
     gpu: &'a Gpu,
 }
 
-/// The columns of the original.
+/// The columns: those of the original, then others.
 const COLUMNS: [Column; 12] = [
     column("Timestamp", 0, |sample| whole(sample.at)),
     column("Webots running", 0, |sample| sample.instances.running.into()),

@@ -13,6 +13,7 @@ use std::time::Duration;
 use super::process_group::ExitReason;
 use super::process_tree;
 use super::runner::Run;
+use crate::shared::run::permanent;
 use crate::simulation::run_id::RunId;
 
 /// The directory of one run of the server: `runs/run-*` in `cacheDir`. It contains a directory for each simulation. Its
@@ -65,7 +66,7 @@ impl RunDir {
             log::warn!("removed what {dead} earlier runs had left");
         }
         let (remover, folders) = mpsc::channel();
-        std::thread::Builder::new().spawn(move || remove_each(&folders))?;
+        permanent::thread("remover", move || remove_each(&folders))?;
         let path = runs.join(RunId::own().folder());
         DirBuilder::new().mode(0o700).create(&path)?;
         let lock = File::open(&path)?;

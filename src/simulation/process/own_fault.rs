@@ -31,12 +31,12 @@ pub fn own_call_failed(error: &io::Error) -> Failure {
 
 /// Why the disk of a directory can't be written at this moment; `None` if it can. `reserve` is `diskReserve`. Blocks.
 pub fn disk_fault(folder: &Path, reserve: u64) -> Option<Failure> {
-    if let Err(error) = write(folder) {
-        return Some(own_call_failed(&error));
+    let written = write(folder);
+    if let Some(left) = DiskRoom::of(folder).ok().and_then(|room| room.shortage(reserve)) {
+        let message = format!("This simulation server's disk is full: less than {left}");
+        return Some(Failure::new(Reason::DiskFull, message));
     }
-    let left = DiskRoom::of(folder).ok()?.shortage(reserve)?;
-    let message = format!("This simulation server's disk is full: less than {left}");
-    Some(Failure::new(Reason::DiskFull, message))
+    written.err().map(|error| own_call_failed(&error))
 }
 
 /// Why this program can't be started at this moment: it is missing, or the system starts no more processes. Blocks.
@@ -53,10 +53,12 @@ pub fn start_fault(program: &str) -> Option<Failure> {
     Some(Failure::new(Reason::ServerFault, message))
 }
 
-/// Writes a file without a name, which is gone afterwards.
+/// Writes a file without a name, which is gone afterwards, and waits until it is on the disk.
 fn write(folder: &Path) -> io::Result<()> {
     std::fs::create_dir_all(folder)?;
-    tempfile::tempfile_in(folder)?.write_all(&vec![0; WRITTEN])
+    let mut file = tempfile::tempfile_in(folder)?;
+    file.write_all(&vec![0; WRITTEN])?;
+    file.sync_all()
 }
 
 #[cfg(test)]

@@ -53,7 +53,7 @@ impl SpawnSpec {
     }
 }
 
-/// A running process group. Dropping it kills the group.
+/// A running process group. Dropping it has the future of [`ProcessGroup::start`] kill the group at once.
 pub struct ProcessGroup {
     leader: i32,
     terminate: Option<oneshot::Sender<()>>,

@@ -11,6 +11,7 @@ use nix::sys::epoll::{Epoll, EpollCreateFlags, EpollEvent, EpollFlags, EpollTime
 use parking_lot::Mutex;
 
 use super::stream::{Source, Stream};
+use crate::shared::run::permanent;
 
 /// Size of the buffer that all streams share, in bytes: as much is copied of a direction before other streams have their
 /// turn. What an end does not take at once is kept for that stream.
@@ -45,11 +46,7 @@ impl StreamThread {
             rest,
         });
         let thread = Arc::clone(&started);
-        std::thread::Builder::new().name("streams".to_owned()).spawn(move || {
-            // Without this thread all streams would stall: the server aborts, and the service manager restarts it.
-            std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| thread.run())).ok();
-            std::process::abort()
-        })?;
+        permanent::thread("streams", move || thread.run())?;
         Ok(started)
     }
 

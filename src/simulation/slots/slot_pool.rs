@@ -116,7 +116,7 @@ impl SlotPool {
             slots.left = Some(slots.taken().collect());
             slots.others = Holdings::default();
         }
-        self.holdings()
+        self.give_up_free()
     }
 
     /// Whether another process has the ports that become free.
@@ -124,11 +124,11 @@ impl SlotPool {
         self.0.lock().left.is_some()
     }
 
-    /// What this process has.
-    pub fn holdings(&self) -> Holdings {
+    /// Gives up the slots that have become free and that nobody here waits for: another process may use them from now on.
+    /// Returns what this process has.
+    pub fn give_up_free(&self) -> Holdings {
         let mut slots = self.0.lock();
         if slots.left.is_some() && slots.queue().next().is_none() {
-            // Nobody here needs those that have become free.
             slots.left = Some(slots.taken().collect());
         }
         Holdings {

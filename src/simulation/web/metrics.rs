@@ -1,5 +1,5 @@
-//! The Prometheus metrics of `/metrics` that follow from the state of the server. The counter of starts is in
-//! `app.rs`, that of ends in `ends/ends.rs`.
+//! The Prometheus metrics of `/metrics` that follow from the state of the server. The counter of starts and
+//! the histogram of real-time factors are in `app.rs`, the counter of ends in `ends/ends.rs`.
 
 use crate::shared::domain::ReadyStatus;
 use crate::shared::http::Gauge;
