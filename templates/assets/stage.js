@@ -58,8 +58,7 @@ export class Stage {
     this.#shows += 1;
     const show = this.#shows;
     const webots = viewer === 'small' ? undefined : ((await ownViewer(server)) ?? script);
-    const isSmall = !webots || (viewer === 'automatic' && (await (await small()).isDemonstration(address, kind)));
-    const viewers = isSmall ? await small() : undefined;
+    const viewers = webots ? undefined : await small();
     if (show !== this.#shows) {
       return;
     }
@@ -69,7 +68,7 @@ export class Stage {
     } else if (webots) {
       this.#showWebots(address, webots);
     }
-    if (isSmall && viewer === 'webots') {
+    if (viewers && viewer === 'webots') {
       say(this.#words.stage.onlySmall);
     }
   }

@@ -77,9 +77,10 @@ import { helpsToWait } from './reasons.js';
 /** @typedef {Target & Life & { is: 'running', address: string, scene: Scene, facts: Facts, resumption?: Resumption | undefined }} Running */
 /** The simulation waits for this page, which tries to return. `hasRun`: its simulator was ready, as far as the page knows;
  * `wasShown`: the page still shows its scene;
- * `refusedSince`: since when its server refuses all attempts although the session server answers.
+ * `attempt`: how far the one that is under way has come; `refusedSince`: since when its server refuses all attempts although
+ * the session server answers.
  * @typedef {Target & { is: 'lost', facts: Facts, heardAt: number, resumption: Resumption, hasRun: boolean, wasShown: boolean, isTold: boolean,
- *   tries: number, nextTry: number, refusedSince?: number | undefined }} Lost
+ *   tries: number, nextTry: number, attempt: 'none' | 'opening' | 'asked', refusedSince?: number | undefined }} Lost
  */
 /** @typedef {Connecting | Starting | Running | Lost} Connected */
 /** @typedef {Unconnected | Connected} Going */
@@ -111,7 +112,7 @@ import { helpsToWait } from './reasons.js';
  *   | { type: 'keep' }
  *   | { type: 'online' }
  *   | { type: 'tick' }
- *   | { type: 'probed' }
+ *   | { type: 'probed', answers: boolean }
  *   | { type: 'scene', scene: Exclude<Scene, { is: 'closed' }> }
  *   | { type: 'sceneFailed', why: import('./scene.js').SceneProblem }
  *   | { type: 'sceneClosed' }
@@ -773,6 +774,7 @@ function lost(state, resumption, now) {
     isTold: false,
     tries: 0,
     nextTry: now,
+    attempt: 'none',
     // The server says again what still applies.
     facts: { closesAt: 'facts' in state ? state.facts.closesAt : undefined, isWatched: false },
   };
@@ -798,6 +800,7 @@ function restore({ server, world, token, absence, hasRun }, { now }) {
       isTold: false,
       tries: 0,
       nextTry: now,
+      attempt: 'none',
       facts: { isWatched: false },
     },
     now,
@@ -812,7 +815,7 @@ function restore({ server, world, token, absence, hasRun }, { now }) {
  */
 function tryAgain(state, now, before = []) {
   return {
-    to: { ...state, tries: state.tries + 1, nextTry: now + ATTEMPT },
+    to: { ...state, tries: state.tries + 1, nextTry: now + ATTEMPT, attempt: 'opening' },
     effects: [...before, { do: 'connect', server: state.server, request: { resume: state.resumption.token } }],
   };
 }
@@ -829,6 +832,8 @@ function whileLost(state, event, around) {
   switch (event.type) {
     case 'message':
       return found(state, event.message, now);
+    case 'opened':
+      return { to: { ...state, attempt: 'asked' } };
     case 'closed': {
       if (event.failure && !state.hasRun && event.failure.reason?.code !== 'ended') {
         return startFailed(state, event, around);
@@ -843,9 +848,13 @@ function whileLost(state, event, around) {
       }
       // Random, so that clients that were disconnected together do not return together.
       const pause = Math.min(LONGEST_PAUSE, FIRST_PAUSE * 2 ** (state.tries - 1)) * (0.5 + random());
-      return { to: { ...state, nextTry: Math.min(state.nextTry, now + pause) }, effects: [{ do: 'probe' }] };
+      const nextTry = Math.min(state.nextTry, now + pause);
+      return { to: { ...state, attempt: 'none', nextTry }, effects: [{ do: 'probe' }] };
     }
     case 'probed': {
+      if (!event.answers) {
+        return { to: { ...state, refusedSince: undefined } };
+      }
       const refusedSince = state.refusedSince ?? now;
       if (now - refusedSince < GONE) {
         return { to: { ...state, refusedSince } };
@@ -855,7 +864,8 @@ function whileLost(state, event, around) {
         : redirect({ code: 'server-unreachable' }, state.goal, state, around);
     }
     case 'online':
-      return { to: { ...state, nextTry: now } };
+      // An attempt that has asked may have its answer on the way, with the next token.
+      return state.attempt === 'asked' ? undefined : { to: { ...state, nextTry: now } };
     case 'tick':
       return waitOn(state, away, now);
   }

@@ -190,8 +190,6 @@ export class VisitRunner {
   async #probe() {
     const request = { cache: /** @type {const} */ ('no-store'), signal: AbortSignal.timeout(3000) };
     const answer = await fetch(new URL('load', this.#base), request).catch(() => undefined);
-    if (answer?.ok) {
-      this.take({ type: 'probed' });
-    }
+    this.take({ type: 'probed', answers: answer?.ok ?? false });
   }
 }

@@ -375,7 +375,7 @@ test('a start whose connection breaks is found again, and one that has failed go
     .receive(...EARLY)
     .take({ type: 'closed', code: 1006 });
   for (let attempt = 0; attempt < 4; ++attempt) {
-    gone.take({ type: 'closed', code: 1006 }, { type: 'probed' }).pass(1);
+    gone.take({ type: 'closed', code: 1006 }, { type: 'probed', answers: true }).pass(1);
   }
   assert.ok(['redirected', 'asking'].includes(gone.state.is), gone.state.is);
   const none = connecting().take({ type: 'closed', code: 1006 });
@@ -403,7 +403,11 @@ test('a server that hangs is noticed by its silence, and one attempt is under wa
   visit.pass(2);
   assert.deepEqual(visit.did(), ['connect']);
   visit.take({ type: 'online' }).pass(1);
-  assert.deepEqual(visit.did(), ['connect']);
+  assert.deepEqual(visit.did(), ['connect'], 'it has not asked yet');
+  visit.take({ type: 'opened' }, { type: 'online' }).pass(1);
+  assert.deepEqual(visit.did(), [], 'its answer may be on the way');
+  visit.take({ type: 'closed', code: 1006 }, { type: 'online' }).pass(1);
+  assert.deepEqual(visit.did(), ['probe', 'connect']);
 });
 
 test('a start whose server falls silent is found again, and one that is never accepted goes elsewhere', () => {
@@ -530,7 +534,7 @@ test('a server that refuses all attempts while the session server answers is gon
   for (let attempt = 0; attempt < 4; ++attempt) {
     visit.take({ type: 'closed', code: 1006 });
     assert.deepEqual(visit.did().slice(-1), ['probe']);
-    visit.take({ type: 'probed' }).pass(1);
+    visit.take({ type: 'probed', answers: true }).pass(1);
   }
   assert.equal(visit.view.problem?.text, 'The server was lost. Your simulation is over; start it again.');
   const offline = running().take({ type: 'closed', code: 1006 });
@@ -538,6 +542,11 @@ test('a server that refuses all attempts while the session server answers is gon
     offline.take({ type: 'closed', code: 1006 }).pass(1);
   }
   assert.equal(offline.state.is, 'lost', 'without an answer of the session server, the network may be down');
+  const flapping = running().take({ type: 'closed', code: 1006 });
+  for (const answers of [true, false, false, true, false, true]) {
+    flapping.take({ type: 'closed', code: 1006 }, { type: 'probed', answers }).pass(2);
+  }
+  assert.equal(flapping.state.is, 'lost', 'it was not refused all the time');
 });
 
 test('a page that is hidden leaves what can be resumed', () => {
