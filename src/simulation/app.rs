@@ -268,13 +268,20 @@ pub async fn serve(assembly: Application) -> Result<(), AppError> {
         port,
     );
     let slots = Arc::clone(&server.slots);
-    actix_rt::spawn(Arc::clone(&slots).recheck());
+    let checked = Arc::clone(&slots);
+    actix_rt::spawn(async move {
+        permanent::restarted("the check of slots", async || Arc::clone(&checked).recheck().await).await;
+    });
     let histogram = server.metrics.histogram(
         "webots_simulation_real_time_factor",
         "Simulated seconds per second of running simulations, every five seconds",
         &REAL_TIME_FACTORS,
     )?;
-    actix_rt::spawn(Arc::clone(&slots).follow_real_time(config.real_time.target, histogram));
+    let (target, timed) = (config.real_time.target, Arc::clone(&slots));
+    actix_rt::spawn(async move {
+        let follow = async || Arc::clone(&timed).follow_real_time(target, histogram.clone()).await;
+        permanent::restarted("the times of simulations", follow).await;
+    });
     let spare_keeper = SpareKeeper::new(Arc::clone(&server)).start();
     // This runs unless this thread is blocked, or another one holds the lock of the slots.
     // The service manager expects it of the process that has the port only.
@@ -342,7 +349,10 @@ async fn begin(
         control::set_serving(cache, RunId::own())?;
     }
     predecessors.publish();
-    actix_rt::spawn(Arc::clone(predecessors).follow());
+    let followed = Arc::clone(predecessors);
+    actix_rt::spawn(async move {
+        permanent::restarted("older processes", async || Arc::clone(&followed).follow().await).await;
+    });
     Ok(())
 }
 

@@ -155,7 +155,7 @@ impl<'class> Browser<'class> {
             return Err(StartError::Left);
         }
         let mut first = self.hear_of_start(&mut lease).await?;
-        while is_of_waiting(&first) {
+        while is_before_slot(&first) {
             first = self.hear_of_start(&mut lease).await?;
         }
         drop(waiting);
@@ -353,7 +353,9 @@ impl Drop for Browser<'_> {
     }
 }
 
-/// Whether a text says that no slot is free yet.
-fn is_of_waiting(text: &str) -> bool {
-    text.starts_with("queue:") || text.to_ascii_lowercase().starts_with("loading: waiting for a place")
+/// Whether a text says that no slot is free yet, or comes before that is known.
+fn is_before_slot(text: &str) -> bool {
+    let before = ["session:", "absence:", "resume:", "queue:"];
+    before.iter().any(|begin| text.starts_with(begin))
+        || text.to_ascii_lowercase().starts_with("loading: waiting for a place")
 }

@@ -22,8 +22,9 @@ const WATCH: Duration = Duration::from_secs(3);
 /// Timeout of Webots' end once its client has left.
 const GONE: Duration = Duration::from_secs(15);
 /// Prefixes of the texts that Webots' page knows or ignores on the connection to the simulation server.
-const KNOWN: [&str; 12] = [
+const KNOWN: [&str; 13] = [
     "session:",
+    "reason:",
     "progress:",
     "loading:",
     "queue:",

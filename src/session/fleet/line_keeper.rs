@@ -176,6 +176,7 @@ impl LineKeeper {
     pub(super) fn set_servers(&mut self, servers: &ServerTable) {
         self.dispatcher
             .set_servers(servers.addresses(), terms(&servers.records));
+        self.refused_by.retain(|server| servers.records.contains_key(server));
     }
 
     /// Looks after what changes with time alone.
