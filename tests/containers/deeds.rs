@@ -17,7 +17,7 @@ socketserver.TCPServer(("", int(sys.argv[1])), Answer).serve_forever()' "$port" 
 "#;
 
 /// A server whose Webots has a world, does this and then sends heartbeats.
-fn doing(script: &str) -> Builder {
+pub fn doing(script: &str) -> Builder {
     server_running(&format!("{READY}\n{script}\nwhile :; do echo .; sleep 0.2; done"))
 }
 

@@ -25,4 +25,5 @@ mod image;
 mod kinds;
 mod life;
 mod page;
+mod ready;
 mod registry;

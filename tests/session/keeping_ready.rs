@@ -1,13 +1,15 @@
 //! A fleet that keeps simulations ready: who keeps how many, and that clients are sent where one is.
 
 use serde_json::{Value, json};
+use webots_fleet::shared::domain::ReadyCount;
 
 use crate::support::client::Client;
 use crate::support::git::{Forge, arm};
 use crate::support::http::{self, PASSWORD, post};
-use crate::support::program::{Builder, Server, session_server, simulation_server};
-use crate::support::until;
+use crate::support::program::{Builder, Server, demo_server, session_server, simulation_server};
+use crate::support::reserving::ReservingServer;
 use crate::support::webots::Webots;
+use crate::support::{ready_class, until};
 
 const SECRET: &str = "a secret of this test";
 
@@ -211,68 +213,41 @@ async fn a_server_that_is_full_of_them_takes_clients_of_other_worlds() {
     assert_eq!(site.servers[0].status().await["instances"]["spare"], 0);
 }
 
-/// Plays a class of 30 within 10 s. Returns the seconds until simulated time passed, sorted.
-async fn class(session: &Server, folder: &std::path::Path) -> Vec<f64> {
-    let json = folder.join("visits.json");
-    let mut rehearse = tokio::process::Command::new(env!("CARGO_BIN_EXE_rehearse"));
-    rehearse
-        .arg(session.url(""))
-        .args([
-            "--world",
-            &arm(),
-            "--clients",
-            "30",
-            "--over",
-            "10s",
-            "--stay",
-            "2s",
-            "--real-time",
-            "0",
-            "--json",
-        ])
-        .arg(&json)
-        .kill_on_drop(true);
-    let played = actix_rt::time::timeout(std::time::Duration::from_mins(4), rehearse.output()).await;
-    let played = played.expect("it ends").unwrap();
-    assert!(played.status.success(), "{played:?}");
-    let report: Value = serde_json::from_str(&std::fs::read_to_string(&json).unwrap()).unwrap();
-    let visits = report["visits"].as_array().unwrap().iter();
-    let mut times: Vec<f64> = visits
-        .filter_map(|visit| visit["steps"]["untilRunning"].as_f64())
-        .collect();
-    times.sort_by(f64::total_cmp);
-    assert_eq!(times.len(), 30, "{report:#}");
-    times
+#[actix_rt::test]
+async fn a_server_that_only_shares_idle_time_keeps_its_share_at_any_load() {
+    let mut server = ReservingServer::start(4, 10.0).await;
+    let shares = |load: u32| json!({"load": load, "docker": true, "shareIdleTime": 50});
+    server.report_also(shares(10));
+    let session = session_server(&[server.address.clone()])
+        .set("fleetKey", SECRET)
+        .set("adminPassword", PASSWORD)
+        .set("ready", list(1))
+        .start()
+        .await;
+    let mut link = server.link().await;
+    let count = |list: Vec<ReadyCount>| list.into_iter().map(|one| one.count).collect::<Vec<_>>();
+    while count(link.keep_ready().await) != [1] {}
+    for (load, wanted) in [(60, 2), (10, 3), (60, 4)] {
+        server.report_also(shares(load));
+        until("its load is known", async || {
+            session.status().await["servers"][0]["load"] == f64::from(load)
+        })
+        .await;
+        // That changes nothing: the next list is that of a lesson.
+        let lesson = json!({"world": arm(), "count": wanted, "until": "2999-01-01"});
+        assert_eq!(
+            post(&session.url("/ready"), Some(PASSWORD), &lesson.to_string()).await,
+            200
+        );
+        assert_eq!(count(link.keep_ready().await), [wanted], "at a load of {load} %");
+    }
 }
 
 /// The figures of docs/ready.md: `cargo test on_a_quiet_machine_a_class_finds -- --nocapture` prints them.
 #[actix_rt::test]
 async fn on_a_quiet_machine_a_class_finds_its_world_ready() {
-    const SLOW: &str = "#VRML_SIM R2025a utf8\n#demo-simulator: load=8\nWorldInfo { }\n";
-    let folder = tempfile::tempdir().unwrap();
-    let mut medians = Vec::new();
-    for count in [30, 0] {
-        let site = Site::new(&[20, 20]).await;
-        site._parts.0.commit("lab/arm", "main", &[("worlds/a.wbt", SLOW)]);
-        let session = site.session().set("ready", list(count)).start().await;
-        let begin = std::time::Instant::now();
-        while session.status().await["ready"][0]["ready"] != count {
-            assert!(
-                begin.elapsed() < std::time::Duration::from_mins(5),
-                "{:#}",
-                session.status().await["ready"]
-            );
-            actix_rt::time::sleep(std::time::Duration::from_millis(200)).await;
-        }
-        let times = class(&session, folder.path()).await;
-        let logs: String = site.servers.iter().map(Server::log).collect();
-        let taken = logs.matches(": takes it").count();
-        println!(
-            "{count} ready: median {:.2} s, p99 {:.2} s, {taken} taken",
-            times[15], times[29]
-        );
-        assert_eq!(taken, if count == 30 { 30 } else { 0 });
-        medians.push(times[15]);
+    needs!("bwrap");
+    for level in ["none", "sandbox"] {
+        ready_class::compare(level, || demo_server(ready_class::SLOTS).set("isolation", level)).await;
     }
-    assert!(medians[0] < 1.0 && medians[1] > 8.0, "{medians:?}");
 }

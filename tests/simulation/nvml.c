@@ -31,7 +31,7 @@ int nvmlDeviceGetUtilizationRates(void *device, rates *out) {
   hang("read");
   char compute[] = "NVML_COMPUTE_0";
   compute[sizeof compute - 2] += number(device);
-  out->gpu = atoi(at(compute));
+  out->gpu = /* more than any processor */ marked("NVML_BUSY") ? 300 : atoi(at(compute));
   out->memory = 7;
   return 0;
 }

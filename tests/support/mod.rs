@@ -32,6 +32,7 @@ pub mod network;
 pub mod page;
 pub mod ports;
 pub mod program;
+pub mod ready_class;
 pub mod receiver;
 pub mod relay;
 pub mod reserving;

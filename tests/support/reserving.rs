@@ -11,7 +11,9 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::{WebSocketStream, accept_async};
-use webots_fleet::shared::domain::{Hello, Offer, Offers, ReservationId, ServerRun, ToSimulationServer, Wishes};
+use webots_fleet::shared::domain::{
+    Hello, Offer, Offers, ReadyCount, ReservationId, ServerRun, ToSimulationServer, Wishes,
+};
 
 use super::SOON;
 
@@ -70,6 +72,15 @@ impl ReservingServer {
         *self.status.lock().unwrap() = status(taken, slots);
     }
 
+    /// Reports this, too, from now on.
+    pub fn report_also(&self, more: Value) {
+        let mut status = self.status.lock().unwrap();
+        status
+            .as_object_mut()
+            .unwrap()
+            .extend(more.as_object().unwrap().clone());
+    }
+
     /// The next session server that connects.
     pub async fn link(&mut self) -> SlotSocket {
         let link = actix_rt::time::timeout(SOON, self.links.recv()).await;
@@ -97,6 +108,21 @@ impl SlotSocket {
                 Err(_) => return None,
             }
         }
+    }
+
+    /// The next list of what it is asked to keep ready, which comes soon.
+    pub async fn keep_ready(&mut self) -> Vec<ReadyCount> {
+        let list = async {
+            loop {
+                let message = self.0.next().await.unwrap().unwrap();
+                let Message::Text(text) = message else { continue };
+                if let ToSimulationServer::KeepReady(list) = serde_json::from_str(&text).unwrap() {
+                    return list.keep_ready;
+                }
+            }
+        };
+        let next = actix_rt::time::timeout(SOON, list).await;
+        next.expect("a list of what is to be kept ready")
     }
 
     /// Sends offers; returns whether the session server is still there.
@@ -165,7 +191,7 @@ async fn answer(
         challenge: 1,
         server: ServerRun(2),
         pass,
-        keeps_ready: false,
+        keeps_ready: true,
         roster: true,
     };
     link.say(serde_json::to_string(&hello).unwrap()).await;

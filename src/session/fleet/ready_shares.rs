@@ -9,11 +9,11 @@ use std::time::{Duration, Instant};
 use jiff::Timestamp;
 
 use super::server_record::ServerState;
-use super::server_table::{ServerTable, terms};
+use super::server_table::{ServerTable, admission};
 use super::slot_link::{LinkChange, LinkEvent};
 use crate::session::config::SessionConfig;
 use crate::session::placement::shares;
-use crate::shared::domain::{KeepReady, ProjectUrl, PublicAddress, ReadyCount, ReadyEntry, View};
+use crate::shared::domain::{KeepReady, Load, ProjectUrl, PublicAddress, ReadyCount, ReadyEntry, View};
 
 /// The lists, and what each server was asked for.
 pub(super) struct ReadyShares {
@@ -125,8 +125,10 @@ impl ReadyShares {
         let rooms: Vec<(PublicAddress, u32)> = may_keep
             .filter_map(|server| Some((server.clone(), slots(server)?.slots)))
             .collect();
-        let terms = terms(&servers.records);
-        let accepts = |server: &PublicAddress, world: &ProjectUrl| terms(server, world).is_some();
+        // At any load: a server that only shares idle time keeps its share while it is busy.
+        let admission = admission(&servers.records);
+        let accepts =
+            |server: &PublicAddress, world: &ProjectUrl| admission(server, world, Load::ZERO.percent()).is_some();
         let lists = shares(&self.wanted(config), &rooms, accepts);
         let mut lists: HashMap<PublicAddress, Vec<ReadyCount>> =
             rooms.into_iter().map(|(server, _)| server).zip(lists).collect();

@@ -15,7 +15,7 @@ use actix::prelude::*;
 use jiff::Timestamp;
 
 use super::session::{Session, SpareEvent};
-use crate::shared::domain::{Failure, ProjectUrl};
+use crate::shared::domain::{Failure, Load, ProjectUrl};
 use crate::simulation::checkout::{KeptRepository, Tip, Tips};
 use crate::simulation::isolation::RepositoryAssets;
 use crate::simulation::machine::Readings;
@@ -116,11 +116,7 @@ impl SpareKeeper {
         }
         for (kind, spares) in &spares {
             let number = wanted.get(kind).copied().unwrap_or_default();
-            let tip = self
-                .worlds
-                .get(kind)
-                .filter(|world| world.may_start())
-                .and_then(|world| world.tip.clone());
+            let tip = self.tip_to_start(kind);
             let may_start = is_open && starts > 0 && tip.is_some();
             let plan = plan(number, spares, may_start, has_slot);
             for id in plan.end {
@@ -141,6 +137,14 @@ impl SpareKeeper {
         {
             self.server.slots.end_spare(one.id);
         }
+    }
+
+    /// The commit of a world that may be started now: the pause after its last failed start is over, and at this load the
+    /// server takes clients for it.
+    fn tip_to_start(&self, kind: &SpareKind) -> Option<Tip> {
+        let world = self.worlds.get(kind).filter(|world| world.may_start())?;
+        let is_admitted = self.server.rules.check(&kind.world, self.server.load()).is_ok();
+        world.tip.clone().filter(|_| is_admitted)
     }
 
     /// Forgets worlds that are no longer listed, and adds those that are. The remote of one that is wanted from now on is to
@@ -180,7 +184,6 @@ impl SpareKeeper {
     /// Asks the remote of each repository whose turn it is. One that is not wanted now is only kept in the cache.
     fn ask_remotes(&mut self, wanted: &BTreeMap<SpareKind, u32>, ctx: &mut Context<Self>) {
         let interval = self.server.config.timing.branches;
-        let load = self.server.load();
         for (repository, watched) in &mut self.repositories {
             if watched.asked.is_some_and(|asked| asked.elapsed() < interval) {
                 continue;
@@ -191,7 +194,7 @@ impl SpareKeeper {
             let is_due = of_repository.clone().any(|(_, count)| *count > 0);
             let refused = worlds
                 .iter()
-                .find_map(|world| self.server.rules.admit(world, load).err());
+                .find_map(|world| self.server.rules.admit(world, Load::ZERO).err());
             if let Some(refused) = refused {
                 for (kind, _) in of_repository {
                     self.server
@@ -221,7 +224,7 @@ impl SpareKeeper {
         }
         for (kind, world) in &mut self.worlds {
             let Some(tip) = tips.get(&kind.world) else { continue };
-            // The problem was the remote, or a load above `shareIdleTime`.
+            // The problem was the remote.
             if world.failures.is_none() {
                 self.server.spare_wishes.set_problem(kind, None);
             }
