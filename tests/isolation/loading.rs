@@ -222,3 +222,41 @@ async fn whether_webots_has_listened_decides_who_is_to_blame() {
         assert_eq!(server.status().await["failedStarts"], 2, "{level}, {network}");
     }
 }
+
+/// Begins to listen after as many seconds as its world says, and crashes a tenth of a second later.
+fn crashing_soon() -> Webots {
+    Webots::script(&format!(
+        "for world; do case $world in --port=*) port=${{world#--port=}};; esac; done
+         sleep \"$(sed -n 's/^# listens after //p' \"$world\")\"
+         {DEMO} \"$@\" & child=$!
+         until (exec 3<>/dev/tcp/127.0.0.1/$port) 2>/dev/null; do sleep 0.01; done
+         sleep 0.1; kill -KILL $child; exit 3"
+    ))
+}
+
+#[actix_rt::test]
+async fn on_a_quiet_machine_a_world_that_crashes_webots_soon_after_it_listens_is_to_blame() {
+    let delays = ["2", "2.4", "2.8", "3.2", "3.6", "4"];
+    let cases = ["R2022b", "R2025a"].map(|release| delays.map(|delay| (release, delay)));
+    for (level, user, network) in levels() {
+        let stage = Stage::new();
+        let webots = crashing_soon();
+        let builder = stage.builder(&webots, level).before(user);
+        let server = builder
+            .set("sandbox.network", network)
+            .set("maxConnections", 12)
+            .start()
+            .await;
+        let start = async |(release, delay): (&str, &str)| {
+            let world = format!("{}# listens after {delay}\n", slow("load=60")).replace("R2025a", release);
+            let branch = format!("{release}-{delay}");
+            stage.forge.commit("lab/arm", &branch, &[("worlds/a.wbt", &world)]);
+            let mut client = Client::start(&server, &arm_at(&branch)).await;
+            client.patiently("loading: Error:").await;
+            let told = client.reason();
+            assert_eq!(told["code"], "load-failed", "{level}, {network}, {branch}: {told}");
+        };
+        join_all(cases.concat().into_iter().map(start)).await;
+        assert_eq!(server.status().await["failedStarts"], 0, "{level}, {network}");
+    }
+}

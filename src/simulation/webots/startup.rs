@@ -37,10 +37,26 @@ pub enum StartupEvent {
     Ready,
 }
 
-/// Bounds of the pause between two requests.
-const PAUSE: (Duration, Duration) = (Duration::from_millis(5), Duration::from_millis(500));
-/// The pause is 1/`PART` of the time since the start, so that many starts on a busy machine don't poll all the time.
-const PART: u32 = 20;
+/// The pauses of a poll: a part of the time since the start, so that many starts on a busy machine don't poll all the
+/// time, within bounds.
+struct Pace {
+    part: u32,
+    shortest: Duration,
+    longest: Duration,
+}
+
+/// Looks for its port. A Webots that listens and ends between two of them counts as one that has never listened.
+const LOOKS: Pace = Pace {
+    part: 50,
+    shortest: Duration::from_millis(5),
+    longest: Duration::from_millis(50),
+};
+/// Requests, which Webots answers while it has no world.
+const REQUESTS: Pace = Pace {
+    part: 20,
+    shortest: Duration::from_millis(5),
+    longest: Duration::from_millis(500),
+};
 /// Bounds of the timeout of a request behind a proxy, until one was answered. It is the time since the start: the proxy
 /// may accept the first request before anything inside listens, and Webots answers none while it reads a world.
 const TIMEOUT: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(10));
@@ -114,30 +130,41 @@ impl Startup {
                 Ok(false) => self.processing.notify_one(),
                 Err(_) => {}
             }
-            actix_rt::time::timeout(self.pause(), self.loaded.notified()).await.ok();
+            let is_look = self.sign == ListenSign::Accepts && !self.listens.get();
+            let pause = self.pause(if is_look { &LOOKS } else { &REQUESTS });
+            actix_rt::time::timeout(pause, self.loaded.notified()).await.ok();
         }
     }
 
     /// Watches for the sign that Webots listens, where requests don't show it in time: a world that is being read answers
     /// none.
     async fn watch_for_listening(&self) -> Infallible {
+        // When the sockets of a network are listed again: if their number has changed, or at times.
+        let (mut counted, mut listed) = (0, self.begin);
         while !self.listens.get() {
             let listens = match self.sign {
                 ListenSign::Accepts => TcpStream::connect(self.address).await.is_ok(),
-                ListenSign::InNetworkOf(pid) => process_tree::children_listen(pid, self.address.port()),
+                ListenSign::InNetworkOf(pid) => {
+                    let sockets = process_tree::sockets_of_children(pid);
+                    let is_due = sockets != counted || listed.elapsed() > self.pause(&REQUESTS);
+                    if is_due {
+                        (counted, listed) = (sockets, Instant::now());
+                    }
+                    is_due && process_tree::children_listen(pid, self.address.port())
+                }
                 ListenSign::Answers => break,
             };
             if listens {
                 self.listens();
             } else {
-                actix_rt::time::sleep(self.pause()).await;
+                actix_rt::time::sleep(self.pause(&LOOKS)).await;
             }
         }
         std::future::pending().await
     }
 
-    fn pause(&self) -> Duration {
-        (self.begin.elapsed() / PART).clamp(PAUSE.0, PAUSE.1)
+    fn pause(&self, pace: &Pace) -> Duration {
+        (self.begin.elapsed() / pace.part).clamp(pace.shortest, pace.longest)
     }
 
     /// Asks Webots whether it has a world.
