@@ -14,6 +14,8 @@ const HOME = /^https:\/\/cyberbotics\.com\/wwi\/[^/]+\//;
 const wanted = new URLSearchParams(location.hash.slice(1));
 const script = wanted.get('script') ?? '';
 const words = await wordsOfPage(wanted.get('lang'));
+document.title = words.stage.webotsViewer;
+find('heading', HTMLElement).textContent = words.stage.webotsViewer;
 const base = script.slice(0, script.lastIndexOf('/') + 1);
 
 /** @param {string} text */

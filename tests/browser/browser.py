@@ -88,13 +88,14 @@ class Page:
         return {part.hostname for part in parts if part.scheme not in ("data", "blob", "about")}
 
     def faults(self, frame=None):
-        """The serious and critical violations that axe-core finds, in the page or in a frame of it."""
+        """All violations that axe-core finds, in the page or in a frame of it."""
         # Console messages of axe-core itself are not errors of the page.
         complaints = list(self.complaints)
         violations = Axe().run(frame or self.tab).response["violations"]
         self.complaints[:] = complaints
-        grave = [one for one in violations if one["impact"] in ("serious", "critical")]
-        return [f"{one['id']}: {node['html'][:200]} {node['failureSummary']}" for one in grave for node in one["nodes"]]
+        return [
+            f"{one['id']}: {node['html'][:200]} {node['failureSummary']}" for one in violations for node in one["nodes"]
+        ]
 
     def overflow(self, frame=None):
         """The number of pixels by which the page, or a frame of it, is wider than its window."""
