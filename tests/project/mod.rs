@@ -9,3 +9,4 @@ mod layering;
 mod pages;
 mod reasons;
 mod refusals;
+mod releases;
