@@ -162,6 +162,13 @@ async fn strangers_get_no_paths_process_ids_names_of_users_or_of_the_machine() {
         );
         assert_ne!(status["host"]["name"] == "", is_shown, "{}", status["host"]);
     }
+    // The monitor tells the same. Without a password all visitors see the name.
+    let shows_name = "<dt>Host</dt>";
+    assert!(page(&server).await.contains(shows_name));
+    let strangers = http::get(&server.url("/monitor")).await.text();
+    assert!(!strangers.contains(shows_name), "{strangers}");
+    let open = demo_server(1).start().await;
+    assert!(http::get(&open.url("/monitor")).await.text().contains(shows_name));
 }
 
 #[actix_rt::test]
