@@ -91,3 +91,24 @@ fn every_file_that_contributors_are_sent_to_is_there() {
         );
     }
 }
+
+#[test]
+fn every_test_module_that_contributors_are_sent_to_is_there() {
+    let page = std::fs::read_to_string(root().join("CONTRIBUTING.md")).unwrap();
+    let table = page.split("\n## Which tests cover a change\n").nth(1).unwrap();
+    let table = table.split("\n## ").next().unwrap();
+    let rows = table
+        .lines()
+        .filter(|row| row.starts_with("| ") && !row.starts_with("| change "));
+    let cells = rows.filter_map(|row| row.split('|').nth(3));
+    let names = cells.flat_map(|cell| cell.split('`').skip(1).step_by(2));
+    let modules: Vec<&str> = names.flat_map(str::split_whitespace).collect();
+    assert!(modules.len() > 30, "{modules:?}");
+    for module in modules {
+        let path = root()
+            .join("tests")
+            .join(module.trim_end_matches("::").replace("::", "/"));
+        let is_there = path.is_dir() || path.with_extension("rs").is_file();
+        assert!(is_there, "there are no tests {module}");
+    }
+}
