@@ -268,20 +268,7 @@ pub async fn serve(assembly: Application) -> Result<(), AppError> {
         port,
     );
     let slots = Arc::clone(&server.slots);
-    let checked = Arc::clone(&slots);
-    actix_rt::spawn(async move {
-        permanent::restarted("the check of slots", async || Arc::clone(&checked).recheck().await).await;
-    });
-    let histogram = server.metrics.histogram(
-        "webots_simulation_real_time_factor",
-        "Simulated seconds per second of running simulations, every five seconds",
-        &REAL_TIME_FACTORS,
-    )?;
-    let (target, timed) = (config.real_time.target, Arc::clone(&slots));
-    actix_rt::spawn(async move {
-        let follow = async || Arc::clone(&timed).follow_real_time(target, histogram.clone()).await;
-        permanent::restarted("the times of simulations", follow).await;
-    });
+    follow_slots(&slots, &server)?;
     let spare_keeper = SpareKeeper::new(Arc::clone(&server)).start();
     // This runs unless this thread is blocked, or another one holds the lock of the slots.
     // The service manager expects it of the process that has the port only.
@@ -350,10 +337,29 @@ async fn begin(
     }
     predecessors.publish();
     let followed = Arc::clone(predecessors);
-    actix_rt::spawn(async move {
-        permanent::restarted("older processes", async || Arc::clone(&followed).follow().await).await;
+    keep_up("older processes", async move || Arc::clone(&followed).follow().await);
+    Ok(())
+}
+
+/// Starts the tasks that look after slots: those that are reserved, and how fast simulations run.
+fn follow_slots(slots: &Arc<SlotPool>, server: &AppState) -> Result<(), AppError> {
+    let histogram = server.metrics.histogram(
+        "webots_simulation_real_time_factor",
+        "Simulated seconds per second of running simulations, every five seconds",
+        &REAL_TIME_FACTORS,
+    )?;
+    let (checked, timed) = (Arc::clone(slots), Arc::clone(slots));
+    keep_up("the check of slots", async move || Arc::clone(&checked).recheck().await);
+    let target = server.config.real_time.target;
+    keep_up("the times of simulations", async move || {
+        Arc::clone(&timed).follow_real_time(target, histogram.clone()).await;
     });
     Ok(())
+}
+
+/// Runs a task in the background, and restarts it if it panics.
+fn keep_up(name: &'static str, task: impl AsyncFnMut() + 'static) {
+    actix_rt::spawn(async move { permanent::restarted(name, task).await });
 }
 
 /// Handles signals, and orders of other processes, until the server must stop. Returns the reason.
