@@ -241,7 +241,7 @@ impl Client {
 
     /// Like [`Client::until`], with a longer timeout: a busy machine may have to build an image first.
     pub async fn patiently(&mut self, beginning: &str) -> String {
-        self.within(beginning, Duration::from_secs(90)).await
+        self.within(beginning, Duration::from_mins(5)).await
     }
 
     /// Like [`Client::until`], with this timeout.
