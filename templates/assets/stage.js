@@ -58,7 +58,8 @@ export class Stage {
     this.#shows += 1;
     const show = this.#shows;
     const webots = viewer === 'small' ? undefined : ((await ownViewer(server)) ?? script);
-    const viewers = webots ? undefined : await small();
+    const isSmall = !webots || (viewer === 'automatic' && (await (await small()).isDemonstration(address, kind)));
+    const viewers = isSmall ? await small() : undefined;
     if (show !== this.#shows) {
       return;
     }
@@ -68,7 +69,7 @@ export class Stage {
     } else if (webots) {
       this.#showWebots(address, webots);
     }
-    if (viewers && viewer === 'webots') {
+    if (isSmall && viewer === 'webots') {
       say(this.#words.stage.onlySmall);
     }
   }
