@@ -131,7 +131,7 @@ class() { # CLIENTS OVER STAY REAL_TIME ARGUMENT...
 # class even on a slow machine. Waits first until the simulations of earlier classes have ended. Callers wait for $clients.
 full_class() { # CLIENTS
     within 60 everywhere run_simulations 0
-    class "$1" 1s 12s 0.01 &
+    class "$1" 1s 24s 0.01 &
     clients=$!
     within 60 everywhere run_simulations "$1"
 }
