@@ -45,7 +45,7 @@ export class Panel {
     this.#begin = begin;
     this.#take = take;
     this.#parts = { ...this.#top(), ...this.#notices(), ...this.#steps() };
-    const stage = part('stage', make('section', { id: 'stage', className: 'sheet stage', role: 'group' }));
+    const stage = part('stage', make('div', { id: 'stage', className: 'sheet stage', role: 'group' }));
     stage.setAttribute('aria-label', words.page.simulation);
     this.stage = new Stage(stage, { words, base, tell: take, time });
     this.stage.clear(words.stage.clear);
@@ -174,11 +174,13 @@ export class Panel {
     const watched = hidden({ id: 'watched', role: 'status', textContent: page.watched });
     const slow = hidden({ id: 'slow', role: 'status' });
     const title = make('h2', { id: 'steps-title', textContent: page.steps });
-    const section = part('steps', make('section', { className: 'sheet steps' }, title, list, left, slow, watched));
-    section.setAttribute('aria-labelledby', title.id);
+    const group = part(
+      'steps',
+      make('div', { className: 'sheet steps', role: 'group' }, title, list, left, slow, watched),
+    );
     // No landmark: a page may have several elements, and each landmark needs a name of its own.
-    section.role = 'group';
-    return { steps, left, slow, watched, workbench: make('div', { className: 'workbench' }, section) };
+    group.setAttribute('aria-labelledby', title.id);
+    return { steps, left, slow, watched, workbench: make('div', { className: 'workbench' }, group) };
   }
 
   /* drawing */
