@@ -99,11 +99,24 @@ mod tests {
 
     #[actix_rt::test]
     async fn a_task_that_panics_again_and_again_ends_the_server() {
-        // The process that ends is a second run of this test.
         if std::env::var_os("PANICS").is_some() {
             restarted("a task", async || panic!("this panic is part of a test")).await;
         }
-        let this = concat!(module_path!(), "::a_task_that_panics_again_and_again_ends_the_server");
+        ends_with_1("a_task_that_panics_again_and_again_ends_the_server").await;
+    }
+
+    #[actix_rt::test]
+    async fn a_thread_that_panics_ends_the_server() {
+        if std::env::var_os("PANICS").is_some() {
+            thread("a thread", || panic!("this panic is part of a test")).unwrap();
+            std::future::pending::<()>().await;
+        }
+        ends_with_1("a_thread_that_panics_ends_the_server").await;
+    }
+
+    /// Runs this test of this module again, as a process that panics, which must end with exit code 1.
+    async fn ends_with_1(test: &str) {
+        let this = format!("{}::{test}", module_path!());
         let this = this.split_once("::").unwrap().1;
         let mut again = tokio::process::Command::new(std::env::current_exe().unwrap());
         let ended = again
