@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Checks the JavaScript of the pages (types, lints, format, and its tests without a browser) and all Python (lints,
-# format), in seconds: tests/lint.sh
+# Checks the JavaScript of the pages (types, lints, format, and its tests without a browser), the workflows of the hosted
+# CI, and all Python (lints, format), in seconds: tests/lint.sh
 # With --fix it first formats the files, and mends what can be mended without a decision.
 set -eu
 cd "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/.."
