@@ -15,15 +15,19 @@ const WHY: &str = "The simulation was paused for 0.05 min";
 
 #[actix_rt::test]
 async fn a_paused_simulation_ends_unless_its_client_keeps_it() {
-    let server = quick(demo_server(1)).set("idleTimeout", LIMIT).start().await;
+    let builder = quick(demo_server(1)).set("idleTimeout", LIMIT);
+    let server = builder.set("streaming", "relay").start().await;
     // An old page that sends nothing more.
     let begin = Instant::now();
     let mut client = Client::start(&server, &arm()).await;
+    let address = client.until("webots:").await;
+    let stream = Client::connect(address.strip_prefix("webots:").unwrap()).await;
+    let mut viewer = stream.with_scene().await;
     assert_eq!(client.until("idle:").await, TOLD);
-    assert!(client.heard.iter().any(|text| text.starts_with("webots:")));
     let told = client.until("loading: Error:").await;
     assert!(told.starts_with(&format!("loading: Error: {WHY}")), "{told}");
     assert_eq!(client.closed().await, Some(1000));
+    assert_eq!(viewer.closed_with().await, Some((1000, WHY.to_owned())));
     assert!(begin.elapsed() >= Duration::from_secs(3), "{:?}", begin.elapsed());
     nothing_left(&server, 1).await;
     let metrics = server.metrics().await;

@@ -4,9 +4,10 @@ use std::time::{Duration, Instant};
 
 use webots_fleet::shared::domain::Reason;
 use webots_fleet::shared::domain::Stage;
+use webots_fleet::simulation::config::Streaming;
 
 use crate::inside::Inside;
-use crate::support::until;
+use crate::support::{Client, until};
 
 pub async fn a_simulation_ends_at_its_time_limit_in_any_state() {
     // At level `none`, hidden processes live as long as the server.
@@ -14,6 +15,7 @@ pub async fn a_simulation_ends_at_its_time_limit_in_any_state() {
     for stage in [Stage::Launching, Stage::Idle, Stage::Running, Stage::Stopping] {
         let inside = Inside::new(stage, |config| {
             config.timeout = 5;
+            config.streaming = Streaming::Relay;
             config.timing.grace = Duration::from_millis(500);
         })
         .await;
@@ -23,12 +25,24 @@ pub async fn a_simulation_ends_at_its_time_limit_in_any_state() {
         if stage != Stage::Stopping {
             inside.until(stage).await;
         }
+        let mut viewer = None;
+        if stage == Stage::Running {
+            let address = client.until("webots:").await;
+            let stream = Client::connect(address.strip_prefix("webots:").unwrap()).await;
+            viewer = Some(stream.with_running_scene().await);
+        }
         let told = client.until("loading: Error:").await;
         assert!(
             told.starts_with("loading: Error: The time limit of 5 seconds was reached"),
             "{stage:?}: {told}"
         );
         assert_eq!(client.closed().await, Some(1000), "{stage:?}");
+        if let Some(mut viewer) = viewer {
+            let reason = "The time limit of 5 seconds was reached".to_owned();
+            assert_eq!(viewer.closed_with().await, Some((1000, reason)));
+            let last = viewer.heard.last().unwrap();
+            assert!(last.starts_with("application/json:"), "the time ran: {last}");
+        }
         assert!(
             begin.elapsed() >= Duration::from_secs(5),
             "{stage:?}: it came too early"

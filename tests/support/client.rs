@@ -261,9 +261,15 @@ impl Client {
 
     /// The close code that ends the connection; `None` if it ended without one.
     pub async fn closed(&mut self) -> Option<u16> {
+        self.closed_with().await.map(|(code, _)| code)
+    }
+
+    /// The close code that ends the connection, and its reason; `None` if it ended without them, for example within a
+    /// frame.
+    pub async fn closed_with(&mut self) -> Option<(u16, String)> {
         loop {
             if let Heard::Closed(frame) = self.next().await {
-                return frame.map(|frame| frame.code.into());
+                return frame.map(|frame| (frame.code.into(), frame.reason.to_string()));
             }
         }
     }
