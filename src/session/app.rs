@@ -11,7 +11,7 @@ use tokio::sync::watch;
 use super::config::SessionConfig;
 use super::state::{AppState, PLACED};
 use crate::session::class::Roster;
-use crate::session::fleet::{GetStatus, Reconfigure, Registry};
+use crate::session::fleet::{GetStatus, ReadyRequests, Reconfigure, Registry};
 use crate::session::web::configure;
 use crate::shared::config;
 use crate::shared::domain::{ClientUrls, FleetKey, Reason};
@@ -159,7 +159,14 @@ fn assemble(
         &WAITED,
     )?;
     let roster = Arc::new(Roster::default());
-    let registry = Registry::start(Arc::clone(&config), available_sender, waited, Arc::clone(&roster))?;
+    let (ready_requests, requested) = ReadyRequests::open(&config);
+    let registry = Registry::start(
+        Arc::clone(&config),
+        available_sender,
+        waited,
+        Arc::clone(&roster),
+        requested,
+    )?;
     let key = config.fleet_key.as_ref().map(|key| FleetKey::new(key.reveal()));
     let key = key.unwrap_or_else(FleetKey::random);
     let admin_auth = AdminAuth::new(AuthSettings {
@@ -176,6 +183,7 @@ fn assemble(
     Ok(AppState {
         key,
         registry,
+        ready_requests,
         roster,
         run: rand::random(),
         line_seen: tokio::sync::Mutex::default(),

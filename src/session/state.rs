@@ -10,7 +10,7 @@ use tokio::sync::{Mutex, watch};
 
 use super::config::SessionConfig;
 use crate::session::class::Roster;
-use crate::session::fleet::{FleetStatus, GetStatus, GetWaiting, Pick, Registry, Wait};
+use crate::session::fleet::{FleetStatus, GetStatus, GetWaiting, Pick, ReadyRequests, Registry, Wait};
 use crate::session::line::Place;
 use crate::shared::domain::{ClientUrls, Failure, FleetKey, ProjectUrl, PublicAddress, Reason};
 use crate::shared::http::{AdminAuth, ConnectionKind, ConnectionLimiter, LiveUpdates, Metrics, SharedPage};
@@ -26,6 +26,8 @@ const LINE_AGE: Duration = Duration::from_millis(500);
 pub struct AppState {
     /// The registry of simulation servers.
     pub registry: Addr<Registry>,
+    /// What `POST /ready` has asked for.
+    pub ready_requests: ReadyRequests,
     /// All simulations of the fleet, and who waits.
     pub roster: Arc<Roster>,
     /// This run of the server, to which the versions of the roster belong.

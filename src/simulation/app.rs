@@ -440,7 +440,7 @@ fn assemble(
     let checkouts = CheckoutService::open(&cache, run.path(), Arc::clone(&config), rules.clone());
     let checkouts = checkouts.map_err(cache_fault)?;
     let metrics = Metrics::default();
-    let logs = config.log_dir.0.join("simulation");
+    let logs = config.records();
     let ends = Ends::start(logs, launcher.level().to_string(), config.record_months, &metrics)?;
     let slots = SlotPool::new(
         config.streaming_ports(),
@@ -452,9 +452,7 @@ fn assemble(
         ends.clone(),
     );
     let predecessors = Predecessors::new(&cache, living, Arc::clone(&slots));
-    let csv = config
-        .monitor_log_enabled
-        .then(|| config.log_dir.0.join("simulation/monitor.csv"));
+    let csv = config.monitor_log_enabled.then(|| config.records().join("monitor.csv"));
     let spread = Arc::new(Spread::over(config.displays_of_gpus().len()));
     let thread = || Arbiter::try_new().map(|thread| thread.handle());
     let (load_monitor, readings) = LoadMonitor::new(slots.clone(), run.path(), csv, spread.clone())?;

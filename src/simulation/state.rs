@@ -12,7 +12,7 @@ use super::attachment::ResumableSessions;
 use super::config::SimulationConfig;
 use super::ends::Ends;
 use super::handover::Predecessors;
-use super::handover::control::StopOrder;
+use super::handover::control::ForwardedStop;
 use super::readiness::FailedStarts;
 use super::slots::{SlotPool, SpareKind, SpareStatus};
 use super::spare_wishes::SpareWishes;
@@ -51,7 +51,7 @@ pub struct AppState {
     pub rules: AdmissionRules,
     /// The processes of this server before this one.
     pub predecessors: Arc<Predecessors>,
-    /// Leases slots.
+    /// The slots of all simulations.
     pub slots: Arc<SlotPool>,
     /// What simulations are asked for to be kept ready.
     pub spare_wishes: SpareWishes,
@@ -165,7 +165,7 @@ impl AppState {
     /// Stops the simulations with these ids, for a reason, which may be empty; `by` is who stops them, for the log. Returns
     /// the ids of those that are there.
     pub fn stop(&self, ids: &[String], reason: &str, by: &str) -> Vec<String> {
-        let order = StopOrder {
+        let order = ForwardedStop {
             ids: ids.to_vec(),
             reason: reason.to_owned(),
             by: by.to_owned(),

@@ -24,8 +24,8 @@ use tokio::sync::Mutex;
 use tokio::sync::mpsc::UnboundedSender;
 
 use super::config::SimulationConfig;
-use super::handover::control::{self, Reply, Request, StopOrder, read, write};
-use super::handover::{PROTOCOL, Passed, TAKES_OVER, ToPredecessor, ToSuccessor};
+use super::handover::control::{self, ForwardedStop, Reply, Request, read, write};
+use super::handover::{PROTOCOL, TAKES_OVER, Takeover, ToPredecessor, ToSuccessor};
 use super::run_id::RunId;
 use super::state::AppState;
 use crate::shared::run::{Phase, ServerCommand, passing, service_manager};
@@ -115,7 +115,7 @@ impl Control {
         let mut socket = BufReader::new(socket);
         let reply = match timeout(REQUEST, read(&mut socket)).await? {
             Ok(Request::Look) => Reply::Holdings(self.server.slots.give_up_free()),
-            Ok(Request::Stop(StopOrder { ids, reason, by })) => {
+            Ok(Request::Stop(ForwardedStop { ids, reason, by })) => {
                 Reply::Done(self.server.stop_here(&ids, &reason, &by).join(" "))
             }
             Ok(Request::End) => {
@@ -245,7 +245,7 @@ async fn check() -> Result<(), String> {
 /// Starts the new process with what it gets. Returns the other end of its standard input.
 async fn launch(estate: &Estate) -> io::Result<UnixStream> {
     let (own, theirs) = std::os::unix::net::UnixStream::pair()?;
-    let passed = Passed {
+    let passed = Takeover {
         protocol: PROTOCOL,
         run: RunId::own(),
         sign_in: estate.sign_in.clone(),

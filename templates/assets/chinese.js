@@ -203,6 +203,7 @@ export const words = {
     crashed: 'Webots 崩溃了。',
     hung: 'Webots 没有响应。',
     'memory-limit': '仿真占用的内存过多。',
+    'out-of-memory': '服务器的内存已用尽。',
     'disk-limit': '仿真写入的数据过多。',
     lost: '服务器丢失了仿真。',
     ended: '仿真已结束。',

@@ -213,6 +213,7 @@ export const words = {
     crashed: 'Webots a planté.',
     hung: 'Webots ne répondait plus.',
     'memory-limit': 'La simulation a utilisé trop de mémoire.',
+    'out-of-memory': 'Le serveur n’avait plus de mémoire.',
     'disk-limit': 'La simulation a écrit trop de données.',
     lost: 'Le serveur a perdu la simulation.',
     ended: 'La simulation est terminée.',

@@ -215,6 +215,7 @@ export const words = {
     crashed: 'Webots ist abgestürzt.',
     hung: 'Webots reagierte nicht mehr.',
     'memory-limit': 'Die Simulation brauchte zu viel Arbeitsspeicher.',
+    'out-of-memory': 'Dem Server ging der Arbeitsspeicher aus.',
     'disk-limit': 'Die Simulation schrieb zu viele Daten.',
     lost: 'Der Server hat die Simulation verloren.',
     ended: 'Die Simulation ist beendet.',

@@ -209,6 +209,7 @@ export const words = {
     crashed: 'Webots が異常終了しました。',
     hung: 'Webots が応答しなくなりました。',
     'memory-limit': 'シミュレーションがメモリーを使いすぎました。',
+    'out-of-memory': 'サーバーのメモリーが足りなくなりました。',
     'disk-limit': 'シミュレーションが書き込んだデータが多すぎました。',
     lost: 'サーバーがシミュレーションを失いました。',
     ended: 'シミュレーションは終了しました。',

@@ -56,6 +56,7 @@ export const ADVICE = {
   crashed: 'project',
   hung: 'project',
   'memory-limit': 'project',
+  'out-of-memory': 'later',
   'disk-limit': 'project',
   lost: 'general',
   ended: 'again',

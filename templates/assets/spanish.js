@@ -213,6 +213,7 @@ export const words = {
     crashed: 'Webots ha fallado.',
     hung: 'Webots dejó de responder.',
     'memory-limit': 'La simulación usó demasiada memoria.',
+    'out-of-memory': 'El servidor se quedó sin memoria.',
     'disk-limit': 'La simulación escribió demasiados datos.',
     lost: 'El servidor ha perdido la simulación.',
     ended: 'La simulación ha terminado.',

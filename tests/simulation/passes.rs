@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use serde_json::{Value, json};
 use webots_fleet::shared::domain::{
-    FleetKey, Hello, Offers, Pass, Passed, ProjectUrl, ReservationId, ServerRun, Wish, Wishes,
+    FleetKey, Hello, Offers, Pass, PassedOver, ProjectUrl, ReservationId, ServerRun, Wish, Wishes,
 };
 
 use crate::support::program::{Builder, Server};
@@ -295,7 +295,7 @@ async fn who_has_its_share_is_passed_over_and_keeps_its_place() {
     let offers = link.offers().await;
     assert_eq!(offers.offers[0].ticket, 2);
     // So the session server can name others instead.
-    assert_eq!(offers.passed, [Passed::Address("203.0.113.9".parse().unwrap())]);
+    assert_eq!(offers.passed, [PassedOver::Address("203.0.113.9".parse().unwrap())]);
     greedy.leave().await;
     let offers = link.offers().await;
     assert_eq!((offers.offers[0].ticket, offers.passed), (1, Vec::new()));

@@ -2,7 +2,7 @@
 
 use std::collections::{HashMap, HashSet};
 use std::net::IpAddr;
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, Instant};
 
 use actix::prelude::*;
 use prometheus::Histogram;
@@ -12,10 +12,11 @@ use super::server_table::{ServerTable, admission, terms};
 use super::slot_link::{LinkChange, LinkEvent};
 use crate::session::class::{ClassEntry, ClassState};
 use crate::session::line::{
-    Dispatcher, Entered, Entry, LineStatus, Moment, Place, Progress, Served, Ticket, Turn, WaitingClient,
+    Dispatcher, Entered, Entry, LineStatus, Moment, Place, Position, Served, Ticket, Turn, WaitingClient,
 };
 use crate::session::placement::ReadyWorlds;
 use crate::shared::domain::{Failure, ProjectUrl, PublicAddress, Reason, ServerReport};
+use crate::shared::run::milliseconds_since_1970;
 
 /// Asks for a slot, and waits for it in the line. The answer is the place, unless it is the client's turn already.
 #[derive(Message, Debug)]
@@ -49,7 +50,7 @@ pub enum LineEvent {
     /// Its place, for which it needs a new ticket.
     Ticket(Place),
     /// How it stands.
-    Progress(Progress),
+    Position(Position),
     /// It is its turn.
     Turn(Turn<PublicAddress>),
     /// Another connection has its place.
@@ -189,7 +190,7 @@ impl LineKeeper {
         self.told = now;
         self.dispatcher.forget(now);
         for (client, progress) in self.dispatcher.news(now) {
-            client.do_send(LineEvent::Progress(progress));
+            client.do_send(LineEvent::Position(progress));
         }
         for (client, place) in self.dispatcher.renewals(now) {
             client.do_send(LineEvent::Ticket(place));
@@ -236,7 +237,7 @@ impl LineKeeper {
         let Served { turns, wishes } = served;
         self.give(turns, ready);
         for (client, progress) in self.dispatcher.first_news(now.instant) {
-            client.do_send(LineEvent::Progress(progress));
+            client.do_send(LineEvent::Position(progress));
         }
         for (server, wishes) in wishes {
             servers.ask(&server, wishes);
@@ -253,9 +254,8 @@ impl LineKeeper {
 }
 
 fn moment() -> Moment {
-    let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
     Moment {
         instant: Instant::now(),
-        unix: since.map_or(0, |since| u64::try_from(since.as_millis()).unwrap_or(u64::MAX)),
+        unix: milliseconds_since_1970(),
     }
 }

@@ -2,6 +2,7 @@
 
 mod line_keeper;
 mod name_table;
+mod ready_requests;
 mod ready_shares;
 mod refusal;
 mod registry;
@@ -13,7 +14,8 @@ mod slot_link;
 mod state_history;
 
 pub use line_keeper::{LineEvent, StopWaiting, Wait};
-pub use registry::{GetMonitors, GetStatus, GetWaiting, Pick, Reconfigure, Registry, RequestReady};
+pub use ready_requests::ReadyRequests;
+pub use registry::{GetMonitors, GetStatus, GetWaiting, Pick, Reconfigure, Registry};
 pub use server_monitor::GetRecords;
 pub use server_record::{
     Answer, FleetStatus, Intake, NameStatus, ServerRecord, ServerState, ServerStatus, StateChange, StateName,

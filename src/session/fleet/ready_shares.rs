@@ -2,11 +2,10 @@
 //! server. Part of the registry.
 
 use std::collections::{BTreeMap, HashMap};
-use std::io::Write;
-use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use jiff::Timestamp;
+use tokio::sync::watch;
 
 use super::server_record::ServerState;
 use super::server_table::{ServerTable, admission};
@@ -17,10 +16,8 @@ use crate::shared::domain::{KeepReady, Load, ProjectUrl, PublicAddress, ReadyCou
 
 /// The lists, and what each server was asked for.
 pub(super) struct ReadyShares {
-    /// The entries of `POST /ready` that are not over.
-    requested: Vec<ReadyEntry>,
-    /// The file that they are kept in.
-    file: PathBuf,
+    /// The entries of `POST /ready`.
+    requested: watch::Receiver<Vec<ReadyEntry>>,
     /// The servers that keep simulations ready on request, with what they were asked for last.
     asked: HashMap<PublicAddress, Option<Vec<ReadyCount>>>,
     shared: Instant,
@@ -28,60 +25,30 @@ pub(super) struct ReadyShares {
 
 /// Interval between two looks at what is wanted.
 const INTERVAL: Duration = Duration::from_secs(1);
-/// Most entries of `POST /ready`.
-const MAX_REQUESTED: usize = 1000;
 
 impl ReadyShares {
-    /// Reads what was requested before the last end of the server.
-    pub(super) fn open(config: &SessionConfig) -> Self {
-        let file = config.log_dir.0.join("session/ready.json");
-        let requested = match std::fs::read_to_string(&file) {
-            Ok(text) => serde_json::from_str(&text).unwrap_or_else(|error| {
-                log::warn!("{} is ignored: {error}", file.display());
-                Vec::new()
-            }),
-            Err(_) => Vec::new(),
-        };
+    pub(super) fn new(requested: watch::Receiver<Vec<ReadyEntry>>) -> Self {
         Self {
             requested,
-            file,
             asked: HashMap::new(),
             shared: Instant::now(),
         }
     }
 
-    /// Adds an entry, or replaces that of the same world and mode; with `count` 0 removes it.
-    ///
-    /// # Errors
-    /// When there are too many, or they can't be kept.
-    pub(super) fn request(&mut self, entry: ReadyEntry) -> Result<(), String> {
-        let now = Timestamp::now();
-        let mut requested = self.requested.clone();
-        requested.retain(|one| !one.is_over(now) && (&one.world, one.mode) != (&entry.world, entry.mode));
-        if entry.count > 0 {
-            requested.push(entry);
-        }
-        if requested.len() > MAX_REQUESTED {
-            return Err(format!("{MAX_REQUESTED} worlds are requested already"));
-        }
-        keep(&self.file, &requested).map_err(|error| format!("it can't be kept: {error}"))?;
-        self.requested = requested;
-        Ok(())
-    }
-
     /// The entries of `POST /ready`.
-    pub(super) fn requested(&self) -> &[ReadyEntry] {
-        &self.requested
+    pub(super) fn requested(&self) -> Vec<ReadyEntry> {
+        self.requested.borrow().clone()
     }
 
     /// How many of each listed world the fleet is to keep ready now.
     pub(super) fn wanted(&self, config: &SessionConfig) -> Vec<ReadyCount> {
         let now = Timestamp::now();
+        let requested = self.requested.borrow();
         let mut wanted: BTreeMap<(&ProjectUrl, View), u32> = BTreeMap::new();
         for entry in config
             .ready
             .iter()
-            .chain(&self.requested)
+            .chain(requested.iter())
             .filter(|entry| !entry.is_over(now))
         {
             let most = wanted.entry((&entry.world, entry.mode)).or_default();
@@ -145,14 +112,4 @@ impl ReadyShares {
             }
         }
     }
-}
-
-/// Writes a file, whole or not at all.
-fn keep(path: &Path, entries: &[ReadyEntry]) -> std::io::Result<()> {
-    let folder = path.parent().unwrap_or(Path::new("."));
-    std::fs::create_dir_all(folder)?;
-    let mut file = tempfile::NamedTempFile::new_in(folder)?;
-    file.write_all(&serde_json::to_vec(entries)?)?;
-    file.persist(path)?;
-    Ok(())
 }

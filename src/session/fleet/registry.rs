@@ -55,11 +55,6 @@ pub struct GetMonitors;
 #[rtype(result = "()")]
 pub struct Reconfigure(pub Arc<SessionConfig>);
 
-/// Asks the fleet to keep simulations of a world ready. The error is a text for the administrator.
-#[derive(Message)]
-#[rtype(result = "Result<(), String>")]
-pub struct RequestReady(pub ReadyEntry);
-
 /// The actor.
 pub struct Registry {
     config: Arc<SessionConfig>,
@@ -98,7 +93,8 @@ const TICK: Duration = Duration::from_millis(250);
 
 impl Registry {
     /// Starts the registry and its monitors. It publishes in `available` whether a server can take a client, and observes
-    /// in `waited` how long clients have waited in the line. Simulation servers tell `roster` which simulations they have.
+    /// in `waited` how long clients have waited in the line. Simulation servers tell `roster` which simulations they have. `requested`
+    /// are the worlds that `POST /ready` asks for.
     ///
     /// # Errors
     /// When the system starts no thread for the monitors.
@@ -107,6 +103,7 @@ impl Registry {
         available: watch::Sender<bool>,
         waited: Histogram,
         roster: Arc<Roster>,
+        requested: watch::Receiver<Vec<ReadyEntry>>,
     ) -> std::io::Result<Addr<Self>> {
         let thread = Arbiter::try_new()?.handle();
         Ok(Self::create(|ctx| {
@@ -122,7 +119,7 @@ impl Registry {
                 changes: StateHistory::new(&config),
                 pending: Pending::default(),
                 line: LineKeeper::new(waited, config.fleet_key.is_some()),
-                ready: ReadyShares::open(&config),
+                ready: ReadyShares::new(requested),
                 config,
                 servers,
                 available,
@@ -348,14 +345,6 @@ impl Handler<Settle> for Registry {
     }
 }
 
-impl Handler<RequestReady> for Registry {
-    type Result = Result<(), String>;
-
-    fn handle(&mut self, RequestReady(entry): RequestReady, _: &mut Self::Context) -> Self::Result {
-        self.ready.request(entry)
-    }
-}
-
 impl Handler<GetStatus> for Registry {
     type Result = MessageResult<GetStatus>;
 
@@ -373,7 +362,7 @@ impl Handler<GetStatus> for Registry {
             changes: self.changes.recent.clone(),
             line: self.line.status(),
             ready: self.ready.wanted(&self.config),
-            requested: self.ready.requested().to_vec(),
+            requested: self.ready.requested(),
         }))
     }
 }

@@ -12,7 +12,7 @@ use super::classes::{ClassId, Classes, Doors};
 use super::link::Link;
 use super::rate::{Basis, Rate};
 use super::ticket::Ticket;
-use super::waiting_line::{Entry, LISTED, Place, Progress, WaitingClient, WaitingLine};
+use super::waiting_line::{Entry, LISTED, Place, Position, WaitingClient, WaitingLine};
 use crate::session::placement::{LoadBalancer, ReadyWorlds};
 use crate::shared::domain::{Admission, Hello, Offers, Pass, ProjectUrl, Wishes};
 
@@ -476,7 +476,7 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
     }
 
     /// How the clients stand that have just come.
-    pub fn first_news(&mut self, now: Instant) -> Vec<(Client, Progress)> {
+    pub fn first_news(&mut self, now: Instant) -> Vec<(Client, Position)> {
         let newcomers = std::mem::take(&mut self.newcomers);
         let Some(first) = newcomers.into_iter().min() else {
             return Vec::new();
@@ -486,7 +486,7 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
     }
 
     /// For each client the progress that it has to hear now, if any.
-    pub fn news(&mut self, now: Instant) -> Vec<(Client, Progress)> {
+    pub fn news(&mut self, now: Instant) -> Vec<(Client, Position)> {
         self.newcomers.clear();
         let Self { line, links, rates, .. } = self;
         let classes = line.classes();

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::waiting_line::{LISTED, Place};
-use crate::shared::domain::{Hello, Offers, Passed, ReservationId, ServerRun, Wish, Wishes};
+use crate::shared::domain::{Hello, Offers, PassedOver, ReservationId, ServerRun, Wish, Wishes};
 
 /// The longest time that a reservation may hold.
 const MAX_PASS: Duration = Duration::from_hours(1);
@@ -32,7 +32,7 @@ pub(super) struct Link {
     /// When the clients at its own door have come, in milliseconds since 1970, in order.
     pub(super) queue: Vec<u64>,
     /// Whom it passes over, of those that it was told of.
-    pub(super) passed: Vec<Passed>,
+    pub(super) passed: Vec<PassedOver>,
 }
 
 impl Link {
@@ -185,7 +185,7 @@ mod tests {
         let mut link = link();
         let offers = Offers {
             queue: vec![5; 100_000],
-            passed: (0..20_000).map(|number| Passed::User(number.to_string())).collect(),
+            passed: (0..20_000).map(|number| PassedOver::User(number.to_string())).collect(),
             ..Offers::default()
         };
         link.answered(&offers, 7);

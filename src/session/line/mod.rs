@@ -18,4 +18,4 @@ mod waiting_line;
 
 pub use dispatcher::{Dispatcher, Entered, LineStatus, Moment, Served, Turn, WaitingFor};
 pub use ticket::Ticket;
-pub use waiting_line::{Entry, Place, Progress, WaitingClient};
+pub use waiting_line::{Entry, Place, Position, WaitingClient};

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use super::classes::{ClassId, Classes, Doors, Group};
 use super::rate::estimate;
-use crate::shared::domain::{Admission, Passed, ProjectUrl, Wish};
+use crate::shared::domain::{Admission, PassedOver, ProjectUrl, Wish};
 
 /// A place in the line. Places sort by the time of arrival.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -52,7 +52,7 @@ pub struct WaitingClient<'line> {
 
 /// What a client in the line hears.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Progress {
+pub struct Position {
     /// Number of clients ahead that the same servers could take.
     pub ahead: u32,
     /// Seconds until its turn, as far as that can be estimated.
@@ -70,7 +70,7 @@ pub(super) struct Waiting<Client> {
     address: Option<IpAddr>,
     user: Option<Arc<str>>,
     /// What it heard last, and when.
-    heard: Option<(Progress, Instant)>,
+    heard: Option<(Position, Instant)>,
     /// When its ticket was sent last.
     ticket: Instant,
 }
@@ -257,9 +257,9 @@ impl<Server: Clone + Eq, Client: Clone> WaitingLine<Server, Client> {
 
     /// The first clients of these classes, as many as a simulation server is told of. `passed` are those whom it passes
     /// over.
-    pub(super) fn first(&self, classes: &[ClassId], passed: &[Passed]) -> Vec<Place> {
+    pub(super) fn first(&self, classes: &[ClassId], passed: &[PassedOver]) -> Vec<Place> {
         let mut listed = Vec::new();
-        let mut passed: Vec<(&Passed, usize)> = passed.iter().map(|one| (one, LISTED_OF_PASSED)).collect();
+        let mut passed: Vec<(&PassedOver, usize)> = passed.iter().map(|one| (one, LISTED_OF_PASSED)).collect();
         let mut texts = 0;
         for (place, waiting) in &self.waiting {
             if listed.len() == LISTED {
@@ -296,7 +296,7 @@ impl<Server: Clone + Eq, Client: Clone> WaitingLine<Server, Client> {
     }
 
     /// For each client the progress that it has to hear now, if any. `doors` are those of each class.
-    pub(super) fn news(&mut self, doors: &[Doors], now: Instant) -> Vec<(Client, Progress)> {
+    pub(super) fn news(&mut self, doors: &[Doors], now: Instant) -> Vec<(Client, Position)> {
         let mut news = Vec::new();
         let mut ahead = vec![0_u32; doors.len()];
         for (place, waiting) in &mut self.waiting {
@@ -305,7 +305,7 @@ impl<Server: Clone + Eq, Client: Clone> WaitingLine<Server, Client> {
             if let Some(count) = ahead.get_mut(class) {
                 *count += 1;
             }
-            let is_due = |(heard, at): (Progress, Instant)| {
+            let is_due = |(heard, at): (Position, Instant)| {
                 heard != stands && now.saturating_duration_since(at) >= INTERVAL.max(INTERVAL * stands.ahead / 100)
             };
             if waiting.heard.is_none_or(is_due) {
@@ -323,7 +323,7 @@ impl<Server: Clone + Eq, Client: Clone> WaitingLine<Server, Client> {
         from: Place,
         mut doors: impl FnMut(&Classes<Server>, ClassId) -> Doors,
         now: Instant,
-    ) -> Vec<(Client, Progress)> {
+    ) -> Vec<(Client, Position)> {
         let mut news = Vec::new();
         let mut ahead: Vec<u32> = self.classes.iter().map(|class| class.waiting).collect();
         let mut known = HashMap::new();
@@ -357,10 +357,10 @@ impl<Server: Clone + Eq, Client: Clone> WaitingLine<Server, Client> {
 
 impl<Client> Waiting<Client> {
     /// Whether it is one of these.
-    pub(super) fn is_of(&self, passed: &Passed) -> bool {
+    pub(super) fn is_of(&self, passed: &PassedOver) -> bool {
         match passed {
-            Passed::Address(address) => self.address == Some(*address),
-            Passed::User(user) => self.user.as_deref() == Some(user),
+            PassedOver::Address(address) => self.address == Some(*address),
+            PassedOver::User(user) => self.user.as_deref() == Some(user),
         }
     }
 }
@@ -372,11 +372,11 @@ fn progress<Server: Clone + Eq>(
     class: ClassId,
     ahead: &[u32],
     doors: Option<&Doors>,
-) -> Progress {
+) -> Position {
     let of_line = classes.competing(class, ahead);
     let at_doors = doors.map_or(0, |doors| doors.queue.partition_point(|since| *since < place.since));
     let ahead = of_line.saturating_add(u32::try_from(at_doors).unwrap_or(u32::MAX));
-    Progress {
+    Position {
         ahead,
         estimate: doors.and_then(|doors| estimate(doors.basis, ahead)),
     }

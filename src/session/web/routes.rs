@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 use std::sync::Arc;
 
-use actix_web::error::{ErrorInternalServerError, ErrorServiceUnavailable};
+use actix_web::error::ErrorInternalServerError;
 use actix_web::http::{StatusCode, header};
 use actix_web::{HttpRequest, HttpResponse, Result, web};
 use percent_encoding::percent_decode_str;
@@ -13,7 +13,6 @@ use super::refusal;
 use super::status::status_page;
 use super::web_client::WebClient;
 use super::{class_routes, metrics, page_routes};
-use crate::session::fleet::RequestReady;
 use crate::session::state::AppState;
 use crate::shared::domain::{ReadyEntry, Reason};
 use crate::shared::http::routing::{self, GET, POST, READ, body, json_body, path, retry_after};
@@ -189,8 +188,7 @@ async fn ready(request: HttpRequest, payload: web::Payload, server: web::Data<Ap
         entry.count,
         entry.world
     );
-    let kept = server.registry.send(RequestReady(entry)).await;
-    match kept.map_err(|_| ErrorServiceUnavailable("Error: the server stops."))? {
+    match server.ready_requests.add(entry).await {
         Ok(()) => Ok(HttpResponse::Ok().body("ok")),
         Err(why) => Ok(HttpResponse::InternalServerError().body(format!("Error: {why}."))),
     }

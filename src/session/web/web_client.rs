@@ -6,7 +6,6 @@
 
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::sync::Arc;
-use std::time::SystemTime;
 
 use actix::prelude::*;
 use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
@@ -19,13 +18,13 @@ use tokio::sync::watch;
 
 use super::refusal;
 use crate::session::fleet::{LineEvent, StopWaiting, Wait};
-use crate::session::line::{Place, Progress, Ticket};
+use crate::session::line::{Place, Position, Ticket};
 use crate::session::state::{AppState, PLACED, read_world};
 use crate::shared::domain::{Failure, ProjectUrl};
 use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::websocket::wrong_message;
 use crate::shared::http::{ConnectionPermit, Peer};
-use crate::shared::run::{Phase, closing};
+use crate::shared::run::{Phase, closing, milliseconds_since_1970};
 use crate::shared::text::{chosen_name, client_text};
 
 /// The actor.
@@ -120,7 +119,7 @@ impl WebClient {
         });
         let wait = Wait {
             world,
-            ticket: ticket.and_then(|text| Ticket::read(text, &self.server.key, now())),
+            ticket: ticket.and_then(|text| Ticket::read(text, &self.server.key, milliseconds_since_1970())),
             client: ctx.address().recipient(),
             connection: self.connection,
             from: self.peer.rate_limit_key(),
@@ -150,7 +149,10 @@ impl WebClient {
     }
 
     fn send_ticket(&self, place: Place, ctx: &mut Context) {
-        let ticket = Ticket { place, sent: now() };
+        let ticket = Ticket {
+            place,
+            sent: milliseconds_since_1970(),
+        };
         ctx.text(format!("ticket: {}", ticket.write(&self.server.key)));
     }
 
@@ -160,12 +162,6 @@ impl WebClient {
         }
         ctx.text(refusal::sentence(failure));
     }
-}
-
-/// Milliseconds since 1970.
-fn now() -> u64 {
-    let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
-    since.map_or(0, |since| u64::try_from(since.as_millis()).unwrap_or(u64::MAX))
 }
 
 fn hash(world: &ProjectUrl) -> u64 {
@@ -258,7 +254,7 @@ impl Handler<LineEvent> for WebClient {
         let Some(waiting) = &mut self.waiting else { return };
         match event {
             LineEvent::Ticket(place) => self.send_ticket(place, ctx),
-            LineEvent::Progress(Progress { ahead, estimate }) => {
+            LineEvent::Position(Position { ahead, estimate }) => {
                 ctx.text(format!("queue: {ahead}"));
                 if let Some(seconds) = estimate.filter(|_| waiting.estimate != estimate) {
                     ctx.text(format!("estimate: {seconds}"));

@@ -27,5 +27,5 @@ pub use roster::{
     Follow, RosterUpdate, SimulationReport, Stage, StopOrder, Stopped, ToSessionServer, ToSimulationServer,
 };
 pub use server_report::{Instances, ServerReport};
-pub use slot_link::{Hello, MAX_LINK_MESSAGE, Offer, Offers, Passed, Proof, Wish, Wishes};
+pub use slot_link::{Hello, MAX_LINK_MESSAGE, Offer, Offers, PassedOver, Proof, Wish, Wishes};
 pub use url_prefix::UrlPrefix;

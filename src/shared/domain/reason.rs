@@ -198,6 +198,8 @@ reasons! {
         Hung = "hung", Project, Here;
         /// It has taken more memory than it may (`limits.memory`).
         MemoryLimit = "memory-limit", Project, Here;
+        /// The memory of the machine has run out, and the kernel has chosen it, as a rule because it has taken most.
+        OutOfMemory = "out-of-memory", Project, Later;
         /// It has written more than it may (`limits.disk`), or has grown most when the disk was full (`diskReserve`).
         DiskLimit = "disk-limit", Project, Here;
         /// The server has lost it by an error of its own.

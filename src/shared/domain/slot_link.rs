@@ -103,13 +103,13 @@ pub struct Offers {
     pub queue: Vec<u64>,
     /// Of those whose clients want slots, the ones that are passed over for now.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub passed: Vec<Passed>,
+    pub passed: Vec<PassedOver>,
 }
 
 /// Clients that are passed over: they have their share of the slots, or have let too many reservations expire.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase")]
-pub enum Passed {
+pub enum PassedOver {
     /// Those of an address.
     Address(IpAddr),
     /// Those of a user.

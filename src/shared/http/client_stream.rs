@@ -30,7 +30,7 @@ use tokio::sync::oneshot;
 use tokio_util::io::poll_read_buf;
 
 use super::limits::ConnectionPermit;
-use super::passing::{self, Owner, Progress, Router};
+use super::passing::{self, Owner, Router, ServedSoFar};
 use super::routing::MAX_BODY;
 use super::websocket::FrameReader;
 
@@ -138,7 +138,7 @@ impl ClientStream {
     }
 
     /// Goes on with a connection that another process has passed.
-    pub(super) fn going_on(mut self, progress: Progress) -> Self {
+    pub(super) fn going_on(mut self, progress: ServedSoFar) -> Self {
         self.unread = progress.unread;
         self.is_answered = progress.is_answered;
         self
@@ -201,7 +201,7 @@ impl ClientStream {
         let Some((tcp, permit)) = self.connection.take() else {
             return;
         };
-        let progress = Progress { unread, is_answered };
+        let progress = ServedSoFar { unread, is_answered };
         actix_web::rt::spawn(async move {
             if let Err(error) = passing::pass(&folder, &tcp, &progress).await {
                 log::warn!("a connection is lost, the process that serves it has ended: {error}");

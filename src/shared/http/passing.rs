@@ -44,7 +44,7 @@ const DOOR: &str = "door";
 const MAX_READ: u64 = 256 * 1024;
 
 /// What was done with a connection.
-pub(super) struct Progress {
+pub(super) struct ServedSoFar {
     /// What was read from it and not yet served, from the head of a request on.
     pub(super) unread: BytesMut,
     /// Whether the client has the answer to that request already: its WebSocket is open.
@@ -60,7 +60,7 @@ pub fn open_door(folder: &Path) -> io::Result<UnixListener> {
 }
 
 /// Passes a connection to the process with this directory.
-pub(super) async fn pass(folder: &Path, tcp: &TcpStream, progress: &Progress) -> io::Result<()> {
+pub(super) async fn pass(folder: &Path, tcp: &TcpStream, progress: &ServedSoFar) -> io::Result<()> {
     let mut door = UnixStream::connect(socket_in(&File::open(folder)?, DOOR)).await?;
     let kind = [u8::from(progress.is_answered)];
     door.async_io(Interest::WRITABLE, || send(&door, &kind, &[tcp.as_fd()]))
@@ -70,7 +70,7 @@ pub(super) async fn pass(folder: &Path, tcp: &TcpStream, progress: &Progress) ->
 }
 
 /// Receives a connection at the door.
-pub(super) async fn take(door: UnixStream) -> io::Result<(TcpStream, Progress)> {
+pub(super) async fn take(door: UnixStream) -> io::Result<(TcpStream, ServedSoFar)> {
     let mut kind = [0];
     let mut files = Vec::new();
     door.async_io(Interest::READABLE, || receive(&door, &mut kind, &mut files))
@@ -79,7 +79,7 @@ pub(super) async fn take(door: UnixStream) -> io::Result<(TcpStream, Progress)> 
     door.take(MAX_READ).read_to_end(&mut unread).await?;
     let tcp = std::net::TcpStream::from(files.pop().ok_or(io::ErrorKind::InvalidData)?);
     tcp.set_nonblocking(true)?;
-    let progress = Progress {
+    let progress = ServedSoFar {
         unread: BytesMut::from(unread.as_slice()),
         is_answered: kind == [1],
     };

@@ -15,4 +15,4 @@ pub use open_files::{limit_clients, raise_open_files};
 pub use rotated_file::RotatedFile;
 pub use signals::{Phase, ServerCommand, Signals, closing, leaving};
 pub use start::AppError;
-pub use timestamp::{seconds_since_1970, timestamp, timestamp_in_milliseconds};
+pub use timestamp::{milliseconds_since_1970, seconds_since_1970, timestamp, timestamp_in_milliseconds};

@@ -26,13 +26,13 @@ use crate::simulation::state::AppState;
 /// The actor.
 pub struct SpareKeeper {
     server: Arc<AppState>,
-    repositories: HashMap<String, Watched>,
-    worlds: BTreeMap<SpareKind, World>,
+    repositories: HashMap<String, ListedRepository>,
+    worlds: BTreeMap<SpareKind, ListedWorld>,
 }
 
 /// A repository of listed worlds.
 #[derive(Default)]
-struct Watched {
+struct ListedRepository {
     /// When its remote was asked last; `None` if it is to be asked at once.
     asked: Option<Instant>,
     /// Whether that had no result.
@@ -43,7 +43,7 @@ struct Watched {
 
 /// A listed world.
 #[derive(Default)]
-struct World {
+struct ListedWorld {
     /// Whether its remote is asked about it, at first or again.
     is_asked: bool,
     /// The commit that its URL means, as the remote has said last.
@@ -286,7 +286,7 @@ impl SpareKeeper {
     }
 }
 
-impl World {
+impl ListedWorld {
     /// Whether the pause after its last failed start is over.
     fn may_start(&self) -> bool {
         let failures = self.failures.as_ref();

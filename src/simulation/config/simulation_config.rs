@@ -202,6 +202,11 @@ impl SimulationConfig {
         files.into_iter().flatten().chain(secrets.filter_map(Secret::file))
     }
 
+    /// The folder of `monitor.csv`, `simulations.csv` and the outputs of simulations.
+    pub fn records(&self) -> PathBuf {
+        self.log_dir.0.join("simulation")
+    }
+
     /// Whether simulations are spread over the GPUs of the machine.
     pub fn spreads(&self) -> bool {
         self.gpus == GpuUse::Spread && (self.container.gpu || !self.docker)

@@ -24,6 +24,6 @@ pub use compose_project::ContainerRequest;
 pub use container_service::{ContainerService, check};
 pub use docker::{daemon_fault, data_folder, docker_disk_fault};
 pub use owned_resources::{ResourceOwner, sweep_all};
-pub use simulation_containers::{Cause, SimulationContainers};
+pub use simulation_containers::SimulationContainers;
 pub use usage::measure;
 pub use webots_yml::{ProjectKind, WebotsYml};

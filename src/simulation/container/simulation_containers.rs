@@ -12,7 +12,7 @@ use super::docker::{Docker, DockerError, SHORT_TIMEOUT, daemon_fault};
 use super::failures::refused_by_docker;
 use super::owned_resources::ProjectGuard;
 use crate::shared::domain::Failure;
-use crate::simulation::process::{ExitReason, SpawnSpec};
+use crate::simulation::process::{Cause, ExitReason, SpawnSpec};
 
 /// The containers of one simulation.
 #[derive(Debug)]
@@ -33,17 +33,6 @@ pub struct SimulationContainers {
     pub warnings: Vec<String>,
     /// Restarts the participant's controller; `None` if there is none.
     pub(super) restart: Option<(Arc<Notify>, AbortOnDropHandle<()>)>,
-}
-
-/// The cause of a container's end.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Cause {
-    /// The kernel, because of the memory limit.
-    OutOfMemory,
-    /// Docker, which was stopped or has crashed.
-    Docker,
-    /// Docker, which could not start it although the project has defined no image.
-    NotStarted,
 }
 
 /// Shortest time between two restarts of a participant's controller.
@@ -124,7 +113,7 @@ impl SimulationContainers {
             Err(_) => return Some(Cause::Docker),
         };
         match state.split_whitespace().collect::<Vec<_>>().as_slice() {
-            ["true", ..] => Some(Cause::OutOfMemory),
+            ["true", ..] => Some(Cause::MemoryLimit),
             [_, "created", _] => (!self.is_projects).then_some(Cause::NotStarted),
             // The program has lost the connection to the daemon.
             [_, _, ended] if *ended != code.to_string() => Some(Cause::Docker),

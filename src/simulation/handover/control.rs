@@ -26,7 +26,7 @@ pub enum Request {
     /// What it has.
     Look,
     /// Stop these simulations.
-    Stop(StopOrder),
+    Stop(ForwardedStop),
     /// Stop in an orderly way, as on SIGTERM.
     End,
     /// Let a new process take over.
@@ -37,7 +37,7 @@ pub enum Request {
 
 /// An order to stop simulations.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct StopOrder {
+pub struct ForwardedStop {
     /// Their ids.
     pub ids: Vec<String>,
     /// Why.

@@ -23,13 +23,19 @@ pub const PROTOCOL: u32 = 1;
 /// The first message to the new process. With it come the listening socket, the lock of `cacheDir`, and that of the PID
 /// file if there is one.
 #[derive(Debug, Serialize, Deserialize)]
-pub struct Passed {
+pub struct Takeover {
     /// Version of the messages.
     pub protocol: u32,
     /// The old process.
     pub run: RunId,
     /// The secret that signs administrators' sign-ins in a fleet without a key.
     pub sign_in: String,
+}
+
+/// What the first message of each version has.
+#[derive(Deserialize)]
+struct Version {
+    protocol: u32,
 }
 
 /// What the new process answers.
@@ -88,31 +94,28 @@ impl Inheritance {
             (&channel).read_exact(&mut byte)?;
             line.extend(byte);
         }
-        let passed: Passed = serde_json::from_slice(&line)?;
+        let Version { protocol } = serde_json::from_slice(&line)?;
+        if protocol != PROTOCOL {
+            let why = format!("its version is {protocol}, and this one's {PROTOCOL}");
+            fail(&channel, &why);
+            return Err(io::Error::other(why));
+        }
+        let passed: Takeover = serde_json::from_slice(&line)?;
         let mut files = files.into_iter();
         let lacks = || io::Error::other("files are missing");
-        let inheritance = Self {
+        Ok(Self {
             listener: files.next().ok_or_else(lacks)?.into(),
             lock: Some(files.next().ok_or_else(lacks)?.into()),
             pid_file: files.next().map(File::from),
             sign_in: passed.sign_in,
             run: passed.run,
             channel,
-        };
-        if passed.protocol != PROTOCOL {
-            let why = format!("its version is {}, and this one's {PROTOCOL}", passed.protocol);
-            inheritance.fail(&why);
-            return Err(io::Error::other(why));
-        }
-        Ok(inheritance)
+        })
     }
 
     /// Tells the process before why this one can't start.
     pub fn fail(&self, why: &str) {
-        if let Ok(line) = serde_json::to_string(&ToPredecessor::Failed(why.to_owned())) {
-            // It may have ended.
-            writeln!(&self.channel, "{line}").ok();
-        }
+        fail(&self.channel, why);
     }
 
     /// Tells the process before that this one is ready, and waits until it has the port. Returns what is left to the one
@@ -134,6 +137,14 @@ impl Inheritance {
     }
 }
 
+/// Tells the process before why the new one can't start.
+fn fail(mut channel: &UnixStream, why: &str) {
+    if let Ok(line) = serde_json::to_string(&ToPredecessor::Failed(why.to_owned())) {
+        // It may have ended.
+        writeln!(channel, "{line}").ok();
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -143,7 +154,7 @@ mod tests {
     fn nothing_is_taken_over_from_another_version() {
         for (protocol, is_taken) in [(PROTOCOL, true), (PROTOCOL + 1, false), (PROTOCOL - 1, false)] {
             let (mut before, channel) = UnixStream::pair().unwrap();
-            let passed = Passed {
+            let passed = Takeover {
                 protocol,
                 run: RunId::own(),
                 sign_in: String::new(),

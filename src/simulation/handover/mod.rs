@@ -14,6 +14,6 @@ mod inheritance;
 mod predecessors;
 mod router;
 
-pub use inheritance::{Inheritance, PROTOCOL, Passed, TAKES_OVER, ToPredecessor, ToSuccessor};
+pub use inheritance::{Inheritance, PROTOCOL, TAKES_OVER, Takeover, ToPredecessor, ToSuccessor};
 pub use predecessors::Predecessors;
 pub use router::ConnectionRouter;

@@ -8,7 +8,7 @@ use std::time::Duration;
 use futures_util::future::join_all;
 use parking_lot::Mutex;
 
-use super::control::{Reply, Request, StopOrder, ask};
+use super::control::{ForwardedStop, Reply, Request, ask};
 use crate::shared::domain::ProjectUrl;
 use crate::simulation::process::{is_alive, runs_in};
 use crate::simulation::run_id::RunId;
@@ -103,7 +103,7 @@ impl Predecessors {
     }
 
     /// Has those of these simulations stopped that they have. Returns the ids of these.
-    pub fn stop(self: &Arc<Self>, order: &StopOrder) -> Vec<String> {
+    pub fn stop(self: &Arc<Self>, order: &ForwardedStop) -> Vec<String> {
         let theirs = |id: &&String| self.with_simulation(id).is_some();
         let ids: Vec<String> = order.ids.iter().filter(theirs).cloned().collect();
         if !ids.is_empty() {

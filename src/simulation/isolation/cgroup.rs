@@ -12,6 +12,7 @@ use procfs::process::Process;
 
 use crate::simulation::config::ResourceLimits;
 use crate::simulation::ends::ResourceUsage;
+use crate::simulation::process::Cause;
 
 /// The control groups below this server's own.
 pub struct Cgroups(PathBuf);
@@ -106,19 +107,34 @@ impl Cgroup {
             .collect()
     }
 
-    /// Kills all processes inside. Returns whether the kernel had killed one because of the memory limit, and the
-    /// resources that they have used. Blocks until they have exited, for two seconds at most.
-    pub fn end(&self) -> (bool, ResourceUsage) {
+    /// Kills all processes inside. Returns why the kernel had killed one, if it had, and the resources that they have
+    /// used. Blocks until they have exited, for two seconds at most.
+    pub fn end(&self) -> (Option<Cause>, ResourceUsage) {
         kill(&self.0);
         let events = std::fs::read_to_string(self.0.join("memory.events")).unwrap_or_default();
-        let kills = events.lines().find_map(|line| line.strip_prefix("oom_kill "));
         // `memory.peak` exists since Linux 5.19.
         let taken = ResourceUsage {
             memory: number_in(&self.0.join("memory.peak")),
             time: cgroup_time(&self.0),
         };
-        (kills.is_some_and(|count| count.trim() != "0"), taken)
+        (kill_for_memory(&events), taken)
     }
+}
+
+/// Why the kernel has killed a process of a group, by the group's `memory.events`: `oom_kill` counts those killed for
+/// any lack of memory, `oom` how often the group was at its own limit (Linux, `Documentation/admin-guide/cgroup-v2.rst`).
+fn kill_for_memory(events: &str) -> Option<Cause> {
+    let has = |name: &str| {
+        let counts = events.lines().filter_map(|line| line.split_once(' '));
+        counts.into_iter().any(|(key, count)| key == name && count != "0")
+    };
+    has("oom_kill").then(|| {
+        if has("oom") {
+            Cause::MemoryLimit
+        } else {
+            Cause::OutOfMemory
+        }
+    })
 }
 
 /// The CPU time of all that has run in a group.
@@ -186,4 +202,20 @@ fn own_folder() -> Option<PathBuf> {
     let inside = std::fs::read_to_string(folder.join("cgroup.procs")).ok()?;
     let is_alone = inside.lines().eq(std::iter::once(me.pid().to_string().as_str()));
     is_alone.then_some(folder)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_group_that_is_killed_below_its_limit_is_told_apart() {
+        let events = |oom, kills| format!("low 0\nhigh 0\nmax 7\noom {oom}\noom_kill {kills}\noom_group_kill 0\n");
+        assert_eq!(kill_for_memory(&events(1, 3)), Some(Cause::MemoryLimit));
+        assert_eq!(kill_for_memory(&events(0, 3)), Some(Cause::OutOfMemory));
+        // An allocation was refused, and nothing was killed.
+        assert_eq!(kill_for_memory(&events(1, 0)), None);
+        // Without the controller there is no such file.
+        assert_eq!(kill_for_memory(""), None);
+    }
 }

@@ -14,5 +14,5 @@ pub use guardian::Guardian;
 pub use instance_dir::{InstanceDir, RunDir, has_several_runs, is_alive, remove, remove_tree, runs_in};
 pub use lines::Lines;
 pub use own_fault::{disk_fault, own_call_failed, start_fault};
-pub use process_group::{ExitReason, ProcessGroup, SpawnSpec};
+pub use process_group::{Cause, ExitReason, ProcessGroup, SpawnSpec};
 pub use runner::{Ran, Run, RunError, on_own_thread};

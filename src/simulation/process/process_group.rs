@@ -70,6 +70,19 @@ pub enum ExitReason {
     NotStarted,
 }
 
+/// What has ended a program, if the kernel or Docker tells it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Cause {
+    /// The kernel, because the program has reached its memory limit.
+    MemoryLimit,
+    /// The kernel, because the machine, or the whole server, had no memory left.
+    OutOfMemory,
+    /// Docker, which was stopped or has crashed.
+    Docker,
+    /// Docker, which could not start it although the project has defined no image.
+    NotStarted,
+}
+
 /// Exit code of a launcher (a shell, `env`, `nice`) that does not find its program.
 const NOT_FOUND: i32 = 127;
 /// Offset that bubblewrap adds to the number of the signal that has ended its program.

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use actix::{Message, Recipient};
 
 use super::simulation_record::{Client, Party};
-use crate::shared::domain::{Failure, Offer, Offers, Passed, ProjectUrl, Reason, ReservationId, Wish, Wishes};
+use crate::shared::domain::{Failure, Offer, Offers, PassedOver, ProjectUrl, Reason, ReservationId, Wish, Wishes};
 use crate::shared::http::AddressQuota;
 use crate::simulation::simulation_id::SimulationId;
 
@@ -104,7 +104,7 @@ struct Line {
     /// When the clients of the queue have come, as it was told last.
     queue: Vec<Instant>,
     /// Whom of those in `wanted` this server passes over, as it was told last.
-    passed: Vec<Passed>,
+    passed: Vec<PassedOver>,
 }
 
 /// A place in the order of all who want a slot: who is behind comes after the others.
@@ -361,16 +361,16 @@ fn passed_over(
     wanted: &VecDeque<Wanted>,
     behind: &HashMap<IpAddr, Instant>,
     has_share: impl Fn(&(Party, usize)) -> bool,
-) -> Vec<Passed> {
+) -> Vec<PassedOver> {
     let mut passed = Vec::new();
     for one in wanted {
         let is_behind = one.address.filter(|address| behind.contains_key(address));
         let full = one.parties.iter().filter(|party| has_share(party));
         let full = full.map(|(party, _)| match party {
-            Party::Address(address) => Passed::Address(*address),
-            Party::User(user) => Passed::User(user.clone()),
+            Party::Address(address) => PassedOver::Address(*address),
+            Party::User(user) => PassedOver::User(user.clone()),
         });
-        for found in full.chain(is_behind.map(Passed::Address)) {
+        for found in full.chain(is_behind.map(PassedOver::Address)) {
             if !passed.contains(&found) {
                 passed.push(found);
             }

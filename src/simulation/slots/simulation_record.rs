@@ -57,7 +57,7 @@ pub(super) struct Holding {
     /// Whom it runs for.
     pub runs_for: RunsFor,
     /// How far it has come.
-    pub run: Run,
+    pub state: HoldingState,
 }
 
 /// A client that has a simulation, or waits for one.
@@ -106,7 +106,7 @@ pub(super) struct Served {
 }
 
 /// How far a simulation that has a slot has come.
-pub(super) enum Run {
+pub(super) enum HoldingState {
     /// Its world is checked out.
     CheckingOut,
     /// Its Webots is prepared, for example its containers.
@@ -308,7 +308,7 @@ impl SimulationRecord {
         let standing = Standing::Holding(Holding {
             port,
             runs_for: RunsFor::Spare(spare),
-            run: Run::CheckingOut,
+            state: HoldingState::CheckingOut,
         });
         let event = format!("it is kept ready, with {world}");
         let mut record = Self::with(id, &world, standing, listener, &event);
@@ -442,7 +442,7 @@ impl SimulationRecord {
                 knows_slow: false,
                 arriving: None,
             }),
-            run: Run::CheckingOut,
+            state: HoldingState::CheckingOut,
         });
         self.note_port(port);
         self.listener.do_send(SlotEvent::Granted(port));
@@ -458,7 +458,7 @@ impl SimulationRecord {
         let Some(holding) = self.holding_mut() else {
             return self.refuse("a client that takes it");
         };
-        if let Run::Launched(launch) = &mut holding.run {
+        if let HoldingState::Launched(launch) = &mut holding.state {
             launch.at = now;
         }
         holding.runs_for = RunsFor::Client(Served {
@@ -474,11 +474,11 @@ impl SimulationRecord {
     /// Its world is checked out.
     pub(super) fn prepare(&mut self, prepared: Prepared) {
         if let Some(Holding {
-            run: run @ Run::CheckingOut,
+            state: state @ HoldingState::CheckingOut,
             ..
         }) = self.holding_mut()
         {
-            *run = Run::Preparing(prepared);
+            *state = HoldingState::Preparing(prepared);
         } else {
             self.refuse("a checkout that is done");
         }
@@ -486,10 +486,10 @@ impl SimulationRecord {
 
     /// Its Webots was launched as this process, and its output is kept in this file.
     pub(super) fn launch(&mut self, pid: i32, log: Option<PathBuf>) {
-        if let Some(Holding { run, .. }) = self.holding_mut()
-            && let Run::Preparing(prepared) = run
+        if let Some(Holding { state, .. }) = self.holding_mut()
+            && let HoldingState::Preparing(prepared) = state
         {
-            *run = Run::Launched(Launch {
+            *state = HoldingState::Launched(Launch {
                 prepared: prepared.clone(),
                 at: seconds_since_1970(),
                 pid,
@@ -502,9 +502,9 @@ impl SimulationRecord {
     }
 
     fn phase_mut(&mut self) -> Option<&mut Phase> {
-        match &mut self.holding_mut()?.run {
-            Run::Launched(launch) => Some(&mut launch.phase),
-            Run::CheckingOut | Run::Preparing(_) => None,
+        match &mut self.holding_mut()?.state {
+            HoldingState::Launched(launch) => Some(&mut launch.phase),
+            HoldingState::CheckingOut | HoldingState::Preparing(_) => None,
         }
     }
 
@@ -550,12 +550,12 @@ impl SimulationRecord {
 
     /// Its stream, if that is open.
     pub(super) fn stream(&self) -> Option<&OpenStream> {
-        match &self.holding()?.run {
-            Run::Launched(Launch {
+        match &self.holding()?.state {
+            HoldingState::Launched(Launch {
                 phase: Phase::Ready { stream, .. } | Phase::Stopping(Some(stream)),
                 ..
             }) => Some(stream),
-            Run::CheckingOut | Run::Preparing(_) | Run::Launched(_) => None,
+            HoldingState::CheckingOut | HoldingState::Preparing(_) | HoldingState::Launched(_) => None,
         }
     }
 
@@ -576,9 +576,9 @@ impl SimulationRecord {
     pub(super) fn stage(&self) -> Stage {
         match &self.standing {
             Standing::Waiting { .. } => Stage::Queued,
-            Standing::Holding(holding) => match &holding.run {
-                Run::CheckingOut | Run::Preparing(_) => Stage::CheckingOut,
-                Run::Launched(launch) => match launch.phase {
+            Standing::Holding(holding) => match &holding.state {
+                HoldingState::CheckingOut | HoldingState::Preparing(_) => Stage::CheckingOut,
+                HoldingState::Launched(launch) => match launch.phase {
                     Phase::Launching => Stage::Launching,
                     Phase::Ready { is_running: true, .. } => Stage::Running,
                     Phase::Ready { is_running: false, .. } => Stage::Idle,
@@ -592,10 +592,10 @@ impl SimulationRecord {
     pub(super) fn shown(&self) -> Simulation {
         let client = self.client();
         let holding = self.holding();
-        let (prepared, launch) = match holding.map(|holding| &holding.run) {
-            None | Some(Run::CheckingOut) => (None, None),
-            Some(Run::Preparing(prepared)) => (Some(prepared), None),
-            Some(Run::Launched(launch)) => (Some(&launch.prepared), Some(launch)),
+        let (prepared, launch) = match holding.map(|holding| &holding.state) {
+            None | Some(HoldingState::CheckingOut) => (None, None),
+            Some(HoldingState::Preparing(prepared)) => (Some(prepared), None),
+            Some(HoldingState::Launched(launch)) => (Some(&launch.prepared), Some(launch)),
         };
         Simulation {
             id: self.id,

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 
 use actix::Recipient;
 
-use super::simulation_record::{Client, Phase, Run, SimulationRecord, SlotEvent, SpareKind, SpareState};
+use super::simulation_record::{Client, HoldingState, Phase, SimulationRecord, SlotEvent, SpareKind, SpareState};
 use super::slot_pool::{SlotPool, Slots, may_have, parties};
 use crate::shared::domain::ReservationId;
 use crate::shared::http::Peer;
@@ -39,13 +39,13 @@ pub struct Taker {
 
 impl SimulationRecord {
     /// How far a simulation without a client has come; `None` if it has a client, or ends.
-    fn progress(&self) -> Option<Progress> {
+    fn progress(&self) -> Option<SpareStage> {
         let is_left = self.spare()?.state != SpareState::Ending && self.end.is_none();
-        let progress = match &self.holding()?.run {
-            Run::CheckingOut | Run::Preparing(_) => Progress::CheckingOut,
-            Run::Launched(launch) => match launch.phase {
-                Phase::Launching => Progress::Launching,
-                Phase::Ready { .. } => Progress::Ready,
+        let progress = match &self.holding()?.state {
+            HoldingState::CheckingOut | HoldingState::Preparing(_) => SpareStage::CheckingOut,
+            HoldingState::Launched(launch) => match launch.phase {
+                Phase::Launching => SpareStage::Launching,
+                Phase::Ready { .. } => SpareStage::Ready,
                 Phase::Stopping(_) => return None,
             },
         };
@@ -67,7 +67,7 @@ impl SimulationRecord {
 
 /// How far a simulation without a client has come.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-enum Progress {
+enum SpareStage {
     CheckingOut,
     Launching,
     Ready,
@@ -151,7 +151,7 @@ impl SlotPool {
             let id = record.id;
             spares.entry(spare.kind.clone()).or_default().push(SpareStatus {
                 id,
-                is_ready: progress == Progress::Ready,
+                is_ready: progress == SpareStage::Ready,
                 is_outdated: spare.state == SpareState::Outdated,
                 is_reserved: slots.reservations.holds(id),
             });

@@ -131,7 +131,7 @@ async fn output(
     if server.admin_auth.is_on() {
         server.admin_auth.reader(&request)?;
     }
-    let logs = server.config.log_dir.0.join("simulation");
+    let logs = server.config.records();
     let tail =
         web::block(move || output_file(&logs, &which.id).and_then(|file| last_lines(&file, MAX_TAIL).ok())).await;
     let tail = tail?.ok_or_else(|| ErrorNotFound("Error: nothing is kept of this simulation."))?;
@@ -152,7 +152,7 @@ async fn records(
 ) -> actix_web::Result<HttpResponse> {
     server.admin_auth.reader(&request)?;
     let span = span.in_utc();
-    let logs = server.config.log_dir.0.join("simulation");
+    let logs = server.config.records();
     let lines = web::block(move || csv::lines(&logs, &span)).await?;
     Ok(csv_file(csv::HEADING, &lines))
 }

@@ -9,9 +9,9 @@ use super::launch_spec::LaunchSpec;
 use super::output::{self, OutputEvent, Tail};
 use crate::shared::domain::{Failure, Reason};
 use crate::shared::run::RotatedFile;
-use crate::simulation::container::{Cause, SimulationContainers};
+use crate::simulation::container::SimulationContainers;
 use crate::simulation::ends::{FOLDER_OF_RUNNING, ResourceUsage};
-use crate::simulation::process::{ExitReason, ProcessGroup};
+use crate::simulation::process::{Cause, ExitReason, ProcessGroup};
 
 /// How the processes of a Webots have ended.
 #[derive(Debug)]
@@ -60,7 +60,7 @@ pub fn launch(
     containers: Option<SimulationContainers>,
     events: Recipient<OutputEvent>,
 ) -> std::io::Result<(LaunchedProcess, impl Future<Output = Exit> + use<>)> {
-    let folder = spec.config.log_dir.0.join("simulation").join(FOLDER_OF_RUNNING);
+    let folder = spec.config.records().join(FOLDER_OF_RUNNING);
     let log = folder.join(format!("{}.log", spec.slot.id()));
     let file = RotatedFile::open(&log, MAX_LOG, "").inspect_err(|error| {
         let why = format!(
@@ -90,13 +90,13 @@ pub fn launch(
             Some(cgroup) => actix_rt::task::spawn_blocking(move || cgroup.end())
                 .await
                 .unwrap_or_default(),
-            None => (false, ResourceUsage::default()),
+            None => Default::default(),
         };
         // The last output shows the cause. A process that can't be killed may keep the pipe open.
         actix_rt::time::timeout(LAST_OUTPUT, all_read).await.ok();
         Exit {
             status,
-            cause: in_container.or(on_machine.then_some(Cause::OutOfMemory)),
+            cause: in_container.or(on_machine),
             taken,
         }
     };
@@ -122,9 +122,13 @@ impl Exit {
 /// The cause that control groups or Docker report.
 fn failure_of(cause: Cause) -> Failure {
     match cause {
-        Cause::OutOfMemory => Failure::new(
+        Cause::MemoryLimit => Failure::new(
             Reason::MemoryLimit,
             "The simulation has taken more memory than it may (limits.memory)",
+        ),
+        Cause::OutOfMemory => Failure::new(
+            Reason::OutOfMemory,
+            "The memory of the simulation server has run out, and the system has ended the simulation",
         ),
         Cause::NotStarted => Failure::new(
             Reason::LaunchFailed,
@@ -179,10 +183,17 @@ mod tests {
             ),
             (
                 killed,
-                Some(Cause::OutOfMemory),
+                Some(Cause::MemoryLimit),
                 Reached::Start,
                 Reason::MemoryLimit,
                 "The simulation has taken more memory than it may (limits.memory)",
+            ),
+            (
+                killed,
+                Some(Cause::OutOfMemory),
+                Reached::Start,
+                Reason::OutOfMemory,
+                "The memory of the simulation server has run out, and the system has ended the simulation",
             ),
             (
                 ok,
