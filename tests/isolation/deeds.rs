@@ -200,30 +200,46 @@ fn files(stage: &Stage) -> Vec<(&'static str, String, [bool; 2])> {
 /// Deeds with system calls, and whether they succeed at each level.
 fn system_calls() -> Vec<(&'static str, String, [bool; 2])> {
     let works = |deed: &str| Command::new("sh").args(["-c", deed]).output().unwrap().status.success();
-    let call = |arguments: &str, succeeds: &str| {
-        format!("python3 -c 'import ctypes; assert ctypes.CDLL(None).syscall({arguments}) {succeeds}'")
+    // A call reaches the kernel unless it fails with `EPERM`.
+    let call = |x86: u32, arm: u32, arguments: &str| {
+        let number = if cfg!(target_arch = "aarch64") { arm } else { x86 };
+        format!(
+            "python3 -c 'import ctypes, struct; c = ctypes.CDLL(None, use_errno=True); \
+             assert c.syscall({number}, {arguments}) >= 0 or ctypes.get_errno() != 1'"
+        )
     };
-    let (keyctl, userfaultfd, unshare) = if cfg!(target_arch = "aarch64") {
-        (219, 282, 97)
-    } else {
-        (250, 323, 272)
-    };
-    let keyring = call(&format!("{keyctl}, 0, -3, 1"), "> 0");
-    let io_uring = call("425, 1, ctypes.create_string_buffer(120)", ">= 0");
-    let faults = call(&format!("{userfaultfd}, 1"), ">= 0");
-    let host = "python3 -c 'import socket; socket.socket(40, socket.SOCK_STREAM)'".to_owned();
-    let namespaces = call(&format!("{unshare}, 0"), "== 0");
-    // What such a kernel does not have can't be kept from worlds.
-    let has_keyrings = works(&keyring);
-    let has_io_uring = works(&io_uring);
-    let has_faults = works(&faults);
-    let has_host = works(&host);
-    vec![
-        ("use a keyring", keyring, [has_keyrings, false]),
-        ("use io_uring", io_uring, [has_io_uring, false]),
-        ("handle page faults", faults, [has_faults, false]),
-        ("reach the host of a virtual machine", host, [has_host, false]),
-        ("leave namespaces", namespaces, [true, false]),
+    let socket =
+        |family: u32, kind: &str| format!("python3 -c 'import socket as s; s.socket({family}, s.SOCK_{kind})'");
+    let refused = [
+        ("use a keyring", call(250, 219, "0, -3, 1")),
+        ("use io_uring", call(425, 425, "1, ctypes.create_string_buffer(120)")),
+        ("handle page faults", call(323, 282, "1")),
+        ("reach the host of a virtual machine", socket(40, "STREAM")),
+        ("use ciphers of the kernel", socket(38, "SEQPACKET")),
+        ("leave namespaces", call(272, 97, "0")),
+        // An array of one element.
+        (
+            "use BPF",
+            call(321, 280, "0, struct.pack(\"18I\", 2, 4, 8, 1, *[0] * 14), 72"),
+        ),
+        // No such flags, no such folder, no such process: the machine is not changed.
+        ("count what the processor does", call(298, 241, "0, 0, -1, -1, -1")),
+        ("mount", call(165, 40, "0, b\"/nowhere\", 0, 0, 0")),
+        ("take a file of another process", call(438, 438, "-1, 0, 0")),
+        ("read the size of the log of the kernel", call(103, 116, "10, 0, 0")),
+        ("switch random addresses off", call(135, 92, "0x40000")),
+    ];
+    // What such a machine does not have can't be kept from worlds.
+    let refused = refused.map(|(name, deed)| {
+        let is_there = works(&deed);
+        (name, deed, [is_there, false])
+    });
+    let allowed = vec![
+        (
+            "read its personality",
+            call(135, 92, "0xffffffff"),
+            [true, true],
+        ),
         (
             "start threads and processes",
             "python3 -c 'import threading, subprocess; t = threading.Thread(target=subprocess.check_call, args=[[\"true\"]]); t.start(); t.join()'"
@@ -236,7 +252,8 @@ fn system_calls() -> Vec<(&'static str, String, [bool; 2])> {
                 .to_owned(),
             [true, true],
         ),
-    ]
+    ];
+    refused.into_iter().chain(allowed).collect()
 }
 
 async fn compare(
