@@ -3,7 +3,7 @@
 use serde_json::Value;
 
 use crate::support::{
-    Forge, Server, Webots, arm, demo_server, http, is_told, session_server, simulation_server, until,
+    Forge, Server, Webots, arm, demo_server, http, is_told, make_program, session_server, simulation_server, until,
 };
 
 /// Whether the session server considers its only simulation server working; on a busy machine it may be full.
@@ -70,6 +70,33 @@ async fn a_display_that_is_missing_is_a_problem_for_webots_itself() {
         server.health().await.1.contains("no display answers at :59000")
     })
     .await;
+}
+
+/// A Docker whose first answers to `docker version` are these; after them it answers.
+async fn with_docker(first_answers: &[&str]) -> (Server, tempfile::TempDir) {
+    let folder = tempfile::tempdir().unwrap();
+    for (number, answer) in first_answers.iter().enumerate() {
+        std::fs::write(folder.path().join(format!("answer{number}")), answer).unwrap();
+    }
+    let program = "[ \"$1\" = version ] || exit 0\ncd \"$(dirname \"$0\")\"\nfor answer in answer*; do\n\
+                   [ -f $answer ] || break\nmv $answer given-$answer\n. ./given-$answer\ndone";
+    make_program(&folder.path().join("docker"), program);
+    let path = format!("{}:{}", folder.path().display(), std::env::var("PATH").unwrap());
+    let server = demo_server(1).set("isolation", "container").set("webots", Value::Null);
+    (server.env("PATH", &path).start().await, folder)
+}
+
+#[actix_rt::test]
+async fn one_late_answer_of_docker_refuses_nobody_and_two_do() {
+    const REFUSES: &str = "no simulation can be started: Docker does not answer";
+    for once in ["exec sleep 1000", "exit 1"] {
+        let (server, _docker) = with_docker(&[once]).await;
+        assert_eq!(server.health().await, (200, "ok".to_owned()), "{once}");
+        assert!(!server.log().contains(REFUSES), "{once}: {}", server.log());
+    }
+    let (server, _docker) = with_docker(&["exit 1", "exit 1"]).await;
+    assert!(server.log().contains(REFUSES), "{}", server.log());
+    until("it is asked again", async || server.health().await.0 == 200).await;
 }
 
 #[actix_rt::test]
