@@ -1,5 +1,6 @@
-//! Measures the cost of pages: rendering the session server's monitor with 1,000 simulation servers, and a hundred open
-//! pages of either server, at the demo's size and with 1,000 simulation servers.
+//! Measures the cost of pages: rendering the session server's monitor with 1,000 simulation servers, a hundred open
+//! pages of either server, at the demo's size and with 1,000 simulation servers, and one client that requests the monitor
+//! in a row.
 //!
 //! `cargo bench --bench pages [-- --seconds N]`
 
@@ -18,15 +19,18 @@
 mod support;
 
 use std::collections::VecDeque;
-use std::io::{Read, Write};
+use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use askama::Template;
+use base64::Engine;
+use base64::prelude::BASE64_STANDARD;
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use support::client::{Client, Heard};
 use support::git::{Forge, world};
+use support::http::PASSWORD;
 use support::program::{Server, session_server, simulation_server};
 use support::webots::Webots;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -142,6 +146,7 @@ async fn open_pages(time: Duration) {
     for _ in 0..3 {
         fleet.push(
             simulation_server(&webots.path(), forge.path(), SIMULATIONS)
+                .set("adminPassword", PASSWORD)
                 .start()
                 .await,
         );
@@ -165,6 +170,18 @@ async fn open_pages(time: Duration) {
     }
     compare("session server", &session, time).await;
     compare("simulation server", &fleet[0], time).await;
+    let administrator = format!(
+        "Authorization: Basic {}\r\n",
+        BASE64_STANDARD.encode(format!("admin:{PASSWORD}"))
+    );
+    for (name, path, headers) in [
+        ("/health", "/health", ""),
+        ("the monitor", "/monitor", ""),
+        // For administrators it is rendered for each request, as it was for all.
+        ("the monitor, as administrator", "/monitor", administrator.as_str()),
+    ] {
+        in_a_row(&format!("simulation server, {name}"), &fleet[0], path, headers, time).await;
+    }
 }
 
 /// A session server with many simulation servers whose loads change all the time.
@@ -179,6 +196,8 @@ async fn open_pages_of_a_large_fleet(time: Duration) {
     }
     let session = session_server(&addresses).set("loadRefresh", 1).start().await;
     compare(&format!("session server with {SERVERS} servers"), &session, time).await;
+    let name = format!("session server with {SERVERS} servers, the monitor");
+    in_a_row(&name, &session, "/monitor", "", time).await;
 }
 
 /// A stand-in for a simulation server, which reports a different load each time.
@@ -217,6 +236,49 @@ async fn compare(name: &str, server: &Server, time: Duration) {
         events / PAGES,
         bytes / PAGES / 1024
     );
+}
+
+/// Measures what one client costs that requests a page again and again on one connection.
+async fn in_a_row(name: &str, server: &Server, path: &str, headers: &str, time: Duration) {
+    let alone = used(server, time).await;
+    let port = server.port;
+    let request = format!("GET {path} HTTP/1.1\r\nHost: localhost\r\n{headers}\r\n");
+    let client = std::thread::spawn(move || request_in_a_row(port, &request, time));
+    let with_client = used(server, time).await;
+    let (answers, bytes) = client.join().unwrap();
+    println!(
+        "{name}, requested in a row: {:.2} % of a core more, {:.0} answers and {:.2} MB a second",
+        with_client - alone,
+        answers as f64 / time.as_secs_f64(),
+        bytes as f64 / time.as_secs_f64() / 1e6
+    );
+}
+
+/// Sends a request once the answer to the last one has arrived. Returns the number of answers, and of their bytes.
+fn request_in_a_row(port: u16, request: &str, time: Duration) -> (usize, usize) {
+    let mut stream = BufReader::new(TcpStream::connect(("127.0.0.1", port)).unwrap());
+    let begun = Instant::now();
+    let (mut answers, mut bytes) = (0, 0);
+    while begun.elapsed() < time {
+        stream.get_mut().write_all(request.as_bytes()).unwrap();
+        let mut length = 0;
+        let mut line = String::new();
+        while line != "\r\n" {
+            line.clear();
+            bytes += stream.read_line(&mut line).unwrap();
+            assert!(
+                answers > 0 || bytes > line.len() || line.starts_with("HTTP/1.1 200 "),
+                "{line}"
+            );
+            if let Some(text) = line.to_ascii_lowercase().strip_prefix("content-length:") {
+                length = text.trim().parse().unwrap();
+            }
+        }
+        stream.read_exact(&mut vec![0; length]).unwrap();
+        bytes += length;
+        answers += 1;
+    }
+    (answers, bytes)
 }
 
 /// The processor time of a server during `time`, in percent of one core.

@@ -14,6 +14,10 @@ fn a_black_hole_takes_few_clients() {
     for fails_after in [0.5, 40.0] {
         for scenario in compare::hole_scenarios(&[5], fails_after) {
             let [with, without] = compare::share_that_fails(&scenario);
+            println!(
+                "{:?}, failing after {fails_after} s: {with:.1} % fail, {without:.1} % without ejection",
+                scenario.arrivals
+            );
             assert!(
                 with < without / 2.0,
                 "{scenario:?}: {with:.1} % fail with ejection, {without:.1} % without"

@@ -131,13 +131,13 @@ async fn a_simulation_that_ignores_sigterm_is_killed() {
 }
 
 #[actix_rt::test]
-async fn the_folder_of_a_simulation_is_removed_once_there_is_room_for_processes_again() {
+async fn folders_of_simulations_are_removed_once_there_is_room_for_processes_again() {
     // The limit does not apply to root.
     let Some(nobody) = as_nobody() else { return };
     let stage = Stage::new();
     let webots = Webots::launcher();
     let server = stage.builder(&webots, "none").before(nobody).start().await;
-    let client = Client::ready(&server).await;
+    let clients = [Client::ready(&server).await, Client::ready(&server).await];
     let limit = |processes: &str| {
         // Root may lack the capability for processes of others.
         let pid = server.pid().to_string();
@@ -147,12 +147,14 @@ async fn the_folder_of_a_simulation_is_removed_once_there_is_room_for_processes_
         assert!(prlimit.status().unwrap().success());
     };
     limit("1");
-    client.leave().await;
+    for client in clients {
+        client.leave().await;
+    }
     let gone = async || stages(&server).await.is_empty() && instances_below(&server.folder).is_empty();
     until("the simulation has ended", gone).await;
     let begin = Instant::now();
     while begin.elapsed() < Duration::from_secs(2) {
-        assert_eq!(instance_folders(&server.folder).len(), 1);
+        assert_eq!(instance_folders(&server.folder).len(), 2);
         actix_rt::time::sleep(Duration::from_millis(100)).await;
     }
     limit("1000");

@@ -119,19 +119,20 @@ async fn a_monitor_that_has_not_changed_is_not_sent_again() {
 
 #[actix_rt::test]
 async fn a_monitor_that_is_requested_in_a_row_is_rendered_ten_times_a_second() {
-    let server = session_server(&[]).start().await;
-    let url = server.url("/monitor");
-    http::get(&url).await;
-    let begin = Instant::now();
-    for _ in 0..10 {
+    for server in [session_server(&[]).start().await, demo_server(1).start().await] {
+        let url = server.url("/monitor");
         http::get(&url).await;
+        let begin = Instant::now();
+        for _ in 0..10 {
+            http::get(&url).await;
+        }
+        assert!(begin.elapsed() > Duration::from_millis(950), "{:?}", begin.elapsed());
+        // Many visitors share a rendering.
+        let begin = Instant::now();
+        let all = futures_util::future::join_all((0..100).map(|_| http::get(&url))).await;
+        assert!(all.iter().all(|page| page.status == 200));
+        assert!(begin.elapsed() < Duration::from_secs(5), "{:?}", begin.elapsed());
     }
-    assert!(begin.elapsed() > Duration::from_millis(950), "{:?}", begin.elapsed());
-    // Many visitors share a rendering.
-    let begin = Instant::now();
-    let all = futures_util::future::join_all((0..100).map(|_| http::get(&url))).await;
-    assert!(all.iter().all(|page| page.status == 200));
-    assert!(begin.elapsed() < Duration::from_secs(5), "{:?}", begin.elapsed());
 }
 
 #[actix_rt::test]
