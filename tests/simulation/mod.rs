@@ -5,7 +5,7 @@ mod cache;
 mod checkout;
 mod commits;
 pub mod ends;
-mod fetching;
+
 mod hostile;
 mod https;
 mod idleness;
