@@ -11,7 +11,7 @@
 //! | [`shared::domain`] | addresses, loads, world URLs and the Git hosts that they name (`project_url`), a server's report |
 //! | [`shared::run`] | start, readiness, log, stop |
 //! | [`shared::http`] | pages, live updates, WebSockets, limits, certificates, metrics |
-//! | [`session::placement`] | which server gets the next client: the load of a server and the key that servers are sorted by (`backend`), the choice of the first (`load_balancer`), cost |
+//! | [`session::placement`] | which server gets the next client: the load of a server and the key that servers are sorted by (`backend`), the choice of the first, of dedicated servers before others (`load_balancer`), cost |
 //! | [`session::line`] | the clients that wait for a slot of the fleet: tickets (`ticket`), the order (`waiting_line`), who gets the next slot of which server (`dispatcher`) |
 //! | [`session::class`] | all simulations of the fleet and who waits, with the number of each change, and the links to servers for actions (`roster`) |
 //! | [`session::mail`] | notices: to whom (`smtp`, one address, from the key `administrator` in `config/session_config`) and how (`channel`), what is in them (`notice_text`), which changes are mailed (`event` in `fleet/server_record`), and how long they wait (`outbox`) |
@@ -29,8 +29,8 @@
 //! | [`simulation::attachment`] | what a connection and its session send each other, and the tokens by which a client that resumes finds its session |
 //! | [`simulation::slots`] | the slots that clients wait for: the slot of a simulation (`slot`), its states and what pages show of them (`simulation_record`), the queue and the shares of addresses and users (`slot_pool`), those that are reserved for the line of session servers (`reservations`), how many run in real time (`real_time_places`), the streams of simulations and the tokens that identify them (`stream`) |
 //! | [`simulation::spare_wishes`] | which worlds are kept ready before clients ask for them, and how many; the actor that does it is `spare_keeper` in [`simulation::client`], a spare's slot is in `spare` of [`simulation::slots`] |
-//! | `simulation::relay` | a stream between a client and the port of its Webots |
-//! | `simulation::web` | routes, pages, `/status` and Prometheus metrics of the simulation server (gauges in `metrics`, counters and histograms in `app` and `ends`) |
+//! | `simulation::relay` | a stream between a client and the port of its Webots; what a watcher may send (`watcher`) |
+//! | `simulation::web` | routes, pages (also the one on which an administrator watches a simulation: `page_routes`), `/status` and Prometheus metrics of the simulation server (gauges in `metrics`, counters and histograms in `app` and `ends`) |
 //!
 //! The HTML of pages is in `templates/session` and `templates/simulation` (in each, `monitor.html`: the head of the
 //! monitor's table, `row.html`: a row), their styles (`style.css`) and scripts in `templates/assets`. A column of

@@ -1,5 +1,5 @@
-//! Checkouts: what a URL refers to, what is cached, and what a malicious repository can't do. Fetches that hang or wait
-//! for each other: `fetching`.
+//! Checkouts: what a URL refers to, what is cached, and what a malicious repository can't do. A git that is slow or hangs:
+//! `slow_git`.
 
 use std::path::Path;
 

@@ -7,7 +7,7 @@
 //! | its client closes, the connection breaks or is half open | all but stopping, in which it has no client | `a_client_that_leaves_in_any_way_leaves_nothing_behind` |
 //! | Webots ends, in three ways | launching, idle, running; in others there is no Webots | `a_client_is_told_how_webots_ended` |
 //! | Webots ignores SIGTERM | stopping | `isolation::lives::a_simulation_that_ignores_sigterm_is_killed` |
-//! | git is killed, or hangs | checking out | `checkout::a_kill_in_the_middle_of_a_fetch...`, `fetching::a_git_that_is_stopped...` |
+//! | git is killed, or hangs | checking out | `checkout::a_kill_in_the_middle_of_a_fetch...`, `slow_git::a_git_that_is_stopped...` |
 //! | the time limit | launching, idle, running, stopping: it counts from the start of Webots | `simulation_limits` (`time`) |
 //! | the limits of a checkout and of a launch | checking out, launching | `simulation_limits` (`time`), `ready::a_launch_that_never_listens...` |
 //! | SIGTERM to the server | all | `a_server_that_stops_notifies_clients_and_leaves_nothing` |

@@ -5,7 +5,6 @@ mod cache;
 mod checkout;
 mod commits;
 pub mod ends;
-
 mod hostile;
 mod https;
 mod idleness;
@@ -25,6 +24,7 @@ mod relay;
 mod resuming;
 pub mod scene;
 mod sentences;
+mod slow_git;
 mod soak;
 mod spares;
 mod stopping;

@@ -1,4 +1,5 @@
-//! Fetches into one cached repository: one at a time, each commit once, each within the time limit of a checkout.
+//! A git that is slow, hangs or is stopped disturbs nobody else: fetches into one cached repository run one at a time, each
+//! commit once, each within the time limit of a checkout.
 
 use std::time::Duration;
 

@@ -1,4 +1,5 @@
-//! The URL of a world in a git repository, as a web client types it.
+//! The URL of a world in a git repository, as a web client types it. Where a repository is fetched from is in the
+//! simulation server's `config/mirrors`.
 
 use std::fmt;
 use std::path::Path;

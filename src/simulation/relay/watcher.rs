@@ -1,4 +1,5 @@
-//! The stream of a watcher: it can only request kinds of streams, which changes nothing for others.
+//! The stream of a watcher: it can only request kinds of streams, which changes nothing for others. The page on which
+//! somebody watches is in `web/page_routes`, the token of the stream in `slots/stream`.
 
 use std::collections::HashSet;
 use std::io::{self, ErrorKind};
