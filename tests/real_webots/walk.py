@@ -1,5 +1,6 @@
-"""Runs worlds in a Webots through a fleet: walk.py PROGRAM [WORLD]...; an empty PROGRAM is that of WEBOTS_HOME."""
+"""Runs worlds in a Webots through a fleet; see `tests/real-webots.sh`."""
 
+import argparse
 import base64
 import json
 import os
@@ -7,7 +8,9 @@ import pathlib
 import platform
 import re
 import shutil
+import signal
 import socket
+import subprocess
 import sys
 import time
 import urllib.request
@@ -22,7 +25,7 @@ from websockets.sync.client import connect  # noqa: E402
 # A real world has to be read, and its assets downloaded.
 START = 600.0
 # Wall time over which the speed is measured, in seconds.
-SPAN = 5.0
+SPAN = 3.0
 COLUMNS = (
     "isolation",
     "stream",
@@ -31,13 +34,17 @@ COLUMNS = (
     "moving s",
     "real-time factor",
     "reset",
+    "robot windows",
     "memory MB",
     "watched",
     "resumed s",
     "end s",
     "stopped s",
+    "crashed s",
+    "server's end s",
     "result",
 )
+LEVELS = ("none", "sandbox", "container")
 PASSWORD = "a secret"
 REASON = "The lesson is over"
 
@@ -147,34 +154,41 @@ def speed(stream, begin):
     return first(stream, SPAN + SOON, "time", chosen)
 
 
-def memory(pid):
-    """What a process and its descendants occupy, in MB; shared pages count in each."""
-    total = 0
-    for status in pathlib.Path("/proc").glob("[0-9]*/status"):
-        try:
-            fields = dict(line.split(":\t", 1) for line in status.read_text().splitlines() if ":\t" in line)
-        except OSError:
-            continue
-        if pid in ancestors(int(status.parent.name)):
-            total += int(fields.get("VmRSS", "0").split()[0])
-    return total // 1024
+def memory(server):
+    """What the server reads as the simulation's memory, in MB: of its processes, or of its containers."""
+
+    def reading():
+        cell = re.search('data-label="Memory"[^>]*data-value="([0-9]+)"', as_administrator(server, "monitor"))
+        return int(cell[1]) if cell else 0
+
+    return until("its memory is read", reading) >> 20
 
 
-def ancestors(pid):
-    """A process and its ancestors."""
-    while pid > 1:
-        yield pid
-        try:
-            pid = int(pathlib.Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[1])
-        except OSError:
-            return
+def windows(ready, stream):
+    """The number of robot windows in the scene, whose pages are there."""
+    names = []
+    first(stream, SOON, "the scene", lambda text: has_ended_with(text, names))
+    for name in names:
+        page = f"{ready.url.replace('ws', 'http', 1)}/robot_windows/{name}/{name}.html"
+        with urllib.request.urlopen(page, timeout=SOON) as answer:
+            if not answer.read():
+                raise Failed(f"the page of the window {name} is empty")
+    return len(names)
+
+
+def has_ended_with(text, names):
+    """Whether the scene ends with this text; collects the names of the robots' windows."""
+    kind, _, window = text.partition("robot window: ")
+    if not kind and window:
+        names.append(json.loads(window)["window"])
+    return text == "scene load completed" or None
 
 
 def runs(ready, row, begin):
     """Lets the simulation run and resets it."""
     with connect(f"{ready.url}/", max_size=None) as stream:
         stream.send(ready.kind)
-        until_text(stream, "scene load completed")
+        row["robot windows"] = windows(ready, stream)
         stream.send("real-time:-1")
         now = moved(stream)
         row["moving s"] = f"{time.monotonic() - begin:.1f}"
@@ -206,9 +220,16 @@ def is_resumed(server, client, token, simulation):
         raise Failed("another Webots was started")
 
 
+def runs_nothing(server):
+    try:
+        return not simulations(server)
+    except OSError:
+        return server.process.poll() is not None
+
+
 def has_ended(server, simulation, begin):
     """The seconds until nothing of the simulation is left."""
-    until("the simulation has ended", lambda: not simulations(server))
+    until("the simulation has ended", lambda: runs_nothing(server))
     until("its process has ended", lambda: not pathlib.Path(f"/proc/{simulation['pid']}").exists())
     return f"{time.monotonic() - begin:.1f}"
 
@@ -223,7 +244,7 @@ def student(fleet, row):
         row["ready s"] = f"{time.monotonic() - begin:.1f}"
         (simulation,) = simulations(server)
         runs(ready, row, begin)
-        row["memory MB"] = memory(simulation["pid"])
+        row["memory MB"] = memory(server)
         is_watched(server, simulation, ready.kind, client)
         row["watched"] = "yes"
         # The connection is lost without a word.
@@ -237,8 +258,8 @@ def student(fleet, row):
     row["end s"] = has_ended(server, simulation, begin)
 
 
-def stopped(fleet, row):
-    """An administrator ends the simulation: the client is told why; with a relay, so is its stream."""
+def ended(fleet, stream_kind, reason, end):
+    """The seconds in which a simulation ends: its client is told why, and a relay closes its stream with 1000."""
     server = fleet.simulation
     with connect(f"ws://{server.address}/client", max_size=None) as client:
         client.send(json.dumps({"start": {"url": fleet.url, "resumable": True}}))
@@ -248,57 +269,106 @@ def stopped(fleet, row):
             stream.send(ready.kind)
             until_text(stream, "scene load completed")
             begin = time.monotonic()
-            as_administrator(server, f"simulations/{simulation['id']}/stop", {"reason": REASON})
-            first(client, SOON, "the reason", lambda text: '"stopped-by-administrator"' in text or None)
+            end(server, simulation)
+            first(client, SOON, f"the reason {reason}", lambda text: f'"{reason}"' in text or None)
             try:
                 first(stream, SOON, "the end of the stream", lambda _: None)
             except ConnectionClosed as closed:
                 code = closed.rcvd.code if closed.rcvd else 1006
-            if row["stream"] == "relay" and code != 1000:
-                raise Failed(f"the stream has ended with {code}") from None
-    row["stopped s"] = has_ended(server, simulation, begin)
+            # A crash is no end that anybody wanted.
+            if stream_kind == "relay" and (code == 1000) != (reason != "crashed"):
+                raise Failed(f"{reason}: the stream has ended with {code}") from None
+    return has_ended(server, simulation, begin)
 
 
-def tried(isolation, streaming, world, program):
+def stop(server, simulation):
+    as_administrator(server, f"simulations/{simulation['id']}/stop", {"reason": REASON})
+
+
+def crash(_, simulation):
+    os.kill(simulation["pid"], signal.SIGKILL)
+
+
+def end_server(server, _):
+    server.process.terminate()
+
+
+def tried(isolation, streaming, world, arguments):
     """A row of the table."""
     row = {"isolation": isolation, "stream": streaming, "world": world.stem, "result": "ok"}
     keys = {"isolation": isolation, "streaming": streaming, "adminPassword": PASSWORD}
-    if program:
-        keys["webots"] = program
+    if isolation == "container":
+        # The program is that of the image.
+        keys |= {"webots": None, "container": {"image": image(world, arguments)}}
+    elif arguments.program:
+        keys["webots"] = arguments.program
     else:
         home = os.environ["WEBOTS_HOME"]
         keys |= {"webotsHome": home, "webots": f"{home}/webots"}
     try:
         with OneWorld(world, keys) as fleet:
             student(fleet, row)
-            stopped(fleet, row)
+            row["stopped s"] = ended(fleet, streaming, "stopped-by-administrator", stop)
+            if isolation != "container":
+                # There the process is that of Docker.
+                row["crashed s"] = ended(fleet, streaming, "crashed", crash)
+            row["server's end s"] = ended(fleet, streaming, "server-stopped", end_server)
     except (Failed, AssertionError, OSError, ConnectionClosed) as error:
         row["result"] = str(error).split("\n")[0][:120]
     return row
 
 
-def levels():
-    yield "none"
-    if shutil.which("bwrap"):
-        yield "sandbox"
-    else:
-        print("sandbox: not here, there is no bwrap", file=sys.stderr)
+def image(world, arguments):
+    """The image in which a world runs: by default the one that a server takes for its release."""
+    release = world.read_text().split()[1]
+    return arguments.image or f"cyberbotics/webots.cloud:{release}-ubuntu{'20.04' if release < 'R2023b' else '22.04'}"
+
+
+def docker(*command):
+    return subprocess.run(["docker", *command], capture_output=True, check=False).returncode == 0
+
+
+def missing(isolation, worlds, arguments):
+    """What this machine lacks for this level; empty if nothing."""
+    if isolation == "sandbox" and not shutil.which("bwrap"):
+        return "there is no bwrap"
+    if isolation != "container":
+        return ""
+    if arguments.program and not arguments.image:
+        return "--image names no image with that program"
+    if not shutil.which("docker") or not docker("version"):
+        return "there is no Docker, or this user may not use it"
+    images = sorted({image(world, arguments) for world in worlds})
+    absent = [one for one in images if not docker("image", "inspect", one)]
+    return "; ".join(f"docker pull {one}" for one in absent)
 
 
 def main():
-    program, *worlds = sys.argv[1:]
-    worlds = [pathlib.Path(world).resolve() for world in worlds] or sorted((HERE / "project/worlds").glob("*.wbt"))
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--program")
+    parser.add_argument("--image")
+    parser.add_argument("--isolation", choices=LEVELS)
+    parser.add_argument("worlds", nargs="*")
+    arguments = parser.parse_args()
+    worlds = [pathlib.Path(world).resolve() for world in arguments.worlds]
+    worlds = worlds or sorted((HERE / "project/worlds").glob("*.wbt"))
+    levels = [arguments.isolation] if arguments.isolation else LEVELS
+    lacks = {isolation: missing(isolation, worlds, arguments) for isolation in levels}
     rows = [
-        tried(isolation, streaming, world, program)
-        for isolation in levels()
+        tried(isolation, streaming, world, arguments)
+        for isolation in levels
         for streaming in ("direct", "relay")
         for world in worlds
+        if not lacks[isolation]
     ]
-    print(f"\n{program or os.environ['WEBOTS_HOME']}, {platform.platform()}, {os.cpu_count()} cores\n")
+    print(f"\n{arguments.program or os.environ['WEBOTS_HOME']}, {platform.platform()}, {os.cpu_count()} cores\n")
     print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}")
     for row in rows:
         print(f"| {' | '.join(str(row.get(column, '-')) for column in COLUMNS)} |")
-    return any(row["result"] != "ok" for row in rows)
+    for isolation, what in lacks.items():
+        if what:
+            print(f"\nNot tried: {isolation}: {what}")
+    return not rows or any(row["result"] != "ok" for row in rows)
 
 
 if __name__ == "__main__":
