@@ -117,13 +117,23 @@ async fn a_stopped_docker_is_reported_until_it_is_back() {
     until("it says so", async || !takes_clients(&server).await).await;
     let checked = check(&server);
     assert!(checked.contains("warning: docker: Docker does not answer"), "{checked}");
-    daemon::start_again();
-    until("it takes clients again", async || takes_clients(&server).await).await;
-    Client::start(&server, &arm()).await.patiently("webots:").await;
-    until("what the daemon has kept is gone", async || {
-        containers(&server).len() <= 1
+    until("it has tried to remove what the first has left", async || {
+        server.log().contains("Docker can't remove the containers of ")
     })
     .await;
+    daemon::start_again();
+    let kept = containers(&server);
+    assert_eq!(kept.len(), 1, "{kept:?}");
+    until("it takes clients again", async || takes_clients(&server).await).await;
+    until("what the daemon has kept is gone", async || {
+        containers(&server).is_empty()
+    })
+    .await;
+    until("the log says so", async || {
+        server.log().contains("Docker answers again: the containers of ")
+    })
+    .await;
+    Client::start(&server, &arm()).await.patiently("webots:").await;
 }
 
 #[actix_rt::test]

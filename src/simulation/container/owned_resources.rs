@@ -94,10 +94,10 @@ impl Drop for ProjectGuard {
                 let project = name.clone();
                 match spawn_blocking(move || sweep(&project)).await {
                     Ok(Ok(())) => looks += 1,
-                    Ok(Err(_)) => {
+                    Ok(Err(error)) => {
                         failures += 1;
-                        if failures == SHORT_PAUSES {
-                            log::warn!("the containers of {name} can't be removed until Docker answers again");
+                        if failures == 1 {
+                            log::warn!("Docker can't remove the containers of {name} yet: {error}");
                         }
                     }
                     // The server is ending.
