@@ -1,10 +1,12 @@
 //! The life of a simulation in a container.
 
+use std::process::Command;
 use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
 
 use super::daemon::{self, ask, containers, docker, of_service, running, server};
+use super::image::NAME;
 use crate::support::{Client, SOON, WORLD, arm, instance_folders_in, is_told, until, world};
 
 /// Longest time until nothing of a simulation remains.
@@ -235,4 +237,29 @@ async fn an_upgrade_ends_no_container() {
     assert!(!before.contains(&containers(&server)[0]));
     second.leave().await;
     until("all containers are gone", async || containers(&server).is_empty()).await;
+}
+
+#[actix_rt::test]
+async fn the_script_for_a_real_webots_runs_worlds_in_containers() {
+    let Some(_docker) = docker().await else { return };
+    let root = env!("CARGO_MANIFEST_DIR");
+    let simulator = env!("CARGO_BIN_EXE_demo-simulator");
+    let mut script = Command::new(format!("{root}/tests/real-webots.sh"));
+    script.args(["--program", simulator, "--isolation", "container", "--image", NAME]);
+    script
+        .arg(format!("{root}/tests/real_webots/project/worlds/window.wbt"))
+        .env("FLEET_BIN", std::path::Path::new(simulator).parent().unwrap())
+        .env("DOCKER_HOST", daemon::host())
+        .env("DOCKER_CONFIG", daemon::folder());
+    let output = actix_rt::task::spawn_blocking(move || script.output().unwrap())
+        .await
+        .unwrap();
+    let text = String::from_utf8_lossy(&output.stdout);
+    let rows: Vec<Vec<_>> = text.lines().map(|line| line.split(" | ").collect()).collect();
+    for stream in ["direct", "relay"] {
+        let is_row = |row: &&Vec<_>| row.starts_with(&["| container", stream, "window"]);
+        let row = rows.iter().find(is_row).unwrap_or_else(|| panic!("{output:?}"));
+        assert_eq!(row.last(), Some(&"ok |"), "{text}");
+    }
+    assert!(output.status.success(), "{output:?}");
 }

@@ -381,7 +381,7 @@ async fn a_busy_webots_keeps_its_client_waiting() {
 async fn a_stream_that_the_server_ends_is_closed_with_1000_and_the_reason() {
     // Webots' own code when it is told to end is 1001.
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/support/going_away.py");
-    let webots = || Webots::script(&format!("exec python3 '{script}' \"$@\""));
+    let webots = |options: &str| Webots::script(&format!("exec python3 '{script}' {options} \"$@\""));
     let change = |builder: Builder| builder.set("isolation", "none").set("adminPassword", PASSWORD);
     let close = async |viewer: &mut Socket<MaybeTlsStream<TcpStream>>| loop {
         match next(viewer).await {
@@ -390,14 +390,18 @@ async fn a_stream_that_the_server_ends_is_closed_with_1000_and_the_reason() {
             other => panic!("{other:?}"),
         }
     };
-    let server = relaying(webots(), change).await;
-    let (client, path) = start(&server).await;
-    let (mut viewer, _) = tokio_tungstenite::connect_async(server.websocket(&path)).await.unwrap();
-    assert_eq!(next(&mut viewer).await, Some(Message::text("an update")));
-    let stop = server.url(&format!("/simulations/{}/stop", client.id()));
-    assert_eq!(http::post(&stop, Some(PASSWORD), "").await, 202);
-    let reason = "The administrator has stopped it".to_owned();
-    assert_eq!(close(&mut viewer).await, (1000, reason));
+    // The programs of a container are killed with the script that has started Webots.
+    for options in ["--abrupt", ""] {
+        let server = relaying(webots(options), change).await;
+        let (client, path) = start(&server).await;
+        let (mut viewer, _) = tokio_tungstenite::connect_async(server.websocket(&path)).await.unwrap();
+        assert_eq!(next(&mut viewer).await, Some(Message::text("an update")));
+        let stop = server.url(&format!("/simulations/{}/stop", client.id()));
+        assert_eq!(http::post(&stop, Some(PASSWORD), "").await, 202);
+        let reason = "The administrator has stopped it".to_owned();
+        assert_eq!(close(&mut viewer).await, (1000, reason), "{options}");
+    }
+    let server = relaying(webots(""), change).await;
 
     let (client, path) = start(&server).await;
     let (mut viewer, _) = tokio_tungstenite::connect_async(server.websocket(&path)).await.unwrap();

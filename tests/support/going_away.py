@@ -1,4 +1,7 @@
-"""Runs in place of Webots: it sends updates to each client, and closes with 1001 on SIGTERM, as Webots does."""
+"""Runs in place of Webots: it sends updates to each client, and closes with 1001 on SIGTERM, as Webots does.
+
+With `--abrupt` it just ends, as a Webots that is killed.
+"""
 
 import base64
 import hashlib
@@ -41,9 +44,10 @@ def serve(client):
 def end():
     signal.sigwait([signal.SIGTERM])
     with lock:
-        for client in clients:
+        for client in [] if "--abrupt" in sys.argv else clients:
             client.sendall(b"\x88\x02\x03\xe9")
-    os._exit(0)
+        # Within the lock, so that no frame is cut.
+        os._exit(0)
 
 
 def update():

@@ -1,7 +1,7 @@
 //! Relays a simulation's stream between a client and the port of its Webots on this machine: its WebSocket and the files
 //! that Webots serves.
 
-mod last_frame;
+mod frames;
 mod path;
 mod stream;
 mod stream_thread;

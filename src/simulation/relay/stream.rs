@@ -1,6 +1,6 @@
-//! One stream between a client and its Webots. The bytes are copied as they are: frames, their kinds and close codes are not
-//! parsed, except for the last frame of a simulation that the server ends; once a second the time of an update is looked
-//! for. Each direction is read only as fast as the other end takes it.
+//! One stream between a client and its Webots. The bytes are copied as they are, except for the last frame of a simulation
+//! that the server ends; once a second the time of an update is looked for. Each direction is read only as fast as the
+//! other end takes it.
 
 use std::io::{self, ErrorKind, Read, Write};
 use std::net::{Shutdown, TcpStream};
@@ -8,7 +8,7 @@ use std::sync::{Arc, OnceLock};
 
 use actix_web::web::Bytes;
 
-use super::last_frame::LastFrame;
+use super::frames::Frames;
 use crate::simulation::simulated_time::{SimulatedTime, StreamId};
 
 /// A stream.
@@ -17,6 +17,8 @@ pub struct Stream {
     pub up: Direction,
     /// From Webots to the client.
     pub down: Direction,
+    /// What Webots sends.
+    frames: Frames,
     /// Why the server ends the simulation, once it does.
     ending: Arc<OnceLock<String>>,
     /// How fast the simulation runs, as what it sends tells.
@@ -32,8 +34,6 @@ pub struct Direction {
     pub from: TcpStream,
     /// Data that was read and is not yet written.
     pending: Bytes,
-    /// What may be the last frame, while the server ends the simulation.
-    last: Option<LastFrame>,
     source: Source,
     has_ended: bool,
 }
@@ -58,9 +58,12 @@ impl Stream {
         (ending, time): (Arc<OnceLock<String>>, SimulatedTime),
         held: Box<dyn Send>,
     ) -> Self {
+        let mut frames = Frames::default();
+        frames.pass(&down.pending, None);
         Self {
             up,
             down,
+            frames,
             ending,
             time,
             id: StreamId(rand::random()),
@@ -72,7 +75,8 @@ impl Stream {
     /// had their turn.
     pub fn copy(&mut self, buffer: &mut [u8]) -> bool {
         let ending = self.ending.get().map(String::as_str);
-        let (down, length) = self.down.copy(&self.up.from, ending, buffer);
+        let frames = Some((&mut self.frames, ending));
+        let (down, length) = self.down.copy(&self.up.from, frames, buffer);
         if self.down.pending.is_empty() {
             self.time.read(self.id, buffer.get(..length).unwrap_or_default());
         } else {
@@ -94,7 +98,6 @@ impl Direction {
         Self {
             from,
             pending,
-            last: None,
             source: Source::Readable,
             has_ended: false,
         }
@@ -108,11 +111,16 @@ impl Direction {
     }
 
     /// Returns whether more can be copied, and the number of bytes that were read into the buffer.
-    fn copy(&mut self, to: &TcpStream, ending: Option<&str>, buffer: &mut [u8]) -> (bool, usize) {
+    fn copy(
+        &mut self,
+        to: &TcpStream,
+        frames: Option<(&mut Frames, Option<&str>)>,
+        buffer: &mut [u8],
+    ) -> (bool, usize) {
         if self.has_ended {
             return (false, 0);
         }
-        self.try_copy(to, ending, buffer).unwrap_or_else(|_| {
+        self.try_copy(to, frames, buffer).unwrap_or_else(|_| {
             self.has_ended = true;
             // That end then closes, and the other direction ends, too. An error: it has closed already.
             to.shutdown(Shutdown::Write).ok();
@@ -121,7 +129,12 @@ impl Direction {
     }
 
     /// An error means that this direction has ended.
-    fn try_copy(&mut self, to: &TcpStream, ending: Option<&str>, buffer: &mut [u8]) -> io::Result<(bool, usize)> {
+    fn try_copy(
+        &mut self,
+        to: &TcpStream,
+        frames: Option<(&mut Frames, Option<&str>)>,
+        buffer: &mut [u8],
+    ) -> io::Result<(bool, usize)> {
         let written = write(to, &self.pending)?;
         drop(self.pending.split_to(written));
         if !self.pending.is_empty() || self.source == Source::Empty {
@@ -133,8 +146,8 @@ impl Direction {
                 return Ok((false, 0));
             }
             Ok(0) | Err(_) => {
-                let last = self.last.take().ok_or(ErrorKind::UnexpectedEof)?;
-                self.pending = last.finish();
+                let close = frames.and_then(|(frames, ending)| frames.close(ending?));
+                self.pending = close.ok_or(ErrorKind::UnexpectedEof)?.into();
                 return Ok((true, 0));
             }
             Ok(length) => length,
@@ -143,13 +156,12 @@ impl Direction {
         if length < buffer.len() && self.source == Source::Readable {
             self.source = Source::Empty;
         }
-        let mut read = buffer.get(..length).unwrap_or_default();
-        let passed;
-        if let Some(reason) = ending {
-            passed = self.last.get_or_insert_with(|| LastFrame::new(reason)).pass(read);
-            read = &passed;
-        }
-        let written = write(to, read)?;
+        let read = buffer.get(..length).unwrap_or_default();
+        let read = match frames {
+            Some((frames, ending)) => frames.pass(read, ending),
+            None => read.into(),
+        };
+        let written = write(to, &read)?;
         let rest = read.get(written..).unwrap_or_default();
         self.pending = Bytes::copy_from_slice(rest);
         Ok((rest.is_empty() && self.source != Source::Empty, length))
