@@ -4,6 +4,8 @@ use icu_properties::props::{BinaryProperty, DefaultIgnorableCodePoint};
 
 /// Longest name of a client, in characters.
 const MAX_NAME: usize = 60;
+/// Longest name of a user, in characters.
+const MAX_USER: usize = 200;
 
 /// Returns a text without line breaks, terminal control sequences, direction marks and invisible characters.
 ///
@@ -23,6 +25,12 @@ pub fn one_line(text: &str) -> String {
 /// The name that a client has chosen, as one short line; `None` if nothing is left of it.
 pub fn chosen_name(text: &str) -> Option<String> {
     let name: String = one_line(text).trim().chars().take(MAX_NAME).collect();
+    (!name.is_empty()).then_some(name)
+}
+
+/// The name of a user, as one line; `None` if nothing is left of it.
+pub fn user_name(text: &str) -> Option<String> {
+    let name: String = one_line(text).trim().chars().take(MAX_USER).collect();
     (!name.is_empty()).then_some(name)
 }
 

@@ -4,7 +4,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use crate::shared::text::{chosen_name, one_line};
+use crate::shared::text::chosen_name;
 
 /// The identity of a client. Only administrators see it: on pages, in the server's log and in `simulations.csv`.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -17,15 +17,12 @@ pub struct ClientIdentity {
     pub label: Option<String>,
 }
 
-/// Longest user name, in characters.
-const MAX_USER_LENGTH: usize = 200;
-
 impl ClientIdentity {
-    /// Truncates the names, each as one line; an empty name becomes `None`.
-    pub fn new(user: Option<&str>, label: Option<&str>) -> Self {
-        let cut = |user: &str| one_line(user).trim().chars().take(MAX_USER_LENGTH).collect::<String>();
+    /// The user's name as [`crate::shared::http::TrustedProxies::user`] returns it. What the client calls itself becomes
+    /// one short line; an empty name becomes `None`.
+    pub fn new(user: Option<String>, label: Option<&str>) -> Self {
         Self {
-            user: user.map(cut).filter(|user| !user.is_empty()),
+            user,
             label: label.and_then(chosen_name),
         }
     }
@@ -62,7 +59,7 @@ mod tests {
             assert_eq!(label(text).as_deref(), shown, "{text:?}");
         }
         assert_eq!(
-            ClientIdentity::new(Some("anna@lab"), Some("A\"")).to_string(),
+            ClientIdentity::new(Some("anna@lab".to_owned()), Some("A\"")).to_string(),
             r#", user "anna@lab", calls itself "A\"""#
         );
     }

@@ -75,8 +75,11 @@ export class WebotsSimulation extends HTMLElement {
   start(world = this.world || this.#wanted) {
     this.#wanted = world;
     this.#isReady = false;
-    this.#plays = this.hasAttribute('autoplay');
-    this.#call(() => this.#runner?.take({ type: 'submitted', world }), true);
+    const begin = () => {
+      this.#plays = this.hasAttribute('autoplay');
+      this.#runner?.take({ type: 'submitted', world });
+    };
+    this.#call(begin, true);
   }
 
   /** Ends the simulation, or waits no longer. */
@@ -86,14 +89,18 @@ export class WebotsSimulation extends HTMLElement {
 
   /** Lets the time of the simulation run; of one that is not ready, once it is. */
   play() {
-    this.#plays = this.state !== 'running';
-    this.#call(() => this.#panel?.stage.play());
+    this.#call(() => {
+      this.#plays = this.state !== 'running';
+      this.#panel?.stage.play();
+    });
   }
 
   /** Lets the time of the simulation stand. */
   pause() {
-    this.#plays = false;
-    this.#call(() => this.#panel?.stage.pause());
+    this.#call(() => {
+      this.#plays = false;
+      this.#panel?.stage.pause();
+    });
   }
 
   /** Sets the simulation back to its beginning. */
@@ -224,11 +231,11 @@ export class WebotsSimulation extends HTMLElement {
   /** Goes on with what this tab has kept, or starts by itself. */
   #begin() {
     const calls = this.#calls.splice(0);
-    const wish = calls.length === 0 ? this.#runner?.restore() : undefined;
+    const wish = this.#runner?.restore();
     if (wish) {
       // Nobody has seen it run yet.
       this.#plays = this.hasAttribute('autoplay') && !wish.simulation?.hasRun;
-    } else if (calls.length === 0 && this.hasAttribute('autostart')) {
+    } else if (this.hasAttribute('autostart') && !calls.some(({ isStart }) => isStart)) {
       this.start();
     }
     for (const { call } of calls) {

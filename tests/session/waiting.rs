@@ -144,6 +144,23 @@ async fn a_ticket_keeps_the_place_over_a_reload_and_a_restart_of_the_session_ser
 }
 
 #[actix_rt::test]
+async fn who_got_a_server_that_then_drains_waits_in_its_old_place() {
+    let (server, session) = one_full_server(|builder| builder).await;
+    let Waiting(mut client, ticket) = Waiting::enter(&session, "lab").await;
+    let mut other = Waiting::enter(&session, "lab").await;
+    assert_eq!(other.position().await, "queue: 1");
+    server.set(Manner::idle(1.0, 1));
+    client.until("ws://").await;
+    let draining = json!({"load": 1, "draining": true, "instances": {"running": 0, "places": 1, "arrivals": 1}});
+    server.set(Manner::Status(draining));
+    until_states(&session, &["draining"]).await;
+    assert_eq!(other.position().await, "queue: 0");
+    let mut again = Waiting::come_back(&session, "lab", &ticket).await;
+    assert_eq!(again.position().await, "queue: 0");
+    assert_eq!(other.position().await, "queue: 1");
+}
+
+#[actix_rt::test]
 async fn a_turn_is_for_the_world_that_was_asked_for() {
     let key = |builder: Builder| builder.set("fleetKey", "a secret of this test");
     let (server, session) = one_full_server(key).await;
@@ -283,22 +300,28 @@ async fn the_monitor_shows_who_waits_for_what_and_since_when() {
 async fn a_user_has_one_place() {
     let builder = |builder: Builder| builder.set("userHeader", "X-User");
     let (_server, session) = one_full_server(builder).await;
-    let enter = async || {
+    let enter = async |user| {
         let url = session.websocket("/session");
-        let mut client = Client::with_headers(&url, &[("x-user", "anna")]).await.unwrap();
+        let mut client = Client::with_headers(&url, &[("x-user", user)]).await.unwrap();
         let url = world("lab/arm", "main", "worlds/a.wbt");
-        client.send(&json!({"url": url, "wait": true}).to_string()).await;
+        let request = json!({"url": url, "wait": true, "reason": true});
+        client.send(&request.to_string()).await;
         client.until("ticket: ").await;
         client
     };
-    let mut first = enter().await;
+    let mut first = enter("anna").await;
     assert_eq!(first.until("queue: ").await, "queue: 0");
     let mut other = Waiting::enter(&session, "lab").await;
     assert_eq!(other.position().await, "queue: 1");
-    let mut second = enter().await;
+    let mut second = enter(" anna").await;
+    assert!(first.until("reason: ").await.contains(r#""code":"taken-over""#));
     first.until("Error: another connection has this place").await;
     assert_eq!(second.until("queue: ").await, "queue: 0");
     assert_eq!(session.status().await["line"]["waiting"], 2);
     let metrics = session.metrics().await;
     assert!(metrics.contains("webots_session_waiting 2"), "{metrics}");
+    // Who has no name is nobody else.
+    let mut nameless = [enter("").await, enter(" ").await];
+    assert_eq!(nameless[0].until("queue: ").await, "queue: 2");
+    assert_eq!(nameless[1].until("queue: ").await, "queue: 3");
 }

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use actix::prelude::*;
 use prometheus::Histogram;
 
-use super::server_record::ServerRecord;
+use super::server_record::{Intake, ServerRecord, ServerState};
 use super::server_table::{ServerTable, admission, terms};
 use super::slot_link::{LinkChange, LinkEvent};
 use crate::session::class::{ClassEntry, ClassState};
@@ -109,8 +109,14 @@ impl LineKeeper {
             label: wait.label,
         };
         let is_up = |server: &PublicAddress| {
-            let record = servers.records.get(server);
-            record.is_some_and(|record| record.state.report().is_some())
+            let state = servers.records.get(server).map(|record| &record.state);
+            matches!(
+                state,
+                Some(ServerState::Answering {
+                    intake: Intake::Up | Intake::Full,
+                    ..
+                })
+            )
         };
         let terms = terms(&servers.records);
         let number = rand::random();

@@ -19,14 +19,13 @@ use actix::prelude::*;
 use actix_tls::connect::{Connector as TcpConnector, Resolver};
 use actix_web::web::Bytes;
 use awc::error::{ConnectError, SendRequestError};
-use awc::http::StatusCode;
 use awc::http::header::CONTENT_LENGTH;
 use rustls::ClientConfig;
 use tokio::sync::mpsc::{UnboundedSender, unbounded_channel};
 use tokio::time::{sleep_until, timeout};
 
 use super::resolver::HostResolver;
-use super::slot_link::{LinkEvent, SlotLink};
+use super::slot_link::{LinkEvent, NO_SUCH_PAGE, SlotLink};
 use crate::session::class::Roster;
 use crate::session::config::SessionConfig;
 use crate::shared::domain::{Failure, FleetKey, Load, PublicAddress, Reason, ServerReport, ToSimulationServer};
@@ -63,14 +62,6 @@ static BEGIN: LazyLock<Instant> = LazyLock::new(Instant::now);
 const MAX_TEXT_LENGTH: usize = 500;
 /// Time for which only `/load` is requested from a server without `/status`.
 const LOAD_ONLY: Duration = Duration::from_mins(1);
-
-/// Status codes of a server that has no such page; some servers answer only that the request is invalid.
-const NO_SUCH_PAGE: [StatusCode; 4] = [
-    StatusCode::NOT_FOUND,
-    StatusCode::BAD_REQUEST,
-    StatusCode::METHOD_NOT_ALLOWED,
-    StatusCode::NOT_IMPLEMENTED,
-];
 
 /// An HTTP client that keeps one connection to the simulation server.
 fn client(interval: Duration, tls: Option<Arc<ClientConfig>>) -> awc::Client {

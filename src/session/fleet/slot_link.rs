@@ -92,6 +92,17 @@ enum LinkError {
     Broken(String),
 }
 
+impl LinkError {
+    /// Why no WebSocket was opened. A web server before a simulation server that is just starting has other answers than
+    /// one without `/slots`.
+    fn of_handshake(error: WsClientError) -> Self {
+        match error {
+            WsClientError::InvalidResponseStatus(status) if NO_SUCH_PAGE.contains(&status) => Self::Unsupported,
+            error => Self::Broken(error.to_string()),
+        }
+    }
+}
+
 type Socket = Framed<BoxedSocket, Codec>;
 
 /// Longest message, in bytes: one has at most fifty simulations, whose texts are bounded.
@@ -104,6 +115,13 @@ const SILENCE: Duration = Duration::from_mins(2);
 const PAUSE: Duration = Duration::from_millis(500);
 /// Pause after each message and ping of a server, so that none can keep this one busy with them.
 const BETWEEN_MESSAGES: Duration = Duration::from_millis(1);
+/// Status codes of a server that has no such page; some servers answer only that the request is invalid.
+pub(super) const NO_SUCH_PAGE: [StatusCode; 4] = [
+    StatusCode::NOT_FOUND,
+    StatusCode::BAD_REQUEST,
+    StatusCode::METHOD_NOT_ALLOWED,
+    StatusCode::NOT_IMPLEMENTED,
+];
 /// Pause if the server has no `/slots`, or another key.
 const LONG_PAUSE: Duration = Duration::from_secs(30);
 
@@ -142,12 +160,7 @@ impl SlotLink {
     async fn open(&self, messages: &mut UnboundedReceiver<ToSimulationServer>) -> Result<(), LinkError> {
         let opening = timeout(CONNECT, self.client.ws(&self.url).max_frame_size(MAX_MESSAGE).connect()).await;
         let opened = opening.map_err(|_| LinkError::Broken("no connection in time".to_owned()))?;
-        let (_, mut socket) = opened.map_err(|error| match error {
-            WsClientError::InvalidResponseStatus(status) if status != StatusCode::SERVICE_UNAVAILABLE => {
-                LinkError::Unsupported
-            }
-            error => LinkError::Broken(error.to_string()),
-        })?;
+        let (_, mut socket) = opened.map_err(LinkError::of_handshake)?;
         let hello: Hello = receive(&mut socket, CONNECT).await?;
         send(&mut socket, &hello.prove(&self.key)).await?;
         // A server with another key refuses the proof.
@@ -294,6 +307,20 @@ async fn receive<M: DeserializeOwned>(socket: &mut Socket, limit: Duration) -> R
             Some(Ok(Frame::Close(Some(why)))) if why.code == CloseCode::Policy => return Err(LinkError::Refused),
             Some(Ok(_)) | None => return Err(broken("it has ended")),
             Some(Err(error)) => return Err(broken(&error.to_string())),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_a_server_without_the_page_is_not_asked_again_soon() {
+        for (status, is_unsupported) in [(404, true), (400, true), (502, false), (503, false), (504, false)] {
+            let status = StatusCode::from_u16(status).unwrap();
+            let error = LinkError::of_handshake(WsClientError::InvalidResponseStatus(status));
+            assert_eq!(matches!(error, LinkError::Unsupported), is_unsupported, "{status}");
         }
     }
 }

@@ -128,10 +128,10 @@ impl<Server, Client> Default for Dispatcher<Server, Client> {
 
 impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
     /// A client asks for a slot. With a valid ticket it has the place in that; `number` is that of a new ticket. `is_up`
-    /// is whether a server answers, `terms` on what terms one takes a world by its last report.
+    /// is whether a server answers and does not drain, `terms` on what terms one takes a world by its last report.
     ///
     /// A ticket whose turn has come is not valid any more, except to hear that turn again for the same world, or if the server
-    /// is gone that had to take its client.
+    /// is gone that had to take its client, or takes nobody any more.
     pub fn enter(
         &mut self,
         ticket: Option<Ticket>,
@@ -165,15 +165,10 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
         Entered::Waits(place, displaced)
     }
 
-    /// Whether the server of a turn is the one that it was.
+    /// Whether the server of a turn takes clients, and is the one that it was.
     fn still_takes(&self, turn: &Turn<Server>, is_up: impl Fn(&Server) -> bool) -> bool {
-        match turn.pass {
-            None => is_up(&turn.server),
-            Some(pass) => self
-                .links
-                .get(&turn.server)
-                .is_some_and(|link| link.server == pass.server),
-        }
+        let run = self.links.get(&turn.server).map(|link| link.server);
+        is_up(&turn.server) && turn.pass.is_none_or(|pass| run == Some(pass.server))
     }
 
     /// The client of a connection waits no longer.
@@ -251,7 +246,8 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
                 server: run,
                 reservation: offer.reservation,
             };
-            if let Some(place) = self.line.place_of(offer.ticket) {
+            // The place may be for another world by now, which this server does not take.
+            if let Some(place) = self.line.place_at(server, offer.ticket) {
                 fleet.place(server, now.instant);
                 turns.extend(self.turn(place, server, Some((pass, valid)), now));
             } else if let Some(link) = self.links.get_mut(server) {
@@ -905,6 +901,42 @@ mod tests {
                 number: 3
             }
         );
+    }
+
+    #[test]
+    fn whose_server_takes_nobody_any_more_has_its_place_again() {
+        for reserves in [true, false] {
+            let mut fleet = Fleet::new(&[(&[0], reserves, 1)]);
+            let place = alone(fleet.enter(0, None, 1));
+            fleet.free(0);
+            assert_eq!(fleet.turns, [(1, 0)]);
+            let sent = fleet.now.unix;
+            let terms = terms(&fleet.servers);
+            let ticket = Some(Ticket { place, sent });
+            let entered = fleet
+                .dispatcher
+                .enter(ticket, entry(0, 2), 2, |_| false, terms, fleet.now);
+            assert_eq!(entered, Entered::Waits(place, Vec::new()));
+        }
+    }
+
+    #[test]
+    fn a_slot_for_the_world_that_a_client_wanted_before_goes_back() {
+        let mut fleet = Fleet::new(&[(&[0], true, 1), (&[1], true, 1)]);
+        let place = alone(fleet.enter(0, None, 1));
+        // Its ticket is used again, for a world that only the other server takes.
+        let (terms, sent) = (terms(&fleet.servers), fleet.now.unix);
+        let ticket = Some(Ticket { place, sent });
+        fleet
+            .dispatcher
+            .enter(ticket, entry(1, 1), 1, |_| true, terms, fleet.now);
+        fleet.servers[0].taken -= 1;
+        fleet.offer(0, u64::MAX);
+        assert_eq!(fleet.turns, []);
+        // Somebody who takes the slot that goes back.
+        fleet.waiting.clear();
+        fleet.enter(0, None, 2);
+        assert_eq!(fleet.turns, [(2, 0)]);
     }
 
     #[test]

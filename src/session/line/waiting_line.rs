@@ -204,6 +204,13 @@ impl<Server: Clone + Eq, Client: Clone> WaitingLine<Server, Client> {
         Some(Place { since, number })
     }
 
+    /// The place of a ticket, if its client waits for a world that this server takes.
+    pub(super) fn place_at(&self, server: &Server, number: u64) -> Option<Place> {
+        let place = self.place_of(number)?;
+        let class = self.waiting.get(&place)?.group.class.get();
+        self.classes.servers_of(class).any(|one| one == server).then_some(place)
+    }
+
     /// All who wait, in order, for administrators.
     pub(super) fn clients(&self) -> impl Iterator<Item = WaitingClient<'_>> {
         self.waiting.iter().map(|(place, waiting)| WaitingClient {

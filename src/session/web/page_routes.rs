@@ -97,7 +97,7 @@ async fn viewer(request: HttpRequest, server: web::Data<AppState>) -> HttpRespon
     let user = config
         .user_header
         .as_ref()
-        .and_then(|header| config.trusted_proxies.trusted_header(&request, header));
+        .and_then(|header| config.trusted_proxies.user(&request, header));
     let script = server.config.viewer_script.as_ref().map(url::Url::as_str);
     if request.query_string().split('&').any(|one| one == "embed=1") {
         let policy = framed_by(VIEWER, &server.config.frame_ancestors);

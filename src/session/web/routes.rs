@@ -110,7 +110,7 @@ fn open_websocket(request: &HttpRequest, stream: web::Payload, server: &web::Dat
     let peer = server.config.trusted_proxies.peer(request);
     let permit = server.connections.admit(ConnectionKind::Client, peer)?;
     let user_header = server.config.user_header.as_ref();
-    let user = user_header.and_then(|name| server.config.trusted_proxies.trusted_header(request, name));
+    let user = user_header.and_then(|name| server.config.trusted_proxies.user(request, name));
     let server = Arc::clone(server);
     // Pages that do not request announcements would not understand them.
     let wants_announcements = request.query_string().split('&').any(|one| one == "announcements=1");

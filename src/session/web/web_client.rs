@@ -20,7 +20,7 @@ use super::refusal;
 use crate::session::fleet::{LineEvent, StopWaiting, Wait};
 use crate::session::line::{Place, Position, Ticket};
 use crate::session::state::{AppState, PLACED, read_world};
-use crate::shared::domain::{Failure, ProjectUrl};
+use crate::shared::domain::{Failure, ProjectUrl, Reason};
 use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::websocket::wrong_message;
 use crate::shared::http::{ConnectionPermit, Peer};
@@ -49,6 +49,8 @@ struct Waiting {
     world: u64,
     /// The seconds until its turn, as last sent.
     estimate: Option<u32>,
+    /// Whether it understands a text with the reason before that of an error.
+    wants_reason: bool,
 }
 
 type Context = WebsocketContext<WebClient>;
@@ -116,6 +118,7 @@ impl WebClient {
         self.waiting = Some(Waiting {
             world: hash(&world),
             estimate: None,
+            wants_reason: request.wants_reason,
         });
         let wait = Wait {
             world,
@@ -272,7 +275,8 @@ impl Handler<LineEvent> for WebClient {
                 self.waiting = None;
             }
             LineEvent::TakenOver => {
-                ctx.text("Error: another connection has this place in the line.");
+                let words = "another connection has this place in the line";
+                Self::refuse(&Failure::new(Reason::TakenOver, words), waiting.wants_reason, ctx);
                 self.waiting = None;
             }
         }

@@ -221,7 +221,7 @@ impl AdminAuth {
     fn administrator(&self, request: &HttpRequest, name: &str, way: Way, may: Permission) -> Administrator {
         let settings = &self.settings;
         let header = settings.user_header.as_ref().filter(|_| way != Way::Token);
-        let user = header.and_then(|header| settings.trusted_proxies.trusted_header(request, header));
+        let user = header.and_then(|header| settings.trusted_proxies.user(request, header));
         Administrator {
             name: one_line(user.as_deref().unwrap_or(name)),
             may,

@@ -13,6 +13,8 @@ use ipnet::IpNet;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::shared::text::user_name;
+
 /// The networks of proxies whose header `X-Forwarded-For` is trusted.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(try_from = "Vec<String>")]
@@ -55,15 +57,15 @@ impl TrustedProxies {
         self.resolve(address.to_canonical(), &HeaderMap::new())
     }
 
-    /// The value of a header that a trusted proxy sets; `None` if the header is repeated, because the client may have
-    /// sent one of them.
-    pub fn trusted_header(&self, request: &HttpRequest, header: &str) -> Option<String> {
+    /// The user that a trusted proxy names in this header; `None` if the header is empty, or repeated, because the client
+    /// may have sent one of them.
+    pub fn user(&self, request: &HttpRequest, header: &str) -> Option<String> {
         let is_trusted = request
             .peer_addr()
             .is_some_and(|address| self.trusts(address.ip().to_canonical()));
         let mut lines = request.headers().get_all(header).filter(|_| is_trusted);
         match (lines.next(), lines.next()) {
-            (Some(line), None) => String::from_utf8(line.as_bytes().to_vec()).ok(),
+            (Some(line), None) => std::str::from_utf8(line.as_bytes()).ok().and_then(user_name),
             _ => None,
         }
     }

@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 
 use actix::fut::wrap_future;
 use actix::prelude::*;
+use actix_rt::task::spawn_blocking;
 use jiff::Timestamp;
 
 use super::session::{Session, SpareEvent};
@@ -204,10 +205,17 @@ impl SpareKeeper {
                 continue;
             }
             let asked = self.server.checkouts.tips(worlds.into_iter().collect(), is_due);
-            let repository = repository.clone();
-            let assets = self.server.launcher.assets_of(&repository);
+            let (server, repository) = (Arc::clone(&self.server), repository.clone());
+            let asked = async move {
+                let answer = asked.await;
+                let assets = spawn_blocking(move || (server.launcher.assets_of(&repository), repository)).await;
+                (answer, assets)
+            };
             wrap_future::<_, Self>(asked)
-                .map(move |answer, keeper, _| keeper.asked(&repository, assets, answer))
+                .map(move |(answer, assets), keeper, _| match assets {
+                    Ok((assets, repository)) => keeper.asked(&repository, assets, answer),
+                    Err(error) => log::error!("assets can't be looked for: {error}"),
+                })
                 .spawn(ctx);
         }
     }

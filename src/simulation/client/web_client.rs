@@ -126,7 +126,7 @@ impl WebClient {
             (ClientRequest::Resume(token), None) => self.resume(&token, ctx),
             (ClientRequest::Keep, Some(_)) => self.send(ClientAction::Keep),
             (ClientRequest::Start(start), None) => {
-                let identity = ClientIdentity::new(self.user.as_deref(), start.name.as_deref());
+                let identity = ClientIdentity::new(self.user.clone(), start.name.as_deref());
                 // Sent only if the session panics: otherwise it sends an end itself.
                 let connection = self.attach(lost(), ctx);
                 Session::open(&self.server, identity, connection, &start);

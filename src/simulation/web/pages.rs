@@ -242,7 +242,7 @@ mod tests {
     #[test]
     fn what_a_client_names_is_only_text() {
         let world = ProjectUrl::parse("https://github.com/u/<i>\"'&/blob/main/worlds/<script>.wbt").unwrap();
-        let identity = ClientIdentity::new(Some("<i>root</i>"), Some("<script>'\"&"));
+        let identity = ClientIdentity::new(Some("<i>root</i>".to_owned()), Some("<script>'\"&"));
         let simulation = Simulation::new(SimulationId::next(), &world, identity);
         for (visitor, has_names) in [
             (Visitor::Anybody, false),

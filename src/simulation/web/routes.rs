@@ -47,7 +47,7 @@ async fn client(
     let user = config
         .user_header
         .as_ref()
-        .and_then(|name| proxies.trusted_header(&request, name));
+        .and_then(|name| proxies.user(&request, name));
     let server = Arc::clone(&server);
     Ok(websocket::open(
         &request,
