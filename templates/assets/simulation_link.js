@@ -52,8 +52,8 @@ export class SimulationLink {
     this.#socket.addEventListener('message', ({ data }) => this.#read(String(data)));
     const url = `${server}/client`.replace(/^ws/, 'http');
     this.#socket.addEventListener('close', async ({ code }) => {
-      // A browser does not tell why a connection could not be opened.
-      const isForbidden = !this.#isOpen && 'start' in request && (await forbids(url));
+      // A browser does not tell why a connection could not be opened. One that the page gave up needs no reason.
+      const isForbidden = !this.#isOver && !this.#isOpen && 'start' in request && (await forbids(url));
       this.#end(code, isForbidden);
     });
   }

@@ -7,7 +7,6 @@ import { Scene, SceneError } from './scene.js';
 import { Stream } from './stream.js';
 
 export { SceneError } from './scene.js';
-export { isDemonstration } from './stream.js';
 
 /** @typedef {import('./stream.js').Mode} Mode */
 

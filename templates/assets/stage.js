@@ -9,7 +9,9 @@ const REPORT = 2000;
 const HERE = 'webots-viewer';
 /** Least time between two signs of life that are passed on, in milliseconds. */
 const HEARD = 500;
-/** How long a simulation server may take to say whether it has Webots' viewer, in ms. */
+/** The program whose scenes are for the small viewer. */
+const DEMO = 'demo-simulator';
+/** How long a simulation server may take to say whether Webots' viewer fits, in milliseconds. */
 const ANSWER = 3000;
 
 /** @typedef {import('./visit.js').Event} VisitEvent */
@@ -57,9 +59,8 @@ export class Stage {
   async show({ address, kind, server, isBack }, { viewer, script, say }) {
     this.#shows += 1;
     const show = this.#shows;
-    const webots = viewer === 'small' ? undefined : ((await ownViewer(server)) ?? script);
-    const isSmall = !webots || (viewer === 'automatic' && (await (await small()).isDemonstration(address, kind)));
-    const viewers = isSmall ? await small() : undefined;
+    const webots = viewer === 'small' ? undefined : await webotsViewer(server, script, viewer === 'webots');
+    const viewers = webots ? undefined : await small();
     if (show !== this.#shows) {
       return;
     }
@@ -69,7 +70,7 @@ export class Stage {
     } else if (webots) {
       this.#showWebots(address, webots);
     }
-    if (isSmall && viewer === 'webots') {
+    if (viewers && viewer === 'webots') {
       say(this.#words.stage.onlySmall);
     }
   }
@@ -204,17 +205,23 @@ export class Stage {
 }
 
 /**
- * The URL of Webots' own viewer on a simulation server, if it has it.
+ * The URL of Webots' own viewer, if it fits: that of the simulation server, or else the configured one. It does not fit
+ * the demo simulator, unless somebody has chosen it.
  * @param {string} server
+ * @param {string | undefined} script
+ * @param {boolean} isChosen
  * @returns {Promise<string | undefined>}
  */
-async function ownViewer(server) {
+async function webotsViewer(server, script, isChosen) {
   const base = server.startsWith('ws') ? `http${server.slice('ws'.length)}` : server;
   try {
-    const { viewer } = await (await fetch(`${base}/status`, { signal: AbortSignal.timeout(ANSWER) })).json();
-    return viewer ? `${base}/${viewer}` : undefined;
+    const { viewer, simulator } = await (await fetch(`${base}/status`, { signal: AbortSignal.timeout(ANSWER) })).json();
+    if (simulator === DEMO && !isChosen) {
+      return undefined;
+    }
+    return viewer ? `${base}/${viewer}` : script;
   } catch {
     // Another kind of server, without a viewer.
-    return undefined;
+    return script;
   }
 }

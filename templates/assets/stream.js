@@ -4,8 +4,6 @@
 const SILENCE = 2000;
 /** The names of the 3D stream, in the order in which they are tried if the server has not told which one it is. */
 const KINDS = ['x3d', 'w3d'];
-/** How long a simulator has to show that it is the demonstration's, in milliseconds. */
-const DEMONSTRATION = 3 * SILENCE;
 
 /**
  * An update of the scene, as the simulator sends it.
@@ -145,30 +143,4 @@ function events(text) {
 function printed(line) {
   const prefix = ['stdout:', 'stderr:'].find((name) => line.startsWith(name)) ?? '';
   return line.slice(prefix.length);
-}
-
-/**
- * Whether the simulator at this address is the demonstration's, as the head of its scene says.
- * @param {string} url
- * @param {string | undefined} kind
- * @returns {Promise<boolean>}
- */
-export function isDemonstration(url, kind) {
-  return new Promise((resolve) => {
-    /** @param {boolean} found */
-    const answer = (found) => {
-      clearTimeout(timer);
-      stream.close();
-      resolve(found);
-    };
-    const timer = setTimeout(() => answer(false), DEMONSTRATION);
-    const stream = new Stream(url, { kind, isOnlooker: true }, (event) => {
-      if (event.is === 'model') {
-        // What comes before the scene is not of the world.
-        answer(event.xml.slice(0, event.xml.indexOf('<Scene')).includes('name="simulator" content="demo"'));
-      } else if (event.is === 'closed') {
-        answer(false);
-      }
-    });
-  });
 }

@@ -4,11 +4,10 @@
 import assert from 'node:assert/strict';
 import { beforeEach, test } from 'node:test';
 
-import { isDemonstration, Stream } from '../../templates/assets/stream.js';
+import { Stream } from '../../templates/assets/stream.js';
 import { Clock, FakeWebSocket } from './fakes.js';
 
 const SCENE = 'model:<X3D><head></head><Scene></Scene></X3D>';
-const DEMO = 'model:<X3D><head><meta name="simulator" content="demo"/></head><Scene></Scene></X3D>';
 const UPDATE = 'application/json:{"time":32,"updates":[]}';
 
 /** @type {Clock} */
@@ -79,36 +78,6 @@ test('the progress of Webots comes with its percentage', () => {
   const { socket, events } = open({ kind: 'w3d' });
   webots(socket, 'w3d', ['loading:Parsing nodes:50']);
   assert.deepEqual(events, [{ is: 'loading', status: 'Parsing nodes', percent: 50 }]);
-});
-
-test('the demonstration is recognized by the head of its scene alone', async () => {
-  const worlds = [
-    { scene: DEMO, expected: true },
-    { scene: SCENE, expected: false },
-    {
-      scene: 'model:<X3D><head></head><Scene><WorldInfo title=\'name="simulator" content="demo"\'/></Scene></X3D>',
-      expected: false,
-    },
-  ];
-  for (const { scene, expected } of worlds) {
-    const found = isDemonstration('ws://host:1', undefined);
-    const socket = FakeWebSocket.last;
-    webots(socket, 'w3d', [UPDATE, scene]);
-    socket.receive(UPDATE, 'stderr:name="simulator" content="demo"');
-    clock.pass(2000);
-    assert.equal(await found, expected, scene);
-    assert.equal(socket.closedWith, 1000);
-  }
-});
-
-test('a simulator that sends no scene in time is not the demonstration', async () => {
-  const found = isDemonstration('ws://host:1', 'w3d');
-  webots(FakeWebSocket.last, 'w3d', []);
-  for (let second = 0; second < 6; ++second) {
-    FakeWebSocket.last.receive(UPDATE);
-    clock.pass(1000);
-  }
-  assert.equal(await found, false);
 });
 
 test('texts of other versions are understood', () => {

@@ -61,7 +61,7 @@ class Page:
     def __init__(self, context):
         self.context = context
         self.tab = context.new_page()
-        self.asked, self.complaints, self.loses_connections = [], [], False
+        self.asked, self.complaints = [], []
         self.tab.on("request", lambda request: self.asked.append(request.url))
         self.tab.on("websocket", lambda socket: self.asked.append(socket.url))
         self.tab.on("console", self._console)
@@ -91,7 +91,10 @@ class Page:
         """All violations that axe-core finds, in the page or in a frame of it."""
         # Console messages of axe-core itself are not errors of the page.
         complaints = list(self.complaints)
-        violations = Axe().run(frame or self.tab).response["violations"]
+        axe, page = Axe(), frame or self.tab
+        if not page.evaluate("'axe' in window"):
+            page.evaluate(axe.axe_script)
+        violations = page.evaluate("axe.run({ resultTypes: ['violations'] })")["violations"]
         self.complaints[:] = complaints
         return [
             f"{one['id']}: {node['html'][:200]} {node['failureSummary']}" for one in violations for node in one["nodes"]

@@ -2,12 +2,13 @@
 
 import pathlib
 import re
+import shutil
 import tempfile
 import unittest
 
 from case import BrowserTest
 from door import COOKIE, OneDoor
-from fleet import WORLD
+from fleet import BIN, WORLD, until
 from playwright.sync_api import expect
 
 # Like the real one, it links a style sheet of another site, adds a script to the page, and compiles a function.
@@ -61,23 +62,24 @@ def installed(test):
 class WebotsViewer(BrowserTest):
     @classmethod
     def setUpClass(cls):
-        cls.simulation = installed(cls)
+        keys = installed(cls)
+        # The demo simulator, but not by its name.
+        webots = shutil.copy(BIN / "demo-simulator", f"{keys['webotsHome']}/webots")
+        cls.simulation = {**keys, "webots": webots}
         super().setUpClass()
 
-    def test_it_is_loaded_from_the_simulation_server_alone(self):
+    def test_it_is_loaded_from_the_simulation_server_alone_and_nothing_else_asks_for_the_scene(self):
         page = self.open(self.fleet.session.url("viewer"))
+        sent = self.sent_over_streams(page)
         expect(page.tab.locator("#availability")).to_contain_text("Available")
-        page.tab.get_by_label("Shown by").select_option("webots")
         page.tab.get_by_role("button", name="Playground").click()
         page.tab.get_by_role("button", name="Connect", exact=True).click()
         view = page.tab.frame_locator("#stage iframe").locator("webots-view")
         expect(view).to_contain_text("connected to ws://127.0.0.1:")
         expect(view).to_contain_text("/wwi/wren.data undefined null compiled")
         expect(view).to_have_css("font-size", "20px")
-
-    def test_a_scene_of_the_demonstration_is_shown_by_the_small_viewer(self):
-        page, _ = self.start_world()
-        expect(page.tab.locator("#view")).to_be_visible()
+        until("it asks for the scene", lambda: sent)
+        self.assertEqual([text for text in sent if text.startswith("w3d")], ["w3d"])
 
 
 class BehindTheDoor(BrowserTest):
@@ -94,6 +96,12 @@ class BehindTheDoor(BrowserTest):
         page.context.add_cookies([{"name": COOKIE, "value": "anna", "url": self.fleet.url("")}])
         page.tab.goto(url)
         return page
+
+    def test_a_scene_of_the_demonstration_is_shown_by_the_small_viewer(self):
+        page = self.visit(self.fleet.url(f"viewer?url={WORLD.format('playground')}&start=1"))
+        expect(page.tab.locator("#view")).to_be_visible()
+        page.tab.get_by_role("button", name="Disconnect").click()
+        expect(page.tab.locator("#stage")).to_contain_text("it has ended")
 
     def test_it_streams_through_the_door_and_an_administrator_watches_with_it(self):
         page = self.visit(self.fleet.url(f"viewer?url={WORLD.format('playground')}"))

@@ -207,6 +207,12 @@ impl SimulationConfig {
         self.log_dir.0.join("simulation")
     }
 
+    /// The name of the program that runs worlds.
+    pub fn simulator(&self) -> Option<String> {
+        let program = self.webots.as_ref()?.0.file_name()?;
+        Some(program.to_string_lossy().into_owned())
+    }
+
     /// Whether simulations are spread over the GPUs of the machine.
     pub fn spreads(&self) -> bool {
         self.gpus == GpuUse::Spread && (self.container.gpu || !self.docker)

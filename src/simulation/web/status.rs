@@ -51,6 +51,8 @@ pub fn status_page(server: &AppState, snapshot: &Snapshot, names_machine: bool) 
         "gpuProblem": readings.gpu_problem,
         // `places`: how many are offered because simulations are slow; null: all.
         "realTime": {"target": server.config.real_time.target, "places": server.slots.real_time_places()},
+        // Pages choose the viewer by it.
+        "simulator": server.config.simulator(),
         "viewer": webots_viewer::folder(&server.config).map(|_| webots_viewer::PATH),
         "simulations": snapshot.simulations,
     });
