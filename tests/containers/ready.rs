@@ -2,6 +2,7 @@
 
 use std::time::{Duration, Instant};
 
+use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 
 use super::daemon::{self, ask, containers, docker, of_service};
@@ -33,17 +34,28 @@ async fn until_ready(server: &Server, count: u16) {
 async fn a_class_takes_containers_that_are_ready_and_starts_none() {
     let Some(_docker) = docker().await else { return };
     const CLASS: u16 = 3;
-    // Once it has all slots, none is started in place of those that it has taken.
-    let server = keeping(daemon::server(CLASS), &arm(), CLASS).start().await;
-    until_ready(&server, CLASS).await;
-    assert_eq!(server.simulations().await.len(), 0);
-    let running = || {
-        let mut ids = of_service(&server, "webots");
+    let folder = tempfile::tempdir().unwrap();
+    let start = || keeping(daemon::server(CLASS).folder(folder.path()), &arm(), CLASS).start();
+    let running = |server: &Server| {
+        let mut ids = of_service(server, "webots");
         ids.sort();
         ids
     };
-    let before = running();
-    assert_eq!(before.len(), usize::from(CLASS));
+    let mut killed = start().await;
+    until_ready(&killed, CLASS).await;
+    let of_killed = running(&killed);
+    killed.signal(Signal::SIGKILL);
+    killed.ended().await;
+    // Once the class has all slots, none is started in place of those that it has taken.
+    let mut server = start().await;
+    until_ready(&server, CLASS).await;
+    assert_eq!(server.simulations().await.len(), 0);
+    until("nothing is left of the killed server", async || {
+        containers(&server).len() == usize::from(CLASS)
+    })
+    .await;
+    let before = running(&server);
+    assert!(before.iter().all(|id| !of_killed.contains(id)));
     let mut clients = Vec::new();
     for _ in 0..CLASS {
         clients.push(Client::start(&server, &arm()).await);
@@ -55,7 +67,7 @@ async fn a_class_takes_containers_that_are_ready_and_starts_none() {
         let stream = format!("{}/", url.strip_prefix("webots:").unwrap());
         Client::connect(&stream).await.with_running_scene().await;
     }
-    assert_eq!(running(), before, "no container was started");
+    assert_eq!(running(&server), before, "no container was started");
     for client in clients {
         client.leave().await;
     }
@@ -63,8 +75,17 @@ async fn a_class_takes_containers_that_are_ready_and_starts_none() {
         kept(&server).await["ready"] == CLASS && server.simulations().await.is_empty()
     })
     .await;
-    assert!(running().iter().all(|id| !before.contains(id)));
-    server.reload(json!({"ready": []}));
+    assert!(running(&server).iter().all(|id| !before.contains(id)));
+    // The server drains: what nobody has ends at once, and it ends with its last client.
+    let client = Client::ready(&server).await;
+    server.signal(Signal::SIGUSR1);
+    until("the client's is left", async || {
+        server.status().await["instances"]["spare"] == 0 && containers(&server).len() == 1
+    })
+    .await;
+    assert_eq!(server.simulations().await.len(), 1);
+    client.leave().await;
+    assert_eq!(server.ended().await, Some(0));
     until("no container is left", async || containers(&server).is_empty()).await;
 }
 
@@ -152,6 +173,8 @@ async fn a_world_that_only_shares_idle_time_stays_ready_at_any_load_and_is_start
     std::fs::remove_file(&mark).unwrap();
     until_ready(&server, 1).await;
     assert_eq!(kept(&server).await["problem"], Value::Null);
+    server.reload(json!({"ready": []}));
+    until("no container is left", async || containers(&server).is_empty()).await;
 }
 
 /// The figures of docs/ready.md: `tests/own_network.sh cargo test --test containers on_a_quiet_machine_a_class -- --nocapture`

@@ -44,6 +44,12 @@ fn pids(server: &Server) -> Vec<i32> {
     pids
 }
 
+/// When a line of the log was written.
+fn time_of(line: &str) -> jiff::SignedDuration {
+    let time: jiff::Timestamp = line.split(' ').next().unwrap().parse().unwrap();
+    time.as_duration()
+}
+
 async fn asking(server: &Server, start: Value) -> Client {
     let mut client = Client::connect(&server.websocket("/client")).await;
     client.send(&json!({ "start": start }).to_string()).await;
@@ -94,8 +100,13 @@ async fn a_client_takes_one_that_is_ready_and_starts_nothing() {
         let mut client = Client::resuming(&server, &token).await;
         client.token().await;
         drop(viewer);
-        // Another one is started in its place.
+        // Another one is started in its place, but not while others of its class may come.
         until_ready(&server, 2).await;
+        let log = server.log();
+        let is_started = |line: &&str| line.contains("is kept ready with");
+        let taken = log.lines().find(|line| line.contains(": takes it")).unwrap();
+        let pause = time_of(log.lines().rfind(is_started).unwrap()) - time_of(taken);
+        assert!(pause.as_secs_f64() >= 3.0, "{pause}");
         client.close_with(1000).await;
         until("only those are left", async || {
             server.simulations().await.is_empty() && kept(&server).await["ready"] == 2

@@ -29,6 +29,8 @@ pub struct SpareKeeper {
     server: Arc<AppState>,
     repositories: HashMap<String, ListedRepository>,
     worlds: BTreeMap<SpareKind, ListedWorld>,
+    /// The number of clients that have come, and when that was seen to change.
+    arrivals: (u64, Option<Instant>),
 }
 
 /// A repository of listed worlds.
@@ -71,6 +73,9 @@ struct Plan {
 const TICK: Duration = Duration::from_millis(500);
 /// Number of simulations that start at a time: their starts are in nobody's way.
 const STARTS: usize = 2;
+/// Time after a client's arrival in which none is started: others of its class are about to come, and starts, of containers
+/// above all, would delay them.
+const CALM: Duration = Duration::from_secs(3);
 /// Bounds of the pause after a failed start, which doubles each time.
 const PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_mins(10));
 /// Memory in use, beyond the load up to which simulations are started, from which some end, in percent.
@@ -90,6 +95,7 @@ impl SpareKeeper {
             server,
             repositories: HashMap::new(),
             worlds: BTreeMap::new(),
+            arrivals: (0, None),
         }
     }
 
@@ -108,7 +114,7 @@ impl SpareKeeper {
         let readings = self.server.readings.borrow().clone();
         let limit = self.server.config.ready_load;
         let has_room = readings.load.is_some_and(|load| load.percent() < limit) && memory(&readings) < limit;
-        let is_open = has_room && !self.server.takes_nobody();
+        let is_open = self.is_calm() && has_room && !self.server.takes_nobody();
         let starting = spares.values().flatten().filter(|one| !one.is_ready).count();
         let mut starts = STARTS.saturating_sub(starting);
         let mut has_slot = self.server.slots.has_room_for_spare();
@@ -138,6 +144,16 @@ impl SpareKeeper {
         {
             self.server.slots.end_spare(one.id);
         }
+    }
+
+    /// Whether no client has come lately.
+    fn is_calm(&mut self) -> bool {
+        let (known, changed) = &mut self.arrivals;
+        let arrivals = self.server.slots.instances().arrivals;
+        if std::mem::replace(known, arrivals) != arrivals {
+            *changed = Some(Instant::now());
+        }
+        changed.is_none_or(|changed| changed.elapsed() >= CALM)
     }
 
     /// The commit of a world that may be started now: the pause after its last failed start is over, and at this load the

@@ -60,7 +60,7 @@ impl RealTimePlaces {
 
     /// The speed of a simulation as a share of the best of its world.
     fn relative(&mut self, pace: &Pace) -> f64 {
-        let factor = pace.factor.clamp(0.0, 1.0);
+        let factor = pace.factor.min(1.0);
         if self.best.len() >= WORLDS && !self.best.contains_key(&pace.world) {
             self.best.clear();
         }
@@ -76,12 +76,12 @@ impl RealTimePlaces {
             clippy::cast_sign_loss,
             reason = "less than the number of simulations"
         )]
-        let fitting = used.saturating_sub(lost.round() as usize).max(1);
+        let fitting = used.saturating_sub(lost.round() as usize);
         let begins = self.limit.is_none_or(|limit| now.duration_since(limit.slow) >= WELL);
         let before = self.limit.filter(|_| !begins);
         let least = before.map_or(used.div_ceil(2), |limit| limit.least);
         let known = self.limit.map_or(used, |limit| limit.places);
-        let places = fitting.max(least).min(known.max(least)).max(1);
+        let places = fitting.min(known).max(least);
         if begins {
             log::warn!(
                 "simulations run slower than they can: of {used} that have a place {fitting} would run in real time. Until \
@@ -99,13 +99,12 @@ impl RealTimePlaces {
     /// Simulations are not slow, or too few are known to tell.
     fn recover(&mut self, used: usize, all: usize, now: Instant) {
         let Some(limit) = &mut self.limit else { return };
-        let is_well = now.duration_since(limit.slow) >= WELL;
         let mut places = limit.places;
-        if is_well {
+        if now.duration_since(limit.slow) >= WELL {
             // What runs well has been shown to fit.
             places = places.max(used);
         }
-        if is_well && now.duration_since(limit.changed) >= RAISE {
+        if now.duration_since(limit.changed) >= RAISE {
             places += (places / 10).max(1);
         }
         if places != limit.places {
@@ -171,6 +170,20 @@ mod tests {
         // Of those that still start, too.
         assert_eq!(server.run(&paces("a", &[20.0 / 30.0; 30]), 30, 5), Some(20));
         assert_eq!(server.run(&paces("a", &[1.0; 19]), 19, 60), Some(20), "it is known now");
+        // What those that are not slow lack counts, too.
+        let mut server = Server::new();
+        server.run(&paces("a", &[1.0; 30]), 30, 1);
+        let mixed = [[0.8; 15], [0.96; 15]].concat();
+        assert_eq!(server.run(&paces("a", &mixed), 30, 1), Some(26));
+    }
+
+    #[test]
+    fn slow_is_what_is_below_halfway_from_the_target_to_one() {
+        let mut server = Server::new();
+        server.run(&paces("a", &[1.0; 40]), 40, 1);
+        let halfway = f64::midpoint(TARGET, 1.0);
+        assert_eq!(server.run(&paces("a", &[halfway; 40]), 40, 1), None);
+        assert_eq!(server.run(&paces("a", &[halfway - 0.01; 40]), 40, 1), Some(38));
     }
 
     #[test]
@@ -189,6 +202,38 @@ mod tests {
         assert_eq!(server.run(&well, 10, 1), Some(33));
         assert_eq!(server.run(&[], 0, 600), Some(39));
         assert_eq!(server.run(&[], 0, 300), None);
+        // On a full server that is well all places are known to fit.
+        server.run(&paces("a", &[0.5; 40]), 40, 1);
+        assert_eq!(server.run(&paces("a", &[1.0; 40]), 40, 10), None);
+    }
+
+    #[test]
+    fn places_are_added_to_few_and_for_those_that_come_later() {
+        let mut server = Server::new();
+        server.run(&paces("a", &[1.0; 5]), 5, 1);
+        assert_eq!(server.run(&paces("a", &[0.1; 5]), 5, 1), Some(3), "half of five");
+        let well = paces("a", &[1.0; 3]);
+        assert_eq!(server.run(&well, 3, 300), Some(4));
+        assert_eq!(server.run(&well, 6, 1), Some(6));
+        assert_eq!(server.run(&well, 7, 1), Some(7));
+    }
+
+    #[test]
+    fn those_that_are_slow_again_soon_after_they_were_well_are_counted_anew() {
+        let slow = |server: &mut Server, used: usize| server.run(&paces("a", &vec![0.2; used]), used, 1);
+        for (seconds, places) in [(8, 15), (9, 5), (10, 5), (11, 5)] {
+            let mut server = Server::new();
+            server.run(&paces("a", &[1.0; 30]), 30, 1);
+            assert_eq!(slow(&mut server, 30), Some(15));
+            server.run(&paces("a", &[1.0; 20]), 20, seconds);
+            assert_eq!(slow(&mut server, 10), Some(places), "after {seconds} s");
+        }
+        // Of more clients half of the places remain.
+        let mut server = Server::new();
+        server.run(&paces("a", &[1.0; 30]), 30, 1);
+        slow(&mut server, 30);
+        server.run(&paces("a", &[1.0; 30]), 30, 9);
+        assert_eq!(slow(&mut server, 38), Some(19));
     }
 
     #[test]
@@ -197,6 +242,15 @@ mod tests {
         assert_eq!(server.run(&paces("heavy", &[0.5]), 1, 60), None);
         assert_eq!(server.run(&paces("heavy", &[0.5; 10]), 10, 60), None);
         assert_eq!(server.run(&paces("heavy", &[0.4; 10]), 10, 1), Some(8));
+        // Beside faster ones, too.
+        let mut server = Server::new();
+        let both = [paces("a", &[1.0; 5]), paces("heavy", &[0.5; 6])].concat();
+        assert_eq!(server.run(&both, 11, 60), None);
+        // One that stands still says nothing, neither of the machine nor of others.
+        let still = paces("still", &[0.0; 4]);
+        assert_eq!(server.run(&still, 4, 60), None);
+        let both = [paces("a", &[0.5; 4]), still].concat();
+        assert_eq!(server.run(&both, 8, 1), Some(6));
     }
 
     #[test]
@@ -216,9 +270,10 @@ mod tests {
         assert_eq!(server.run(&all, 20, 60), None);
         all.iter_mut().take(10).for_each(|pace| pace.factor = 0.1);
         assert_eq!(server.run(&all, 20, 1), Some(11));
-        let mut alone = Server::new();
-        alone.run(&paces("a", &[1.0]), 1, 1);
-        assert_eq!(alone.run(&paces("a", &[0.1]), 1, 60), None);
+        let mut few = Server::new();
+        few.run(&paces("a", &[1.0]), 1, 1);
+        assert_eq!(few.run(&paces("a", &[0.1]), 1, 60), None);
+        assert_eq!(few.run(&paces("a", &[0.1; 2]), 2, 1), Some(1));
     }
 
     #[test]
@@ -255,7 +310,11 @@ mod tests {
         let mut server = Server::new();
         for number in 0..3 * WORLDS {
             server.run(&paces(&number.to_string(), &[1.0]), 1, 1);
+            assert!(server.places.best.len() <= WORLDS);
         }
-        assert!(server.places.best.len() <= WORLDS);
+        // The table is full, and what it has is used.
+        assert_eq!(server.places.best.len(), WORLDS);
+        let last = (3 * WORLDS - 1).to_string();
+        assert_eq!(server.run(&paces(&last, &[0.5; 10]), 10, 1), Some(5));
     }
 }
