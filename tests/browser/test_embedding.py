@@ -229,6 +229,22 @@ class PrintedPages(Embedding):
         expect(tab.locator("#told")).to_have_text("What did the robot do? Please write it down.")
         until("it is gone", lambda: not self.simulations())
 
+    def test_a_call_before_the_element_is_ready_prevents_neither_its_start_nor_its_return(self):
+        call = """<script type="module">
+          await customElements.whenDefined('webots-simulation');
+          document.getElementById('robot').play();
+        </script>"""
+        page = self.visit("eager", printed("A page").replace('id="robot"', 'id="robot" autostart') + call)
+        tab = page.tab
+        expect(tab.locator("#mode")).to_have_text("real time")
+        (before,) = self.simulations()
+        tab.reload()
+        expect(tab.locator("#mode")).to_have_text("real time")
+        (after,) = self.simulations()
+        self.assertEqual(before["id"], after["id"])
+        tab.evaluate("document.getElementById('robot').stop()")
+        until("it is gone", lambda: not self.simulations())
+
     def test_two_elements_are_two_simulations_and_the_removal_of_one_ends_it(self):
         page = self.visit("race", printed("Two simulations"))
         tab = page.tab
