@@ -3,6 +3,7 @@
 
 import './announce.js';
 import { find, make, setText } from './dom.js';
+import { showReady } from './lessons.js';
 import { follow } from './server_events.js';
 import { makeSortable, sort as sortTable } from './table.js';
 import { timeOfDay } from './times.js';
@@ -13,7 +14,7 @@ import { timeOfDay } from './times.js';
  */
 /** A simulation server. @typedef {{ address: string, page: string, state: string, note: string, simulations?: number }} Server */
 /** An event. @typedef {{ all?: boolean, changed?: Entry[], gone?: [string | null, string][],
- *   servers?: Server[], announcement?: string }} Update
+ *   servers?: Server[], ready?: import('./lessons.js').ReadyWorld[], announcement?: string }} Update
  */
 
 /** A row of the table. @typedef {{ entry: Entry, row: HTMLTableRowElement, text: string[] }} Row */
@@ -243,7 +244,7 @@ function showServers(servers) {
 }
 
 /** @param {Update} update */
-function take({ all: isAll, changed, gone, servers, announcement }) {
+function take({ all: isAll, changed, gone, servers, ready, announcement }) {
   if (isAll) {
     const there = new Set((changed ?? []).map((entry) => keyOf(entry.server, entry.id)));
     [...rows.keys()].filter((key) => !there.has(key)).forEach(drop);
@@ -256,6 +257,9 @@ function take({ all: isAll, changed, gone, servers, announcement }) {
   }
   if (servers) {
     showServers(servers);
+  }
+  if (ready) {
+    showReady(ready);
   }
   if (announcement !== undefined) {
     const place = find('announcement', HTMLElement);

@@ -115,6 +115,7 @@ test('modules have no words of their own', () => {
     'class.js',
     'server_events.js',
     'announce.js',
+    'lessons.js',
     'simulation_monitor.js',
     'times.js',
   ];

@@ -57,6 +57,30 @@ class OneClass(BrowserTest):
         expect(page.tab.locator("#live")).to_have_text("Live")
         return page
 
+    def test_a_teacher_asks_for_simulations_that_are_ready_for_a_lesson(self):
+        page = self.teacher()
+        page.tab.get_by_label("World", exact=True).fill(WORLD.format("carousel"))
+        page.tab.get_by_label("How many").fill("1")
+        now = page.tab.evaluate("Date.now()")
+        later = page.tab.evaluate(
+            "(time) => new Date(time - 60000 * new Date(time).getTimezoneOffset()).toISOString().slice(0, 16)",
+            now + 3_600_000,
+        )
+        page.tab.get_by_label("until").fill(later)
+        page.tab.get_by_role("button", name="Keep ready").click()
+        kept = page.tab.locator("#ready-worlds li")
+        expect(kept).to_contain_text("carousel.wbt 1 of 1 ready now; 1 until")
+        (asked,) = self.fleet.session.status()["requested"]
+        self.assertLess(abs(page.tab.evaluate("(time) => Date.parse(time)", asked["until"]) - now - 3_600_000), 60_000)
+        self.assertEqual(page.faults(), [])
+        kept.get_by_role("button", name="End carousel.wbt").click()
+        expect(kept).to_have_count(0)
+        # A world that is none is named, and nothing is kept.
+        page.tab.get_by_label("World", exact=True).fill("https://example.org/nothing")
+        page.tab.get_by_role("button", name="Keep ready").click()
+        expect(page.tab.locator("#ready-problem")).to_contain_text("Wrong Webots simulation URL")
+        page.complaints.clear()
+
     def test_a_teacher_has_all_servers_on_one_page(self):
         students = self.start(["anna", "ben", "chloe"])
         others = self.start(["dora"], "playground")

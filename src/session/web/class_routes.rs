@@ -18,11 +18,12 @@ use futures_util::future::join_all;
 use futures_util::stream::{self, StreamExt};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
+use serde_json::value::RawValue;
 
 use crate::session::class::{Changes, ClassEntry, Key, Matching, Watching};
 use crate::session::fleet::{FleetStatus, GetMonitors, GetRecords, ServerStatus, StateName};
 use crate::session::state::AppState;
-use crate::shared::domain::PublicAddress;
+use crate::shared::domain::{ProjectUrl, PublicAddress, ReadyEntry, View};
 use crate::shared::http::assets::accepts_gzip;
 use crate::shared::http::routing::{GET, POST, READ, json_body, path};
 use crate::shared::http::time_span::{TimeSpan, csv_file};
@@ -271,6 +272,35 @@ fn server_lines(server: &AppState, status: &FleetStatus) -> Vec<ServerLine> {
     status.servers.iter().map(line).collect()
 }
 
+/// A world that is kept ready, or will be, as the page shows it.
+#[derive(Serialize)]
+struct ReadyWorld<'status> {
+    world: &'status ProjectUrl,
+    mode: View,
+    /// How many are to be ready now.
+    wanted: u32,
+    /// How many are.
+    ready: u32,
+    /// What `POST /ready` has asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    lesson: Option<&'status ReadyEntry>,
+}
+
+fn ready_worlds(status: &FleetStatus) -> Vec<ReadyWorld<'_>> {
+    let mut worlds = Vec::new();
+    for one in &status.ready {
+        let mut lessons = status.requested.iter();
+        worlds.push(ReadyWorld {
+            world: &one.world,
+            mode: one.mode,
+            wanted: one.count,
+            ready: status.ready(one),
+            lesson: lessons.find(|entry| (&entry.world, entry.mode) == (&one.world, one.mode)),
+        });
+    }
+    worlds
+}
+
 fn percent_encoded(address: &PublicAddress) -> String {
     url::form_urlencoded::byte_serialize(address.to_string().as_bytes()).collect()
 }
@@ -282,7 +312,9 @@ struct Event {
     #[serde(flatten)]
     list: Option<List>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    servers: Option<Box<serde_json::value::RawValue>>,
+    servers: Option<Box<RawValue>>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    ready: Option<Box<RawValue>>,
     #[serde(skip_serializing_if = "Option::is_none")]
     announcement: Option<String>,
 }
@@ -300,8 +332,9 @@ struct Feed {
     server: web::Data<AppState>,
     /// The version of the list that the page knows.
     known: Option<u64>,
-    /// The servers that the page knows.
+    /// The servers, and the worlds that are kept ready, that the page knows.
     servers: String,
+    ready: String,
     announcement: Option<String>,
     /// Number of looks so far.
     looks: u32,
@@ -326,6 +359,7 @@ async fn events(request: HttpRequest, server: web::Data<AppState>) -> Result<Htt
     let mut feed = Feed {
         known: known.and_then(|id| id.strip_prefix(&format!("{}-", server.run))?.parse().ok()),
         servers: String::new(),
+        ready: String::new(),
         announcement: None,
         looks: 0,
         unsent: Bytes::new(),
@@ -399,31 +433,33 @@ impl Feed {
                 List { all, changed, gone }
             },
         );
-        let servers = if self.looks.is_multiple_of(SERVERS) {
-            self.new_servers().await
-        } else {
-            None
-        };
+        let (mut servers, mut ready) = (None, None);
+        if self.looks.is_multiple_of(SERVERS)
+            && let Ok(status) = self.server.status().await
+        {
+            servers = if_new(&mut self.servers, &server_lines(&self.server, &status));
+            ready = if_new(&mut self.ready, &ready_worlds(&status));
+        }
         let announcement = self.server.announcement.borrow().clone();
         let announcement = (self.announcement.as_ref() != Some(&announcement)).then_some(announcement);
         self.announcement = announcement.clone().or(self.announcement.take());
-        let has_news = list.is_some() || servers.is_some() || announcement.is_some();
+        let has_news = list.is_some() || servers.is_some() || ready.is_some() || announcement.is_some();
         has_news.then_some(Event {
             version: env!("CARGO_PKG_VERSION"),
             list,
             servers,
+            ready,
             announcement,
         })
     }
+}
 
-    /// The servers, if they are not as the page knows them.
-    async fn new_servers(&mut self) -> Option<Box<serde_json::value::RawValue>> {
-        let status = self.server.status().await.ok()?;
-        let lines = serde_json::to_string(&server_lines(&self.server, &status)).ok()?;
-        if lines == self.servers {
-            return None;
-        }
-        self.servers.clone_from(&lines);
-        serde_json::value::RawValue::from_string(lines).ok()
+/// These lines, if they are not as the page knows them.
+fn if_new(known: &mut String, lines: &impl Serialize) -> Option<Box<RawValue>> {
+    let lines = serde_json::to_string(lines).ok()?;
+    if lines == *known {
+        return None;
     }
+    known.clone_from(&lines);
+    RawValue::from_string(lines).ok()
 }

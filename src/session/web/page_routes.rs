@@ -17,7 +17,7 @@ use crate::shared::http::{ConnectionKind, FOREIGN_SCRIPTS, OWN_FILES, PageView, 
 use crate::shared::run::timestamp;
 
 /// Assets of this server's pages, besides those that both servers share.
-static ASSETS: [Asset; 18] = [
+static ASSETS: [Asset; 19] = [
     asset!("viewer.js"),
     asset!("viewer.css"),
     asset!("embed.js"),
@@ -41,6 +41,7 @@ static ASSETS: [Asset; 18] = [
     asset!("class.css"),
     asset!("class.js"),
     asset!("announce.js"),
+    asset!("lessons.js"),
 ];
 
 /// Adds the routes to an app.
