@@ -94,7 +94,7 @@ async fn a_thousand_servers_that_fail_together_are_one_mail() {
     let mut smtp = Smtp::start(&[]).await;
     let _session = mailing(&servers, smtp.port)
         .set("loadRefresh", 600)
-        .set("timing.gather", 3)
+        .set("timing.gather", 8)
         .start()
         .await;
     let mail = smtp.mail().await;
