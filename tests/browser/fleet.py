@@ -41,12 +41,12 @@ def free_ports(count):
     raise RuntimeError(f"no {count} free ports in a row")
 
 
-def until(what, condition):
+def until(what, condition, patience=SOON):
     """Waits until a condition is true; returns its value."""
     begin = time.monotonic()
     while not (found := condition()):
         waited = time.monotonic() - begin
-        if waited > SOON:
+        if waited > patience:
             raise AssertionError(f"waited in vain until {what}")
         # The interval grows: each check of a page costs three programs milliseconds.
         time.sleep(min(max(waited / 10, 0.02), 0.25))

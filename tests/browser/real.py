@@ -17,12 +17,18 @@ import struct
 import zlib
 
 from fleet import SOON, Fleet
+from fleet import until as soon
 from machine import Machine
 
 PARTS = pathlib.Path(os.environ.get("WEBOTS_REAL_PARTS", "/nonexistent"))
 # In seconds: without a GPU the engine is slow.
 PATIENCE = 5 * SOON
 MISSING = "WEBOTS_REAL_PARTS names no folder with Webots' viewer and an export, see tests/browser/real.py"
+
+
+def until(what, condition):
+    """Waits with this patience."""
+    return soon(what, condition, PATIENCE)
 
 
 def release():

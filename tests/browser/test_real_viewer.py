@@ -8,8 +8,9 @@ import unittest
 
 import real
 from case import Administered, BrowserTest
-from fleet import WORLD, until
+from fleet import WORLD
 from playwright.sync_api import expect
+from real import until
 from site_of_others import Site
 
 # Pictures of one scene differ a little: ambient occlusion is noise that is averaged over several frames.
@@ -48,9 +49,13 @@ class RealViewer:
         expect(page.tab.locator("#availability.on")).to_be_visible()
         page.tab.get_by_label("Shown by").select_option("webots")
         page.tab.get_by_role("button", name="Connect", exact=True).click()
+        return page, self.shown(page)
+
+    def shown(self, page):
+        """The frame of the viewer, once that shows the scene."""
         frame = page.tab.locator("#stage iframe").element_handle().content_frame()
         frame.wait_for_selector("#play-button", state="attached")
-        return page, frame
+        return frame
 
     def from_files(self, frame):
         """A page of the same size that draws the export from its files."""
@@ -100,9 +105,11 @@ class RealViewer:
         until("it draws the same in the new size", lambda: self.shared(frame, small, 0)["equal"] > SAME)
 
         self.opens_a_robot_window(frame)
+        pid = self.pid()
+        self.comes_back_after_a_lost_connection(page)
+        self.assertEqual(self.pid(), pid)
 
-        (server,) = [one for one in (self.fleet.simulation, self.fleet.other) if one.status()["simulations"]]
-        os.kill(server.status()["simulations"][0]["pid"], signal.SIGKILL)
+        os.kill(pid, signal.SIGKILL)
         expect(page.tab.locator("#problem-text")).not_to_be_empty()
         expect(page.tab.get_by_role("button", name="Connect", exact=True)).to_be_enabled()
 
@@ -113,6 +120,24 @@ class RealViewer:
         until("the robot's window is loaded", lambda: f"/robot_windows/{folder.name}/" in window.url)
         window.wait_for_load_state("domcontentloaded")
         self.assertGreater(window.locator("body *").count(), 0, window.url)
+
+    def pid(self):
+        """Of the simulation."""
+        servers = (self.fleet.simulation, self.fleet.other)
+        (simulation,) = [one for server in servers for one in server.status()["simulations"]]
+        return simulation["pid"]
+
+    def comes_back_after_a_lost_connection(self, page):
+        # The browser reports what it can't reach.
+        self.may_complain = True
+        page.context.set_offline(True)
+        expect(page.tab.locator("#notice-text")).to_contain_text("No connection for")
+        page.context.set_offline(False)
+        expect(page.tab.locator("#notice")).to_be_hidden()
+        frame = self.shown(page)
+        before = self.time(frame)
+        self.press(frame, "play")
+        until("the robot drives again", lambda: self.time(frame) > before + 500)
 
     def stands_still(self, frame):
         """The time once two looks at it, with a drawing between them, are the same."""
