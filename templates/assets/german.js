@@ -122,14 +122,14 @@ export const words = {
   },
   line: {
     advice:
-      'Es startet von selbst, wenn Sie an der Reihe sind. Sie behalten Ihren Platz, wenn Sie die Seite neu laden.',
+      'Es startet von selbst, wenn du an der Reihe bist. Du behältst deinen Platz, wenn du die Seite neu lädst.',
     /**
      * @param {string} position
      * @param {number} seconds
      */
     estimated: (position, seconds) =>
       `${position}, etwa ${seconds < 90 ? 'eine Minute' : `${Math.round(seconds / 60)} Minuten`}`,
-    turn: 'Sie sind an der Reihe.',
+    turn: 'Du bist an der Reihe.',
   },
   lost: {
     since: (seconds) => `Keine Verbindung seit ${duration(seconds)}.`,
@@ -160,7 +160,7 @@ export const words = {
     'no-frame':
       'Die Ansicht von Webots kann nicht gezeigt werden: Ihr Server erlaubt keine Rahmen auf Seiten dieser Website (Schlüssel frameAncestors).',
     'not-loaded':
-      'Die Szene lässt sich nicht zeigen: Ein Teil dieser Seite war nicht zu laden. Laden Sie die Seite neu.',
+      'Die Szene lässt sich nicht zeigen: Ein Teil dieser Seite war nicht zu laden. Lade die Seite neu.',
     'no-webgl': 'Die Szene lässt sich nicht zeigen: Dieser Browser hat kein WebGL und kann nichts zeichnen.',
     unreadable: 'Die Szene lässt sich nicht zeigen: Der Simulator hat eine unlesbare Szene gesendet.',
   },

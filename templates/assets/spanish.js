@@ -120,14 +120,14 @@ export const words = {
     advice: 'Empezará por sí sola cuando haya uno libre.',
   },
   line: {
-    advice: 'Empieza sola cuando sea su turno. Conserva su lugar si vuelve a cargar la página.',
+    advice: 'Empieza sola cuando sea tu turno. Conservas tu lugar si vuelves a cargar la página.',
     /**
      * @param {string} position
      * @param {number} seconds
      */
     estimated: (position, seconds) =>
       `${position}, aproximadamente ${seconds < 90 ? 'un minuto' : `${Math.round(seconds / 60)} minutos`}`,
-    turn: 'Es su turno.',
+    turn: 'Es tu turno.',
   },
   lost: {
     since: (seconds) => `Sin conexión desde hace ${duration(seconds)}.`,
@@ -158,7 +158,7 @@ export const words = {
     'no-frame':
       'No se puede mostrar la vista de Webots: su servidor no admite marcos en páginas de este sitio (clave frameAncestors).',
     'not-loaded':
-      'No se puede mostrar la escena: no se ha cargado una parte de esta página. Vuelva a cargar la página.',
+      'No se puede mostrar la escena: no se ha cargado una parte de esta página. Vuelve a cargar la página.',
     'no-webgl': 'No se puede mostrar la escena: este navegador no tiene WebGL y no puede dibujar nada.',
     unreadable: 'No se puede mostrar la escena: el simulador ha enviado una escena ilegible.',
   },
