@@ -121,8 +121,7 @@ export const words = {
     advice: 'Es geht von selbst los, sobald einer frei ist.',
   },
   line: {
-    advice:
-      'Es startet von selbst, wenn du an der Reihe bist. Du behältst deinen Platz, wenn du die Seite neu lädst.',
+    advice: 'Es startet von selbst, wenn du an der Reihe bist. Du behältst deinen Platz, wenn du die Seite neu lädst.',
     /**
      * @param {string} position
      * @param {number} seconds
@@ -159,8 +158,7 @@ export const words = {
   scene: {
     'no-frame':
       'Die Ansicht von Webots kann nicht gezeigt werden: Ihr Server erlaubt keine Rahmen auf Seiten dieser Website (Schlüssel frameAncestors).',
-    'not-loaded':
-      'Die Szene lässt sich nicht zeigen: Ein Teil dieser Seite war nicht zu laden. Lade die Seite neu.',
+    'not-loaded': 'Die Szene lässt sich nicht zeigen: Ein Teil dieser Seite war nicht zu laden. Lade die Seite neu.',
     'no-webgl': 'Die Szene lässt sich nicht zeigen: Dieser Browser hat kein WebGL und kann nichts zeichnen.',
     unreadable: 'Die Szene lässt sich nicht zeigen: Der Simulator hat eine unlesbare Szene gesendet.',
   },
