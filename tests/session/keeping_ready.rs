@@ -178,10 +178,18 @@ async fn a_lesson_is_requested_until_its_end_and_outlives_a_restart() {
         site.servers[0].status().await["instances"]["spare"] == 0
     })
     .await;
-    // One in the past is over.
-    let past = json!({"world": arm(), "count": 2, "until": "2020-01-01"});
-    assert_eq!(ready(&session, Some(PASSWORD), past).await, 200);
+    // One in the past is refused, and one ends when its time comes.
+    let until_then = |until: &str| json!({"world": arm(), "count": 1, "until": until});
+    assert_eq!(ready(&session, Some(PASSWORD), until_then("2020-01-01")).await, 400);
     assert_eq!(session.status().await["ready"], json!([]));
+    let soon = jiff::Timestamp::now() + std::time::Duration::from_secs(5);
+    assert_eq!(
+        ready(&session, Some(PASSWORD), until_then(&soon.to_string())).await,
+        200
+    );
+    assert_eq!(session.status().await["ready"][0]["wanted"], 1);
+    until("it is over", async || session.status().await["ready"] == json!([])).await;
+    assert!(jiff::Timestamp::now() >= soon);
 }
 
 #[actix_rt::test]

@@ -167,8 +167,8 @@ async fn clients_get_the_slots_of_those_that_are_ready_in_any_state() {
             (&status["instances"]["spare"], &status["ready"][0]["wanted"]),
             (&json!(0), &json!(2))
         );
-        // Nobody is ended for one that could be kept ready.
-        actix_rt::time::sleep(Duration::from_secs(1)).await;
+        // Nobody is ended for one that could be kept ready, also once others could be started again.
+        actix_rt::time::sleep(Duration::from_secs(5)).await;
         assert_eq!(server.simulations().await.len(), 2);
         first.leave().await;
         until("one is kept again", async || {

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use actix_web::error::ErrorInternalServerError;
 use actix_web::http::{StatusCode, header};
 use actix_web::{HttpRequest, HttpResponse, Result, web};
+use jiff::Timestamp;
 use percent_encoding::percent_decode_str;
 use serde::Deserialize;
 
@@ -182,6 +183,9 @@ async fn ready(request: HttpRequest, payload: web::Payload, server: web::Data<Ap
     };
     if entry.until.is_none() && entry.count > 0 {
         return Ok(HttpResponse::BadRequest().body("Error: until is missing, so that nothing is kept ready for ever."));
+    }
+    if entry.count > 0 && entry.is_over(Timestamp::now()) {
+        return Ok(HttpResponse::BadRequest().body("Error: until is over already."));
     }
     log::info!(
         "{administrator}: asks for {} of {} to be kept ready",

@@ -125,8 +125,8 @@ impl Cgroup {
 /// any lack of memory, `oom` how often the group was at its own limit (Linux, `Documentation/admin-guide/cgroup-v2.rst`).
 fn kill_for_memory(events: &str) -> Option<Cause> {
     let has = |name: &str| {
-        let counts = events.lines().filter_map(|line| line.split_once(' '));
-        counts.into_iter().any(|(key, count)| key == name && count != "0")
+        let mut counts = events.lines().filter_map(|line| line.split_once(' '));
+        counts.any(|(key, count)| key == name && count != "0")
     };
     has("oom_kill").then(|| {
         if has("oom") {
