@@ -50,11 +50,31 @@ export interface SimulationEvents {
 }
 
 /**
- * Attributes: `world` (its URL), `autostart`, `autoplay`, `name` (the visitor's, for administrators), `viewer` (`small` or
- * `webots`; without it, the one that fits), `viewer-script` (URL of Webots' own viewer, for servers that don't have it),
- * `lang` (`en`, `de`, `fr`, `es`, `zh` or `ja`; without it, that of the browser). `lang` and `autostart` are read only when the
- * element comes into its page, `world` and `autoplay` at each start, `viewer` and `viewer-script` when a scene is shown.
- *
+ * The attributes, for JSX and the like; docs/embedding.md, "TypeScript", shows how React takes them. `lang` and `autostart`
+ * are read only when the element comes into its page, `world` and `autoplay` at each start, `viewer` and `viewer-script` when
+ * a scene is shown.
+ */
+export interface SimulationAttributes {
+  /** The world: the address of its page on its forge. */
+  world?: string | undefined;
+  /** Starts by itself. It counts if it is there, whatever its value is. */
+  autostart?: boolean | '' | undefined;
+  /** Lets the time of the simulation run once it is ready. It counts if it is there, whatever its value is. */
+  autoplay?: boolean | '' | undefined;
+  /** The visitor's name, for administrators. */
+  name?: string | undefined;
+  /** Which viewer shows it; without it, the one that fits. */
+  viewer?: 'small' | 'webots' | undefined;
+  /** URL of Webots' own viewer, for servers that don't have it. */
+  'viewer-script'?: string | undefined;
+  /** `en`, `de`, `fr`, `es`, `zh` or `ja`; without it, the first of the browser's languages that there is. */
+  lang?: string | undefined;
+}
+
+/** All events of the element by their names, also those that each element has. */
+export type SimulationEventMap = Omit<HTMLElementEventMap, keyof SimulationEvents> & SimulationEvents;
+
+/**
  * CSS parts: `availability`, `announcement`, `start`, `leave`, `full-screen`, `notice`, `problem`, `steps`, `stage`.
  */
 export declare class WebotsSimulation extends HTMLElement {
@@ -71,15 +91,25 @@ export declare class WebotsSimulation extends HTMLElement {
   pause(): void;
   /** Sets the simulation back to its beginning. */
   reset(): void;
-  addEventListener<Type extends keyof SimulationEvents>(
+  addEventListener<Type extends keyof SimulationEventMap>(
     type: Type,
-    listener: (event: SimulationEvents[Type]) => void,
+    listener: (this: WebotsSimulation, event: SimulationEventMap[Type]) => void,
     options?: boolean | AddEventListenerOptions,
   ): void;
   addEventListener(
     type: string,
     listener: EventListenerOrEventListenerObject,
     options?: boolean | AddEventListenerOptions,
+  ): void;
+  removeEventListener<Type extends keyof SimulationEventMap>(
+    type: Type,
+    listener: (this: WebotsSimulation, event: SimulationEventMap[Type]) => void,
+    options?: boolean | EventListenerOptions,
+  ): void;
+  removeEventListener(
+    type: string,
+    listener: EventListenerOrEventListenerObject,
+    options?: boolean | EventListenerOptions,
   ): void;
 }
 

@@ -49,8 +49,7 @@ function column(heading) {
 test('attributes', () => {
   const own = all(SOURCE, /(?:get|has)Attribute\('([\w-]+)'\)/g);
   assert.deepEqual(own, column('attribute'));
-  const listed = between(TYPES, ' * Attributes:', '.\n').replace(/\([^)]*\)/g, '');
-  assert.deepEqual(own, all(listed, /`([\w-]+)`/g));
+  assert.deepEqual(own, all(between(TYPES, 'interface SimulationAttributes {', '\n}'), /^ {2}'?([\w-]+)'?\?:/gm));
 });
 
 test('events', () => {
