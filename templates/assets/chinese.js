@@ -2,7 +2,7 @@
 
 import { formats } from './intl.js';
 
-const { clock, duration, number, percent } = formats('zh-Hans');
+const { clock, duration, minutes, number, percent } = formats('zh-Hans');
 
 /** @type {import('./language.js').Words} */
 export const words = {
@@ -121,7 +121,7 @@ export const words = {
      * @param {string} position
      * @param {number} seconds
      */
-    estimated: (position, seconds) => `${position}，大约${Math.max(1, Math.round(seconds / 60))}分钟`,
+    estimated: (position, seconds) => `${position}，大约 ${minutes(seconds)}`,
     turn: '轮到您了。',
   },
   lost: {

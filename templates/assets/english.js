@@ -6,7 +6,7 @@ import { formats } from './intl.js';
 /** @typedef {import('./visit.js').OwnProblem} OwnProblem */
 /** @typedef {import('./messages.js').StepCode} StepCode */
 
-const { clock, duration, number, percent, plural } = formats('en');
+const { clock, duration, minutes, number, percent, plural } = formats('en');
 
 export const words = {
   /** The language, as the page names it to browsers and screen readers. */
@@ -132,8 +132,7 @@ export const words = {
      * @param {string} position
      * @param {number} seconds
      */
-    estimated: (position, seconds) =>
-      `${position}, about ${seconds < 90 ? 'a minute' : `${Math.round(seconds / 60)} minutes`}`,
+    estimated: (position, seconds) => `${position}, about ${minutes(seconds)}`,
     turn: 'It is your turn.',
   },
   lost: {

@@ -2,7 +2,7 @@
 
 import { formats } from './intl.js';
 
-const { clock, duration, number, percent, plural } = formats('fr');
+const { clock, duration, minutes, number, percent, plural } = formats('fr');
 
 /** @type {import('./language.js').Words} */
 export const words = {
@@ -125,8 +125,7 @@ export const words = {
      * @param {string} position
      * @param {number} seconds
      */
-    estimated: (position, seconds) =>
-      `${position}, environ ${seconds < 90 ? 'une minute' : `${Math.round(seconds / 60)} minutes`}`,
+    estimated: (position, seconds) => `${position}, environ ${minutes(seconds)}`,
     turn: 'C’est votre tour.',
   },
   lost: {

@@ -2,7 +2,7 @@
 
 import { formats } from './intl.js';
 
-const { clock, duration, number, percent, plural } = formats('de');
+const { clock, duration, minutes, number, percent, plural } = formats('de');
 
 /** @type {import('./language.js').Words} */
 export const words = {
@@ -126,8 +126,7 @@ export const words = {
      * @param {string} position
      * @param {number} seconds
      */
-    estimated: (position, seconds) =>
-      `${position}, etwa ${seconds < 90 ? 'eine Minute' : `${Math.round(seconds / 60)} Minuten`}`,
+    estimated: (position, seconds) => `${position}, etwa ${minutes(seconds)}`,
     turn: 'Du bist an der Reihe.',
   },
   lost: {

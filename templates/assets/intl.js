@@ -30,6 +30,18 @@ export function formats(language) {
    */
   const amount = (count, unit) =>
     new Intl.NumberFormat(language, { style: 'unit', unit, unitDisplay: 'long' }).format(count);
+  const duration = (/** @type {number} */ seconds) => {
+    const rest = Math.max(0, Math.round(seconds));
+    const hours = Math.floor(rest / 3600);
+    const minutes = Math.floor(rest / 60) % 60;
+    const all = [
+      { count: hours, unit: 'hour' },
+      { count: minutes, unit: 'minute' },
+      { count: hours > 0 ? 0 : rest % 60, unit: 'second' },
+    ];
+    const used = all.filter(({ count }) => count > 0).map(({ count, unit }) => amount(count, unit));
+    return parts().format(used.length > 0 ? used : [amount(0, 'second')]);
+  };
   return {
     /** @param {number} count */
     number: (count) => numbers().format(count),
@@ -41,19 +53,12 @@ export function formats(language) {
      * @param {{ one?: string, other: string }} forms
      */
     plural: (count, forms) => (plurals().select(count) === 'one' ? forms.one : undefined) ?? forms.other,
-    /** @param {number} seconds */
-    duration: (seconds) => {
-      const rest = Math.max(0, Math.round(seconds));
-      const hours = Math.floor(rest / 3600);
-      const minutes = Math.floor(rest / 60) % 60;
-      const all = [
-        { count: hours, unit: 'hour' },
-        { count: minutes, unit: 'minute' },
-        { count: hours > 0 ? 0 : rest % 60, unit: 'second' },
-      ];
-      const used = all.filter(({ count }) => count > 0).map(({ count, unit }) => amount(count, unit));
-      return parts().format(used.length > 0 ? used : [amount(0, 'second')]);
-    },
+    duration,
+    /**
+     * A duration that is only estimated: whole minutes, at least one.
+     * @param {number} seconds
+     */
+    minutes: (seconds) => duration(60 * Math.max(1, Math.round(seconds / 60))),
     /**
      * A time of the simulation.
      * @param {number} time in milliseconds

@@ -2,7 +2,7 @@
 
 import { formats } from './intl.js';
 
-const { clock, duration, number, percent } = formats('ja');
+const { clock, duration, minutes, number, percent } = formats('ja');
 
 /** @type {import('./language.js').Words} */
 export const words = {
@@ -123,7 +123,7 @@ export const words = {
      * @param {string} position
      * @param {number} seconds
      */
-    estimated: (position, seconds) => `${position}、約${Math.max(1, Math.round(seconds / 60))}分`,
+    estimated: (position, seconds) => `${position}、約 ${minutes(seconds)}`,
     turn: 'あなたの順番です。',
   },
   lost: {

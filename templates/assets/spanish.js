@@ -2,7 +2,7 @@
 
 import { formats } from './intl.js';
 
-const { clock, duration, number, percent, plural } = formats('es');
+const { clock, duration, minutes, number, percent, plural } = formats('es');
 
 /** @type {import('./language.js').Words} */
 export const words = {
@@ -125,8 +125,7 @@ export const words = {
      * @param {string} position
      * @param {number} seconds
      */
-    estimated: (position, seconds) =>
-      `${position}, aproximadamente ${seconds < 90 ? 'un minuto' : `${Math.round(seconds / 60)} minutos`}`,
+    estimated: (position, seconds) => `${position}, aproximadamente ${minutes(seconds)}`,
     turn: 'Es tu turno.',
   },
   lost: {

@@ -160,3 +160,27 @@ test('plural forms, durations and numbers are those of the language', async () =
   assert.deepEqual([0, 61_004.4, 3_600_500].map(clock), ['0:00.000', '1:01.004', '60:00.500']);
   assert.equal(german.viewer.time(1500), '0:01,500');
 });
+
+test('an estimate has whole minutes, with the units and forms of the language', async () => {
+  const estimates = {
+    en: ['about 1 minute', 'about 3 minutes', 'about 1 hour, 30 minutes', 'about 33 hours, 20 minutes'],
+    de: ['etwa 1 Minute', 'etwa 3 Minuten', 'etwa 1 Stunde, 30 Minuten', 'etwa 33 Stunden, 20 Minuten'],
+    fr: ['environ 1 minute', 'environ 3 minutes', 'environ 1 heure et 30 minutes', 'environ 33 heures et 20 minutes'],
+    es: [
+      'aproximadamente 1 minuto',
+      'aproximadamente 3 minutos',
+      'aproximadamente 1 hora y 30 minutos',
+      'aproximadamente 33 horas y 20 minutos',
+    ],
+    zh: ['大约 1分钟', '大约 3分钟', '大约 1小时30分钟', '大约 33小时20分钟'],
+    ja: ['約 1 分', '約 3 分', '約 1 時間 30 分', '約 33 時間 20 分'],
+  };
+  for (const [language, load] of Object.entries(LANGUAGES)) {
+    const { line } = (await load()).words;
+    const [one, ...more] = Object.entries(estimates).find(([name]) => name === language)?.[1] ?? [];
+    // Some spaces don't break lines.
+    const text = (/** @type {number} */ seconds) => line.estimated('', seconds).replace(/\s/g, ' ');
+    const texts = [0, 89, 200, 5400, 120_000].map((seconds) => text(seconds).replace(/^[,，、] ?/, ''));
+    assert.deepEqual(texts, [one, one, ...more], language);
+  }
+});

@@ -52,7 +52,7 @@ test('a place in the line, its turn, and the pass', () => {
     visit.pass(30).answer('ticket: t');
   }
   visit.answer('queue: 0');
-  assert.equal(visit.view.progress?.notes.session, 'you are next, about a minute');
+  assert.equal(visit.view.progress?.notes.session, 'you are next, about 1 minute');
   visit.answer('pass: p', SERVER);
   const request = { world: WORLD, pass: 'p' };
   assert.deepEqual(visit.effects.slice(-2), [{ do: 'connect', server: SERVER, request }, { do: 'sayTurn' }]);
