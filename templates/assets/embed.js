@@ -11,11 +11,9 @@ import { VisitRunner } from './visit_runner.js';
 /** @typedef {import('./visit.js').Event} VisitEvent */
 /** @typedef {import('./visit.js').State} State */
 
-/** What a page is told about the visit.
- * @typedef {'idle' | 'waiting' | 'starting' | 'running' | 'lost' | 'ended'} PublicState
- */
-
-/** @typedef {{ state: PublicState, world: string | undefined, ahead: number | undefined }} StateDetail */
+/** @typedef {import('../embed.js').SimulationState} PublicState */
+/** @typedef {import('../embed.js').StateDetail} StateDetail */
+/** What a page is told. @typedef {import('../embed.js').SimulationEvents} SimulationEvents */
 
 /** Pause before the words are loaded again, in milliseconds. */
 const RELOAD = 5000;
@@ -257,8 +255,9 @@ export class WebotsSimulation extends HTMLElement {
   /* events */
 
   /**
-   * @param {string} type
-   * @param {object} detail
+   * @template {keyof SimulationEvents} Type
+   * @param {Type} type
+   * @param {SimulationEvents[Type]['detail']} detail
    */
   #dispatch(type, detail) {
     this.dispatchEvent(new CustomEvent(type, { detail }));
@@ -334,7 +333,8 @@ export class WebotsSimulation extends HTMLElement {
   #endLeft(before) {
     const words = this.#panel?.words.stage;
     this.#isReady = false;
-    this.#dispatch('ended', { code: 'left', message: isConnected(before) ? words?.clearLeft : words?.clearStopped });
+    const message = isConnected(before) ? words?.clearLeft : words?.clearStopped;
+    this.#dispatch('ended', { code: 'left', message: message ?? '' });
   }
 
   /** @param {import('./visit.js').Problem} problem */

@@ -120,3 +120,21 @@ test('each start ends once: one that is replaced, and one that fails as the one 
   simulation.stop();
   assert.deepEqual(told, ['state idle undefined']);
 });
+
+test('an end has what the server has said of its reason', async () => {
+  const before = FakeWebSocket.all.length;
+  const { simulation } = element();
+  while (FakeWebSocket.all.length === before) {
+    await settled();
+  }
+  /** @type {object[]} */
+  const ends = [];
+  simulation.addEventListener('ended', (event) => ends.push(/** @type {CustomEvent} */ (event).detail));
+  FakeWebSocket.last.open();
+  FakeWebSocket.last.receive('1');
+  simulation.start('a');
+  const reason = { code: 'repository-blocked', blame: 'user', retry: 'no' };
+  FakeWebSocket.last.receive(`reason: ${JSON.stringify({ ...reason, message: 'It is blocked.', output: 'printed' })}`);
+  FakeWebSocket.last.receive('Error: It is blocked.');
+  assert.deepEqual(ends, [{ ...reason, message: 'It is blocked.', output: 'printed' }]);
+});
