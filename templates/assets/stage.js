@@ -5,8 +5,9 @@ const small = () => import('./small_viewer.js');
 
 /** Time in which the page of Webots' own viewer reports after its frame has loaded, in milliseconds. */
 const REPORT = 2000;
-/** What that page reports. */
+/** What that page reports: that it may be framed, and that its viewer shows the scene and takes orders. */
 const HERE = 'webots-viewer';
+const READY = 'webots-viewer-ready';
 /** Least time between two signs of life that are passed on, in milliseconds. */
 const HEARD = 500;
 /** The program whose scenes are for the small viewer. */
@@ -142,7 +143,14 @@ export class Stage {
     const listening = new AbortController();
     let isHere = false;
     const hear = (/** @type {MessageEvent} */ { source, data }) => {
-      isHere ||= source === frame.contentWindow && data === HERE;
+      if (source !== frame.contentWindow) {
+        return;
+      }
+      if (data === HERE) {
+        isHere = true;
+      } else if (data === READY) {
+        this.#tell({ type: 'scene', scene: { is: 'framed' } });
+      }
     };
     addEventListener('message', hear, { signal: listening.signal });
     const show = this.#shows;
@@ -165,7 +173,6 @@ export class Stage {
         frame.remove();
       },
     };
-    this.#tell({ type: 'scene', scene: { is: 'framed' } });
   }
 
   play() {

@@ -76,7 +76,7 @@ Object.assign(document.head, {
 
 /** The component, of which only this is used.
  * @typedef {HTMLElement & { connect(url: string | null, mode: undefined, broadcast: boolean, mobile: boolean, timeout: number): void,
- *   sendMessage?(text: string): void }} WebotsView
+ *   sendMessage?(text: string): void, onready?(): void }} WebotsView
  */
 
 try {
@@ -87,9 +87,11 @@ try {
   await import(script);
   const view = /** @type {WebotsView} */ (document.createElement('webots-view'));
   find('main', HTMLElement).append(view);
-  // The kind of stream is left to the component: its name has changed over the versions of Webots.
   // What the page around this one wants of the simulation, such as `pause`.
   addEventListener('message', ({ source, data }) => source === parent && view.sendMessage?.(String(data)));
+  // The scene is there, for the first time or after a reset.
+  view.onready = () => parent.postMessage('webots-viewer-ready', '*');
+  // The kind of stream is left to the component: its name has changed over the versions of Webots.
   view.connect(wanted.get('stream'), undefined, wanted.has('watch'), matchMedia('(pointer: coarse)').matches, -1);
 } catch (error) {
   problem(words.stage.noWebotsViewer(error instanceof Error ? error.message : error));

@@ -45,7 +45,7 @@ class RealViewer:
 
     def streamed(self):
         """The fleet's page with the viewer in it, and the viewer's frame."""
-        page = self.offline(f"{self.viewer()}?url={WORLD.format(real.world())}")
+        page = self.offline(f"{self.viewer()}?url={WORLD.format(real.world())}&play=1")
         expect(page.tab.locator("#availability.on")).to_be_visible()
         page.tab.get_by_label("Shown by").select_option("webots")
         page.tab.get_by_role("button", name="Connect", exact=True).click()
@@ -82,8 +82,7 @@ class RealViewer:
 
     def test_it_draws_what_the_files_have_and_obeys_its_buttons(self):
         page, frame = self.streamed()
-        self.press(frame, "play")
-        until("the robot drives", lambda: self.time(frame) > 500)
+        until("the robot drives by itself, as the page's URL says", lambda: self.time(frame) > 500)
         self.press(frame, "play")
         paused = until("time stands still", lambda: self.stands_still(frame))
         files = self.from_files(frame)

@@ -8,8 +8,9 @@ import unittest
 
 from case import BrowserTest
 from door import COOKIE, OneDoor
-from fleet import BIN, WORLD, until
+from fleet import BIN, WORLD, free_ports, until
 from playwright.sync_api import expect
+from site_of_others import FLEET, Site, printed
 
 # Like the real one, it links a style sheet of another site, adds a script to the page, and compiles a function.
 COMPONENT = """
@@ -33,12 +34,13 @@ class WebotsView extends HTMLElement {
   // As the real one does it: texts over the stream, files from where the stream is.
   stream(server, broadcast) {
     const socket = new WebSocket(server);
+    this.sendMessage = (text) => socket.readyState === 1 && socket.send(text);
     socket.onopen = () => socket.send(broadcast ? 'w3d;broadcast' : 'w3d');
     socket.onmessage = async ({ data }) => {
       if (data === 'scene load completed') {
         const file = await fetch(`${server.replace('ws', 'http')}worlds/textures/wood.png`);
         this.textContent += ` ${data}, ${await file.text()}`;
-        socket.send('real-time:-1');
+        this.onready();
       } else if (data.startsWith('application/json:'))
         this.title = data;
     };
@@ -46,6 +48,7 @@ class WebotsView extends HTMLElement {
 }
 customElements.define('webots-view', WebotsView);
 """
+MOVES = re.compile("^application/json:")
 
 
 def installed(test):
@@ -69,17 +72,40 @@ class WebotsViewer(BrowserTest):
         super().setUpClass()
 
     def test_it_is_loaded_from_the_simulation_server_alone_and_nothing_else_asks_for_the_scene(self):
-        page = self.open(self.fleet.session.url("viewer"))
+        page = self.open("about:blank")
         sent = self.sent_over_streams(page)
-        expect(page.tab.locator("#availability")).to_contain_text("Available")
-        page.tab.get_by_role("button", name="Playground").click()
-        page.tab.get_by_role("button", name="Connect", exact=True).click()
+        page.tab.goto(self.fleet.session.url(f"viewer?url={WORLD.format('playground')}&start=1&play=1"))
         view = page.tab.frame_locator("#stage iframe").locator("webots-view")
         expect(view).to_contain_text("connected to ws://127.0.0.1:")
         expect(view).to_contain_text("/wwi/wren.data undefined null compiled")
         expect(view).to_have_css("font-size", "20px")
-        until("it asks for the scene", lambda: sent)
-        self.assertEqual([text for text in sent if text.startswith("w3d")], ["w3d"])
+        expect(view).to_contain_text("scene load completed")
+        # What the page wants before the viewer has the scene is not lost.
+        expect(view).to_have_attribute("title", MOVES)
+        self.assertEqual(sent, ["w3d", "real-time:-1"])
+
+    def test_in_a_page_of_another_site_it_is_shown_where_the_site_may_frame_it(self):
+        site = self.enterContext(Site(self.fleet))
+        self.may_complain, self.elsewhere = True, {"localhost"}
+        text = printed("A page").replace('id="robot"', 'id="robot" autostart viewer="webots"')
+        refused = self.open(site.put("refused", text))
+        expect(refused.tab.locator("#problem-text")).to_contain_text("frameAncestors")
+        until("the console has it", lambda: any("frameAncestors" in one for one in refused.complaints))
+        refused.tab.close()
+        servers = {"simulationServers": [self.fleet.simulation.address], "loadRefresh": 0.2, "loadThreshold": 1000}
+        named = {"port": free_ports(1), "frameAncestors": [site.origin]}
+        framing = self.fleet.start("session-server", "framing", {**servers, **named})
+        play = """<script type="module">
+          await customElements.whenDefined('webots-simulation');
+          document.getElementById('robot').play();
+        </script>"""
+        allowed = self.open("about:blank")
+        sent = self.sent_over_streams(allowed)
+        allowed.tab.goto(site.put("allowed", text.replace(FLEET, framing.url("").rstrip("/")) + play))
+        view = allowed.tab.frame_locator("webots-simulation iframe").locator("webots-view")
+        expect(view).to_contain_text("scene load completed")
+        expect(view).to_have_attribute("title", MOVES)
+        self.assertEqual(sent, ["w3d", "real-time:-1"])
 
 
 class BehindTheDoor(BrowserTest):
@@ -104,22 +130,21 @@ class BehindTheDoor(BrowserTest):
         expect(page.tab.locator("#stage")).to_contain_text("it has ended")
 
     def test_it_streams_through_the_door_and_an_administrator_watches_with_it(self):
-        page = self.visit(self.fleet.url(f"viewer?url={WORLD.format('playground')}"))
+        page = self.visit(self.fleet.url(f"viewer?url={WORLD.format('playground')}&play=1"))
         expect(page.tab.locator("#availability.on")).to_be_visible()
         page.tab.get_by_label("Shown by").select_option("webots")
         page.tab.get_by_role("button", name="Connect", exact=True).click()
         view = page.tab.frame_locator("#stage iframe").locator("webots-view")
         expect(view).to_contain_text(f"connected to wss://{self.fleet.host}/127.0.0.")
         expect(view).to_contain_text("scene load completed, a picture")
-        moves = re.compile("^application/json:")
-        expect(view).to_have_attribute("title", moves)
+        expect(view).to_have_attribute("title", MOVES)
         server = page.tab.locator("[data-step=server] small").inner_text().replace("wss:", "https:")
         teacher = self.visit("about:blank")
         teacher.sign_in(server, "secret")
         teacher.tab.goto(teacher.tab.get_by_role("link", name="Watch").evaluate("link => link.href"))
         watched = teacher.tab.frame_locator("#stage iframe").locator("webots-view")
         expect(watched).to_contain_text(f"connected to {server.replace('https:', 'wss:')}/stream/")
-        expect(watched).to_have_attribute("title", moves)
+        expect(watched).to_have_attribute("title", MOVES)
         expect(page.tab.locator("#watched")).to_be_visible()
 
 
