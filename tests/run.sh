@@ -23,8 +23,9 @@ tests/install.sh cc=gcc,libc6-dev node=nodejs git=git git-lfs=git-lfs flock=util
 # The headless build of the browser takes half of the processor time, if the distribution has it.
 ! apt-cache show chromium-headless-shell >/dev/null 2>&1 ||
     tests/install.sh chromium-headless-shell=chromium-headless-shell || echo 'the browser tests take longer' >&2
+skipped=() failed=()
 # Not each distribution has it.
-tests/install.sh firefox-esr=firefox-esr || echo 'the browser tests in Firefox are skipped' >&2
+tests/install.sh firefox-esr=firefox-esr || skipped+=('the browser tests in Firefox')
 # udev does this; without udev the device may be missing or accessible to root only.
 if ((EUID == 0)) && [[ ! -c /dev/net/tun || $(stat --format=%a /dev/net/tun) != 666 ]]; then
     echo 'lets everybody open /dev/net/tun, as udev does'
@@ -40,7 +41,6 @@ if (($# > 0)); then
 fi
 
 start=$SECONDS
-skipped=() failed=()
 logs=$(mktemp -d)
 declare -A jobs=()
 # shellcheck disable=SC2317 # The trap calls it.
@@ -118,6 +118,11 @@ start "${CARGO[@]}" --test integration --test faults on_a_quiet_machine -- --tes
 finish "${CARGO[@]}" --test integration --test faults on_a_quiet_machine -- --test-threads=1
 start tests/own_network.sh "${CARGO[@]}" --test containers on_a_quiet_machine
 finish tests/own_network.sh "${CARGO[@]}" --test containers on_a_quiet_machine
+drawing='env QUIET_MACHINE=1 tests/browser/run test_embedding.PrintedPages.test_on_a_quiet_machine_it_is_drawn_within_100_ms'
+# shellcheck disable=SC2086
+start $drawing
+# shellcheck disable=SC2086
+finish $drawing
 rm "$logs/busy"
 [[ -n ${jobs[tests/swarm.sh]-} ]] || start tests/swarm.sh
 # The guide mostly unpacks packages with apt, while the Swarm test waits.
