@@ -8,19 +8,19 @@
 //! |---|---|
 //! | [`shared::text`] | untrusted texts, made safe to show |
 //! | [`shared::config`] | configuration files: loading, errors, kinds of values, a macro for structs of keys (`keys`) |
-//! | [`shared::domain`] | addresses, loads, world URLs and the Git hosts that they name (`project_url`), a server's report |
+//! | [`shared::domain`] | addresses, loads, the forms of world URLs (`project_url`), which repositories a server takes (`admission`), a server's report |
 //! | [`shared::run`] | start, readiness, log, stop |
 //! | [`shared::http`] | pages, live updates, WebSockets, limits, certificates, metrics |
-//! | [`session::placement`] | which server gets the next client: the load of a server and the key that servers are sorted by (`backend`), the choice of the first, of dedicated servers before others (`load_balancer`), cost |
-//! | [`session::line`] | the clients that wait for a slot of the fleet: tickets (`ticket`), the order (`waiting_line`), who gets the next slot of which server (`dispatcher`) |
+//! | [`session::placement`] | which server gets the next client: the load of a server and the key that servers are sorted by (`backend`), the choice of the first, of servers that keep the world ready before dedicated ones before others (`load_balancer`), cost |
+//! | [`session::line`] | the clients that wait for a slot of the fleet: tickets (`ticket`), the line and its order (`Place` in `waiting_line`), who gets the next slot of which server (`Dispatcher::share`, in `dispatcher`) |
 //! | [`session::class`] | all simulations of the fleet and who waits, with the number of each change, and the links to servers for actions (`roster`) |
 //! | [`session::mail`] | notices: to whom (`smtp`, one address, from the key `administrator` in `config/session_config`) and how (`channel`), what is in them (`notice_text`), which changes are mailed (`event` in `fleet/server_record`), and how long they wait (`outbox`) |
 //! | [`session::fleet`] | the registry and the monitors of simulation servers, and what connects them with the line (`line_keeper`, `slot_link`) |
-//! | [`session::web`] | routes, pages, `/status`, Prometheus metrics (gauges in `metrics`, counters and histograms in `app`) and the WebSocket of the session server with its messages (`web_client`) |
-//! | [`simulation::process`] | process trees: how they start and end (`process_group`: SIGTERM, grace period, SIGKILL; leftovers of a dead server: `process_tree`, `guardian`); directories of simulations |
+//! | [`session::web`] | routes, pages, `/status`, Prometheus metrics (gauges in `metrics`, counters and histograms in `app`) and the WebSocket of the session server with its messages (`web_client`: `Request` is what comes in, its handlers and `updates` write what goes out) |
+//! | [`simulation::process`] | process trees: how they start and end (`process_group`: SIGTERM, grace period, SIGKILL; leftovers of a dead server: `process_tree`, `guardian`; what has left the group ends with its control group or its containers, see `simulation::isolation` and `simulation::container`); directories of simulations |
 //! | [`simulation::machine`] | readings of the machine (`sensors`) and its GPUs (`gpus`), the load that follows from them (`sensors`), its mean and `monitor.csv` (`load_monitor`), what each simulation uses (`usage`); which GPU a simulation gets if they are spread over several (`spread`) |
-//! | [`simulation::checkout`] | worlds checked out with git; `timing.checkout` limits a whole checkout (`checkout_service`), each git command, and by a quarter of it a silent remote (`git`); `projectSize` limits its size; the simulation server's `config/mirrors` has GitHub's address and the mirrors of others |
-//! | `simulation::isolation` | how a simulation is launched: its level of isolation (`launcher`), the variables that it inherits, limits; the control group that ends with it (`cgroup`) |
+//! | [`simulation::checkout`] | worlds checked out with git; `timing.checkout` limits a whole checkout (`checkout_service`), each git command, and by a quarter of it a silent remote (`git`); `projectSize` limits its size; the simulation server's `config/mirrors` has GitHub's address and the other Git hosts (`gitMirrors`) |
+//! | `simulation::isolation` | how a simulation is launched: its level of isolation (`launcher`), the variables that it inherits, limits; the GPUs that a sandbox shows (`devices` in `sandbox`); the control group that ends with it (`cgroup`) |
 //! | [`simulation::container`] | simulations in containers: what a project requests, its image, its compose project (`compose_project`, with its GPU and user) |
 //! | [`simulation::ends`] | how simulations have ended: counter, table, their logs (`kept_output`); for which reasons an end can be requested (`stop_reason`) |
 //! | [`simulation::webots`] | one running Webots: its command line and GPU (`launch_spec`), its log (path and size in `launched`, its lines in `output`), the wait for its end (`launched`) |

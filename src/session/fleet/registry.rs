@@ -209,11 +209,10 @@ impl Registry {
         };
         let now = Instant::now();
         let takes_room = self.quota.take(from);
-        let ready_one = world.filter(|world| ready.has(world)).and_then(|world| {
-            let terms = |address: &PublicAddress, load| terms(address, load).filter(|_| ready.left(address, world) > 0);
-            fleet.pick_admitted(now, takes_room, terms)
-        });
-        let picked = ready_one.or_else(|| fleet.pick_admitted(now, takes_room, terms));
+        let picked = match world.filter(|world| ready.has(world)) {
+            Some(world) => fleet.pick_ready_first(now, takes_room, |address| ready.left(address, world) > 0, terms),
+            None => fleet.pick_admitted(now, takes_room, terms),
+        };
         if let Some((server, world)) = picked.as_ref().zip(world) {
             ready.place(server, world, now);
         }

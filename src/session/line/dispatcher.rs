@@ -295,9 +295,9 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
                 let waiting: usize = waiting.map(|class| class.waiting as usize).sum();
                 if link.passed.is_empty() {
                     let list = lists.entry(taken);
-                    first.extend(list.or_insert_with_key(|taken| line.first(taken, &[])).iter());
+                    first.extend(list.or_insert_with_key(|taken| line.told_of(taken, &[])).iter());
                 } else {
-                    first.extend(line.first(&taken, &link.passed));
+                    first.extend(line.told_of(&taken, &link.passed));
                 }
                 first.sort_unstable();
                 first.dedup();
@@ -360,18 +360,20 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
                 admission(server, &waiting.group.world, load).filter(|_| is_ready && !passes_over(server))
             };
             let world: &ProjectUrl = &waiting.world;
-            let of_ready = |server: &Server, load| {
-                let gone = used.get(&(server.clone(), world)).copied().unwrap_or_default();
-                terms(server, load).filter(|_| ready.left(server, world) > gone)
+            let picked = if ready.has(world) {
+                let has_ready = |server: &Server| {
+                    let gone = used.get(&(server.clone(), world)).copied().unwrap_or_default();
+                    ready.left(server, world) > gone
+                };
+                let picked = fleet.pick_ready_first(now.instant, true, has_ready, terms);
+                if let Some(server) = picked.as_ref().filter(|server| has_ready(server)) {
+                    *used.entry((server.clone(), world)).or_default() += 1;
+                }
+                picked
+            } else {
+                fleet.pick_admitted(now.instant, true, terms)
             };
-            let ready_one = ready
-                .has(world)
-                .then(|| fleet.pick_admitted(now.instant, true, of_ready))
-                .flatten();
-            if let Some(server) = &ready_one {
-                *used.entry((server.clone(), world)).or_default() += 1;
-            }
-            match ready_one.or_else(|| fleet.pick_admitted(now.instant, true, terms)) {
+            match picked {
                 None => {
                     if !self.links.keys().any(passes_over) {
                         exhausted.insert(class);

@@ -264,7 +264,7 @@ impl<Server: Clone + Eq, Client: Clone> WaitingLine<Server, Client> {
 
     /// The first clients of these classes, as many as a simulation server is told of. `passed` are those whom it passes
     /// over.
-    pub(super) fn first(&self, classes: &[ClassId], passed: &[PassedOver]) -> Vec<Place> {
+    pub(super) fn told_of(&self, classes: &[ClassId], passed: &[PassedOver]) -> Vec<Place> {
         let mut listed = Vec::new();
         let mut passed: Vec<(&PassedOver, usize)> = passed.iter().map(|one| (one, LISTED_OF_PASSED)).collect();
         let mut texts = 0;

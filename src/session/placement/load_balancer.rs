@@ -118,6 +118,19 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
         Some(id)
     }
 
+    /// The same; servers on which a simulation is ready for the client come before all others.
+    pub fn pick_ready_first(
+        &mut self,
+        now: Instant,
+        takes_room: bool,
+        has_ready: impl Fn(&Id) -> bool,
+        admission: impl Fn(&Id, f64) -> Option<Admission>,
+    ) -> Option<Id> {
+        let of_ready = |id: &Id, load: f64| admission(id, load).filter(|_| has_ready(id));
+        self.pick_admitted(now, takes_room, of_ready)
+            .or_else(|| self.pick_admitted(now, takes_room, &admission))
+    }
+
     /// Counts a client as sent to a server that has promised it a slot.
     pub fn place(&mut self, id: &Id, now: Instant) {
         let Some(server) = self.servers.get_mut(id) else { return };
