@@ -8,6 +8,7 @@ use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
 use tokio::sync::{RwLock, RwLockReadGuard, RwLockWriteGuard};
+use webots_fleet::simulation::container::ResourceOwner;
 
 use super::image;
 use crate::support::{Builder, Client, SOON, Server, arm, demo_server};
@@ -295,6 +296,13 @@ pub fn server_running(webots: &str) -> Builder {
 /// A Dockerfile that copies a project and then has these lines.
 pub fn dockerfile(lines: &str) -> String {
     format!("FROM {}\nCOPY . /usr/local/webots-project\n{lines}\n", image::NAME)
+}
+
+/// The ids of the images that a server has built.
+pub fn own_images(server: &Server) -> Vec<String> {
+    let name = format!("webots-fleet/{}", ResourceOwner::of(&server.cache()).0);
+    let ids = ask(&["image", "ls", "--quiet", "--no-trunc", &name]);
+    ids.lines().map(str::to_owned).collect()
 }
 
 /// The output of `--check` for a server's configuration.

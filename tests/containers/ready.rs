@@ -5,9 +5,9 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 
-use super::daemon::{self, ask, containers, docker, of_service};
+use super::daemon::{self, ask, containers, docker, dockerfile, of_service, own_images};
 use super::deeds::doing;
-use crate::support::{Builder, Client, SOON, Server, WORLD, arm, ready_class, shared_library, until, world};
+use crate::support::{Builder, Client, SOON, Server, WORLD, arm, arm_at, ready_class, shared_library, until, world};
 
 /// A server that keeps this many of a world ready, however busy the machine is.
 fn keeping(builder: Builder, world: &str, count: u16) -> Builder {
@@ -87,6 +87,44 @@ async fn a_class_takes_containers_that_are_ready_and_starts_none() {
     client.leave().await;
     assert_eq!(server.ended().await, Some(0));
     until("no container is left", async || containers(&server).is_empty()).await;
+}
+
+#[actix_rt::test]
+async fn the_image_of_a_world_that_is_kept_ready_stays_between_its_times() {
+    let Some(_docker) = docker().await else { return };
+    let folder = tempfile::tempdir().unwrap();
+    // Two images of these fit.
+    let builder = daemon::server(1).set("container", json!({ "imagesSize": 50 }));
+    for branch in ["a", "b", "c"] {
+        let line = format!("RUN head -c 20M /dev/zero >/usr/local/{branch}");
+        let files = [("Dockerfile", &*dockerfile(&line))];
+        builder.forge().commit("lab/arm", branch, &files);
+    }
+    let builder = keeping(builder.folder(folder.path()), &arm_at("a"), 1);
+    let server = builder.start().await;
+    until_ready(&server, 1).await;
+    let [first] = &*own_images(&server) else {
+        panic!("{}", server.log())
+    };
+    let list = |entries: Value| server.reload(json!({ "ready": entries }));
+    // Its time is over.
+    list(json!([{"world": arm_at("a"), "count": 0}]));
+    until("its container is gone", async || containers(&server).is_empty()).await;
+    let build = async |branch| {
+        let mut client = Client::start(&server, &arm_at(branch)).await;
+        client.patiently("webots:").await;
+        client.leave().await;
+        until("its container is gone", async || containers(&server).is_empty()).await;
+    };
+    build("b").await;
+    build("c").await;
+    until("two fit", async || own_images(&server).len() == 2).await;
+    assert!(own_images(&server).contains(first), "{}", server.log());
+    // Once it is listed no longer, it is as any other that was used until now.
+    list(json!([]));
+    build("b").await;
+    build("c").await;
+    until("it is gone", async || !own_images(&server).contains(first)).await;
 }
 
 #[actix_rt::test]

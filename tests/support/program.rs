@@ -380,7 +380,7 @@ impl Server {
             .join(format!("log/simulation/instances/{}.log", client.id()))
     }
 
-    /// Makes a session server reload its configuration with these keys changed.
+    /// Makes a server reload its configuration with these keys changed.
     pub fn reload(&self, keys: Value) {
         self.rewrite_config(|config| {
             config

@@ -16,7 +16,7 @@ pub struct Project {
     /// Its size, in bytes.
     pub size: u64,
     /// The URL that it was checked out from.
-    pub(super) url: ProjectUrl,
+    pub url: ProjectUrl,
     pub(super) revision: Revision,
     /// The project's directory, with `worlds` and `controllers` inside.
     pub folder: PathBuf,

@@ -18,6 +18,7 @@ use jiff::Timestamp;
 use super::session::{Session, SpareEvent};
 use crate::shared::domain::{Failure, Load, ProjectUrl};
 use crate::simulation::checkout::{KeptRepository, Tip, Tips};
+use crate::simulation::container::ImageUse;
 use crate::simulation::isolation::RepositoryAssets;
 use crate::simulation::machine::Readings;
 use crate::simulation::simulation_id::SimulationId;
@@ -52,6 +53,8 @@ struct ListedWorld {
     /// The commit that its URL means, as the remote has said last.
     tip: Option<Tip>,
     failures: Option<Failures>,
+    /// The images of the last one that was ready, which stay as long as the world is listed.
+    images: Vec<ImageUse>,
 }
 
 /// Starts of a world that have failed.
@@ -175,7 +178,12 @@ impl SpareKeeper {
             let watched = self.repositories.entry(repository.clone()).or_default();
             listed.insert(repository);
             if *count == 0 {
-                if std::mem::take(world).is_asked {
+                if world.is_asked {
+                    let images = std::mem::take(&mut world.images);
+                    *world = ListedWorld {
+                        images,
+                        ..ListedWorld::default()
+                    };
                     self.server.spare_wishes.set_problem(kind, None);
                 }
             } else if !world.is_asked {
@@ -285,6 +293,14 @@ impl SpareKeeper {
         }
     }
 
+    /// One of this world is ready.
+    fn is_ready(&mut self, kind: &SpareKind) {
+        if let Some((world, containers)) = self.worlds.get_mut(kind).zip(self.server.containers.as_ref()) {
+            world.images = containers.keep_images_of(&kind.world);
+        }
+        self.server.spare_wishes.set_problem(kind, None);
+    }
+
     /// Counts a failed start, and logs the first one until failures are forgotten.
     fn failed(&mut self, kind: &SpareKind, failure: &Failure) {
         let Some(world) = self.worlds.get_mut(kind) else { return };
@@ -364,7 +380,7 @@ impl Handler<SpareEvent> for SpareKeeper {
 
     fn handle(&mut self, event: SpareEvent, _: &mut Self::Context) {
         match event {
-            SpareEvent::Ready(kind) => self.server.spare_wishes.set_problem(&kind, None),
+            SpareEvent::Ready(kind) => self.is_ready(&kind),
             SpareEvent::Failed(kind, failure) => self.failed(&kind, &failure),
         }
     }

@@ -14,12 +14,13 @@ use super::compose_project::{ComposeProject, ContainerRequest, WEBOTS};
 use super::docker::{Docker, SHORT_TIMEOUT, daemon_fault};
 use super::failures::{of_project, on_thread, refused_by_docker};
 use super::image::Images;
+use super::image_store::ImageUse;
 use super::network;
 use super::owned_resources::{ProjectGuard, ResourceOwner, sweep_except};
 use super::packet_filter;
 use super::simulation_containers::SimulationContainers;
 use super::webots_yml::ProjectKind;
-use crate::shared::domain::Failure;
+use crate::shared::domain::{Failure, ProjectUrl};
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::process::process_tree::is_connected;
 use crate::simulation::progress::{OnProgress, Progress, Step};
@@ -121,6 +122,7 @@ impl ContainerService {
                 .pull(&self.config.container.editor_image, address, progress)
                 .await?;
         }
+        self.images.store.used_for(&project.url, &kept);
         let compose = ComposeProject {
             name: guard.name.clone(),
             request,
@@ -166,6 +168,11 @@ impl ContainerService {
             warnings: yml.warnings,
             restart: None,
         })
+    }
+
+    /// Keeps the images that the last simulation of a world has had, until the returned values are dropped.
+    pub fn keep_images_of(&self, world: &ProjectUrl) -> Vec<ImageUse> {
+        self.images.store.keep_for(world)
     }
 
     /// Whether a connection to the Webots of the simulation on this port is open; `None` if that is not known. The kernel

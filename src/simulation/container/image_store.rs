@@ -18,6 +18,7 @@ use super::docker::{Docker, DockerError, SHORT_TIMEOUT, docker_disk_fault};
 use super::dockerfile::LABEL;
 use super::engine::with_tag;
 use super::owned_resources::ResourceOwner;
+use crate::shared::domain::ProjectUrl;
 use crate::shared::run::seconds_since_1970;
 use crate::simulation::config::SimulationConfig;
 
@@ -27,6 +28,8 @@ pub struct ImageStore {
     owner: ResourceOwner,
     config: Arc<SimulationConfig>,
     uses: Arc<Mutex<HashMap<String, Use>>>,
+    /// The images of the last simulation of each world.
+    worlds: Mutex<HashMap<ProjectUrl, Vec<String>>>,
     /// Images that were not there, and are pulled, or will be by a build.
     expected: Mutex<HashSet<String>>,
     /// Signals that there are more images.
@@ -54,8 +57,12 @@ struct Image {
     id: String,
     /// With those that it begins with, in bytes.
     size: u64,
+    /// When it was built, in seconds since 1970.
+    built: u64,
     /// When it got its last name, in seconds since 1970.
     named: u64,
+    /// The server that has built it.
+    owner: Option<String>,
     names: Vec<String>,
     layers: Vec<String>,
 }
@@ -66,8 +73,8 @@ const RETRY_INTERVAL: Duration = Duration::from_secs(5);
 /// Minimum age of leftovers of failed builds that are removed because the disk is full, in minutes.
 const MIN_AGE: u64 = 5;
 /// What is read about an image.
-const FORMAT: &str =
-    "{{.Id}} {{.Size}} {{json .Metadata.LastTagTime}} {{json .RepoTags}} {{json .RepoDigests}} {{json .RootFS.Layers}}";
+const FORMAT: &str = "{{.Id}} {{.Size}} {{json .Created}} {{json .Metadata.LastTagTime}} {{json .RepoTags}} \
+    {{json .RepoDigests}} {{json .RootFS.Layers}} {{json .Config.Labels}}";
 /// Number of images that are read at a time.
 const AT_A_TIME: usize = 100;
 /// The beginning of the tag of an image that was pulled.
@@ -85,14 +92,18 @@ impl Drop for ImageUse {
 impl Image {
     /// Parses a line of [`FORMAT`].
     fn read(line: &str) -> Option<Self> {
-        let mut words = line.split(' ');
-        let (id, size, named) = (words.next()?, words.next()?, words.next()?);
+        // A label may have spaces.
+        let mut words = line.splitn(8, ' ');
+        let (id, size, built, named) = (words.next()?, words.next()?, words.next()?, words.next()?);
         let mut list = || serde_json::from_str::<Option<Vec<String>>>(words.next()?).ok();
         let (tags, digests, layers) = (list()?, list()?, list()?);
+        let labels: Option<HashMap<String, String>> = serde_json::from_str(words.next()?).ok()?;
         Some(Self {
             id: id.to_owned(),
             size: size.parse().ok()?,
+            built: seconds(built).unwrap_or_default(),
             named: seconds(named).unwrap_or_default(),
+            owner: labels.and_then(|mut labels| labels.remove(LABEL)),
             names: tags.into_iter().chain(digests).flatten().collect(),
             layers: layers.unwrap_or_default(),
         })
@@ -150,6 +161,7 @@ impl ImageStore {
             owner,
             config,
             uses: Arc::default(),
+            worlds: Mutex::default(),
             expected: Mutex::default(),
             growth: Notify::new(),
         }
@@ -170,6 +182,18 @@ impl ImageStore {
         }
     }
 
+    /// Notes which images a simulation of a world has.
+    pub fn used_for(&self, world: &ProjectUrl, uses: &[ImageUse]) {
+        let names = uses.iter().map(|one| one.name.clone()).collect();
+        self.worlds.lock().insert(world.clone(), names);
+    }
+
+    /// Keeps the images that the last simulation of a world has had in this run, until the returned values are dropped.
+    pub fn keep_for(&self, world: &ProjectUrl) -> Vec<ImageUse> {
+        let names = self.worlds.lock().get(world).cloned().unwrap_or_default();
+        names.iter().map(|name| self.keep(name)).collect()
+    }
+
     /// Notes that an image is not there, and will be pulled.
     pub fn expect(&self, name: &str) {
         self.expected.lock().insert(listed_name(name));
@@ -180,9 +204,10 @@ impl ImageStore {
         self.growth.notify_one();
     }
 
-    /// Removes what is too much: images that are old, and leftovers of failed builds; above `container.imagesSize`, and
-    /// while the disk is full, those that were not used for longest. Images that a container uses stay, and those that
-    /// this server has neither built nor pulled. Never returns.
+    /// Removes what is too much: images that were not used for long, and leftovers of failed builds; above
+    /// `container.imagesSize`, and while the disk is full, those that were not used for longest. Images that a container
+    /// uses stay, those of worlds that are kept ready, and those that this server has neither built nor pulled. Never
+    /// returns.
     pub async fn keep_within_limits(self: Arc<Self>) {
         loop {
             let is_done = match self.clean().await {
@@ -209,9 +234,7 @@ impl ImageStore {
         };
         let mine = format!("label={LABEL}={}", self.owner.0);
         let old = format!("until={minutes}m");
-        let prune = [
-            "image", "prune", "--all", "--force", "--filter", &mine, "--filter", &old,
-        ];
+        let prune = ["image", "prune", "--force", "--filter", &mine, "--filter", &old];
         self.docker.run(&prune, SHORT_TIMEOUT).await?;
         self.evict().await?;
         Ok(!self.is_disk_full().await)
@@ -237,23 +260,26 @@ impl ImageStore {
     }
 
     /// Removes images, those first that were not used for longest: while the disk is full or they take too much, and
-    /// pulled ones that are old.
+    /// those that are old.
     async fn evict(&self) -> Result<(), DockerError> {
         let limit = self.config.container.images_size << 20;
         let oldest = seconds_since_1970().saturating_sub(self.config.container.images_age * 24 * 60 * 60);
-        let is_old = |image: &Image| image.is_named(&self.mark()) && self.last_use(image) < oldest;
         let mut all = self.all().await?;
         let names: HashSet<&String> = all.iter().flat_map(|image| &image.names).collect();
         let is_there = |name: &String, of_image: &mut Use| of_image.now > 0 || names.contains(name);
         self.uses.lock().retain(is_there);
+        let are_there = |images: &mut Vec<String>| images.iter().any(|name| names.contains(name));
+        self.worlds.lock().retain(|_, images| are_there(images));
         let mut stays: Vec<String> = Vec::new();
         loop {
-            let is_own = |image: &Image| image.is_named(&self.prefix());
+            let is_own = |image: &Image| self.is_own(image);
             let own: Vec<&Image> = all.iter().filter(|image| is_own(image)).collect();
             let total = room(&all, is_own);
             let is_too_much = total > limit || self.is_disk_full().await;
             let candidates = own.into_iter().filter(|image| {
-                (is_too_much || is_old(image)) && !stays.contains(&image.id) && !self.is_permanent(image)
+                (is_too_much || self.last_use(image) < oldest)
+                    && !stays.contains(&image.id)
+                    && !self.is_permanent(image)
             });
             // What begins with another image goes before it.
             let Some(first) = candidates.min_by_key(|image| (self.last_use(image), Reverse(image.layers.len()))) else {
@@ -292,6 +318,12 @@ impl ImageStore {
         format!("{}{BASE}", self.prefix())
     }
 
+    /// Whether this server has built or pulled it. One without a name is a leftover, or a step of another.
+    fn is_own(&self, image: &Image) -> bool {
+        let is_built = !image.names.is_empty() && image.owner.as_deref() == Some(self.owner.0.as_str());
+        is_built || image.is_named(&self.prefix())
+    }
+
     fn is_in_use(&self, name: &str) -> bool {
         self.uses.lock().get(name).is_some_and(|of_image| of_image.now > 0)
     }
@@ -302,7 +334,7 @@ impl ImageStore {
         permanent.any(|name| image.names.contains(&listed_name(name)))
     }
 
-    /// When an image was last used or got its name, in seconds since 1970.
+    /// When an image was last used, built or pulled, in seconds since 1970.
     fn last_use(&self, image: &Image) -> u64 {
         let uses = self.uses.lock();
         let ends = image
@@ -310,7 +342,13 @@ impl ImageStore {
             .iter()
             .filter_map(|name| uses.get(name))
             .map(|of_image| of_image.last);
-        ends.max().unwrap_or_default().max(image.named)
+        // A pulled one may have been built years ago.
+        let begin = if image.is_named(&self.mark()) {
+            image.named
+        } else {
+            image.built
+        };
+        ends.max().unwrap_or_default().max(begin)
     }
 
     /// All images of this machine.
@@ -345,13 +383,19 @@ mod tests {
             format!("[\"{name}\"]")
         };
         let time = "2026-11-24T10:35:49.97185664+01:00";
-        Image::read(&format!(r#"{id} {size} "{time}" {names} null [{}]"#, layers.join(","))).unwrap()
+        let layers = layers.join(",");
+        let labels = r#"{"a":"b c","webots-fleet.owner":"o"}"#;
+        Image::read(&format!(
+            r#"{id} {size} "2026-11-24T08:35:49Z" "{time}" {names} null [{layers}] {labels}"#
+        ))
+        .unwrap()
     }
 
     #[test]
     fn a_line_of_docker_is_read() {
         let read = image("a", 7, "xy", "webots-fleet/o:a");
-        assert_eq!((read.size, read.named), (7, 1_795_512_949));
+        assert_eq!((read.size, read.built, read.named), (7, 1_795_509_349, 1_795_512_949));
+        assert_eq!(read.owner.as_deref(), Some("o"));
         assert_eq!(read.names, ["webots-fleet/o:a"]);
         assert_eq!(read.layers, ["x", "y"]);
         assert_eq!(seconds("\"0001-01-01T00:00:00Z\""), None);

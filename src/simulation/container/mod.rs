@@ -23,6 +23,7 @@ pub use built_image::RUNS;
 pub use compose_project::ContainerRequest;
 pub use container_service::{ContainerService, check};
 pub use docker::{daemon_fault, data_folder, docker_disk_fault};
+pub use image_store::ImageUse;
 pub use owned_resources::{ResourceOwner, sweep_all};
 pub use simulation_containers::SimulationContainers;
 pub use usage::measure;
