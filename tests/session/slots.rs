@@ -1,11 +1,13 @@
-//! The WebSocket `/slots` to simulation servers that lie or send too much: others, and the line, are not disturbed.
+//! The WebSocket `/slots` to simulation servers that lie, send too much or have none: others, and the line, are not
+//! disturbed.
 
 use std::time::{Duration, Instant};
 
 use serde_json::json;
 use webots_fleet::shared::domain::{Offer, Offers, ReservationId};
 
-use super::until_states;
+use super::stand_in::{Manner, StandIn};
+use super::{times_logged, until_states};
 use crate::support::client::Client;
 use crate::support::git::arm;
 use crate::support::http::{PASSWORD, get_as_administrator};
@@ -102,4 +104,31 @@ async fn a_link_that_breaks_at_its_begin_is_opened_again_and_blames_no_key() {
     server.link().await;
     assert_eq!(server.breaks_left(), 0);
     assert!(!session.log().contains("fleetKey is another one"), "{}", session.log());
+}
+
+#[actix_rt::test]
+async fn a_server_whose_slots_cant_be_asked_for_takes_its_turn_by_its_reports() {
+    // As behind a proxy that passes no WebSockets on.
+    let status = json!({"load": 1, "reserves": true, "instances": {"running": 0, "places": 5}});
+    let server = StandIn::start(Manner::Status(status));
+    let session = session_server(&[server.address()])
+        .set("fleetKey", SECRET)
+        .start()
+        .await;
+    until_states(&session, &["up"]).await;
+    for _ in 0..2 {
+        let mut client = enter(&session).await;
+        assert_eq!(client.until("ws://").await, server.url());
+        assert!(
+            !client.heard.iter().any(|text| text.starts_with("pass:")),
+            "{:?}",
+            client.heard
+        );
+    }
+    assert_eq!(
+        times_logged(&session, "its /slots can't be used"),
+        1,
+        "{}",
+        session.log()
+    );
 }

@@ -223,7 +223,7 @@ async fn the_order_of_a_session_server_holds_whatever_its_messages_round() {
 
 #[actix_rt::test]
 async fn only_a_server_with_the_key_gets_slots() {
-    let server = reserving().start().await;
+    let server = reserving().set("maxClientsPerAddress", 1).start().await;
     let (mut socket, hello) = Link::challenged(&server).await;
     let proof = hello.prove(&FleetKey::new("another secret key"));
     socket.send(&serde_json::to_string(&proof).unwrap()).await;
@@ -243,6 +243,14 @@ async fn only_a_server_with_the_key_gets_slots() {
     assert_eq!(socket.closed().await, Some(1008));
     let (mut socket, _) = Link::challenged(&server).await;
     assert_eq!(socket.closed().await, Some(1008));
+    // Pages that listen take no link from it.
+    let from = ("x-forwarded-for", "203.0.113.9");
+    let page = awc::Client::default().get(server.url("/events")).insert_header(from);
+    let _page = page.send().await.unwrap();
+    let mut link = Client::with_headers(&server.websocket("/slots"), &[from])
+        .await
+        .unwrap();
+    link.until("{").await;
     let plain = demo_server(1).start().await;
     assert_eq!(
         Client::with_headers(&plain.websocket("/slots"), &[]).await.unwrap_err(),

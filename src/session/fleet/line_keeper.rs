@@ -63,8 +63,8 @@ pub(super) struct LineKeeper {
     waited: Histogram,
     /// Whether this server has a key, for which others reserve slots.
     has_key: bool,
-    /// The servers that have another key.
-    refused_by: HashSet<PublicAddress>,
+    /// The servers to which no link can be opened.
+    failed: HashSet<PublicAddress>,
     /// When the clients were last told how they stand.
     told: Instant,
 }
@@ -83,7 +83,7 @@ impl LineKeeper {
             dispatcher: Dispatcher::default(),
             waited,
             has_key,
-            refused_by: HashSet::new(),
+            failed: HashSet::new(),
             told: Instant::now(),
         }
     }
@@ -149,13 +149,16 @@ impl LineKeeper {
         }
         match change {
             LinkChange::Up(hello) => {
-                self.refused_by.remove(&server);
-                self.dispatcher.link(server.clone(), &hello);
+                self.failed.remove(&server);
+                self.dispatcher.link(server, &hello);
             }
-            LinkChange::Down => self.dispatcher.unlink(&server),
-            LinkChange::Refused => {
+            LinkChange::Down => {
+                self.failed.remove(&server);
                 self.dispatcher.unlink(&server);
-                self.refused_by.insert(server.clone());
+            }
+            LinkChange::Failed => {
+                self.dispatcher.unlink(&server);
+                self.failed.insert(server);
             }
             LinkChange::Offers(offers) => {
                 let turns = self.dispatcher.offered(&server, &offers, &mut servers.fleet, moment());
@@ -183,7 +186,7 @@ impl LineKeeper {
     pub(super) fn set_servers(&mut self, servers: &ServerTable) {
         self.dispatcher
             .set_servers(servers.addresses(), terms(&servers.records));
-        self.refused_by.retain(|server| servers.records.contains_key(server));
+        self.failed.retain(|server| servers.records.contains_key(server));
     }
 
     /// Looks after what changes with time alone.
@@ -234,7 +237,7 @@ impl LineKeeper {
         // Until it can be asked for reservations, a server that makes some gets nobody: its slot might be another's.
         let will_reserve = |server: &PublicAddress| {
             let report = records.get(server).and_then(|record| record.state.report());
-            self.has_key && !self.refused_by.contains(server) && report.is_some_and(|report| report.reserves)
+            self.has_key && !self.failed.contains(server) && report.is_some_and(|report| report.reserves)
         };
         let now = moment();
         let served = self

@@ -70,7 +70,7 @@ impl ReadyShares {
     pub(super) fn link(&mut self, LinkEvent { server, change }: &LinkEvent) {
         match change {
             LinkChange::Up(hello) if hello.keeps_ready => drop(self.asked.insert(server.clone(), None)),
-            LinkChange::Up(_) | LinkChange::Down | LinkChange::Refused => drop(self.asked.remove(server)),
+            LinkChange::Up(_) | LinkChange::Down | LinkChange::Failed => drop(self.asked.remove(server)),
             LinkChange::Offers(_) => {}
         }
     }

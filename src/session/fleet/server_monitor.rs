@@ -19,13 +19,15 @@ use actix::prelude::*;
 use actix_tls::connect::{Connector as TcpConnector, Resolver};
 use actix_web::web::Bytes;
 use awc::error::{ConnectError, SendRequestError};
+use awc::http::StatusCode;
 use awc::http::header::CONTENT_LENGTH;
 use rustls::ClientConfig;
 use tokio::sync::mpsc::{UnboundedSender, unbounded_channel};
+use tokio::sync::watch;
 use tokio::time::{sleep_until, timeout};
 
 use super::resolver::HostResolver;
-use super::slot_link::{LinkEvent, NO_SUCH_PAGE, SlotLink};
+use super::slot_link::{LinkEvent, SlotLink};
 use crate::session::class::Roster;
 use crate::session::config::SessionConfig;
 use crate::shared::domain::{Failure, FleetKey, Load, PublicAddress, Reason, ServerReport, ToSimulationServer};
@@ -60,6 +62,13 @@ const SLOT: Duration = Duration::from_millis(10);
 static BEGIN: LazyLock<Instant> = LazyLock::new(Instant::now);
 /// Longest text of a server that is kept, in characters.
 const MAX_TEXT_LENGTH: usize = 500;
+/// Status codes of a server that has no such page; some servers answer only that the request is invalid.
+const NO_SUCH_PAGE: [StatusCode; 4] = [
+    StatusCode::NOT_FOUND,
+    StatusCode::BAD_REQUEST,
+    StatusCode::METHOD_NOT_ALLOWED,
+    StatusCode::NOT_IMPLEMENTED,
+];
 /// Time for which only `/load` is requested from a server without `/status`.
 const LOAD_ONLY: Duration = Duration::from_mins(1);
 
@@ -121,6 +130,8 @@ pub struct ServerMonitor {
     parent: Parent,
     /// The link before it is opened.
     link: Option<SlotLink>,
+    /// Whether the server says that it reserves slots.
+    reserves: watch::Sender<bool>,
     /// Sends messages over the link.
     messages: Option<UnboundedSender<ToSimulationServer>>,
 }
@@ -155,6 +166,7 @@ impl ServerMonitor {
         });
         Self {
             link,
+            reserves: watch::Sender::new(false),
             messages: None,
             target: Rc::new(Target {
                 client,
@@ -199,6 +211,9 @@ impl ServerMonitor {
     }
 
     fn send(&self, answer: Result<ServerReport, Failure>, latency: Duration, ctx: &mut Context<Self>) {
+        let reserves = answer.as_ref().is_ok_and(|report| report.reserves);
+        self.reserves
+            .send_if_modified(|before| std::mem::replace(before, reserves) != reserves);
         let result = ProbeResult {
             server: self.server.clone(),
             latency,
@@ -221,7 +236,9 @@ impl Actor for ServerMonitor {
         if let Some(link) = self.link.take() {
             let (sender, messages) = unbounded_channel();
             self.messages = Some(sender);
-            link.keep(messages).into_actor(self).spawn(ctx);
+            link.keep(messages, self.reserves.subscribe())
+                .into_actor(self)
+                .spawn(ctx);
         }
     }
 }

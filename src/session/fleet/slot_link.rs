@@ -1,8 +1,9 @@
 //! The WebSocket to `/slots` of a simulation server, over which it reserves slots for the line, and tells which simulations
 //! it has. Part of the monitor.
 //!
-//! It is opened again whenever it has ended. A server without `/slots` or with another `fleetKey` takes part in the line
-//! by its reports alone.
+//! It is opened again whenever it has ended. A server takes part in the line by its reports alone while it says that it
+//! reserves no slots, or when no link could be opened several times in a row: it has another `fleetKey`, or a proxy does
+//! not pass `/slots` on.
 
 use std::collections::HashMap;
 use std::future::pending;
@@ -12,14 +13,12 @@ use std::time::Duration;
 use actix::prelude::*;
 use actix_codec::Framed;
 use awc::BoxedSocket;
-use awc::error::WsClientError;
-use awc::http::StatusCode;
 use awc::ws::{CloseCode, Codec, Frame, Message as Text};
 use futures_util::{SinkExt, StreamExt};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use tokio::sync::mpsc::UnboundedReceiver;
-use tokio::sync::oneshot;
+use tokio::sync::{oneshot, watch};
 use tokio::time::{sleep, timeout};
 
 use crate::session::class::{Roster, StopRequest};
@@ -45,10 +44,10 @@ pub enum LinkChange {
     Up(Hello),
     /// It has reserved slots, or answers wishes.
     Offers(Offers),
-    /// It reserves no more slots, but may again.
+    /// It reserves no more slots, but may again soon.
     Down,
-    /// It has another key, and reserves none for this session server.
-    Refused,
+    /// No link can be opened, although it says that it reserves slots.
+    Failed,
 }
 
 /// What a link needs.
@@ -82,25 +81,12 @@ struct Followed {
 /// Why a link has ended.
 #[derive(Debug, thiserror::Error)]
 enum LinkError {
-    #[error("it does not reserve slots")]
-    Unsupported,
     #[error("its fleetKey is another one")]
     WrongKey,
     #[error("it refuses what it was sent")]
     Refused,
     #[error("{0}")]
     Broken(String),
-}
-
-impl LinkError {
-    /// Why no WebSocket was opened. A web server before a simulation server that is just starting has other answers than
-    /// one without `/slots`.
-    fn of_handshake(error: WsClientError) -> Self {
-        match error {
-            WsClientError::InvalidResponseStatus(status) if NO_SUCH_PAGE.contains(&status) => Self::Unsupported,
-            error => Self::Broken(error.to_string()),
-        }
-    }
 }
 
 type Socket = Framed<BoxedSocket, Codec>;
@@ -115,59 +101,74 @@ const SILENCE: Duration = Duration::from_mins(2);
 const PAUSE: Duration = Duration::from_millis(500);
 /// Pause after each message and ping of a server, so that none can keep this one busy with them.
 const BETWEEN_MESSAGES: Duration = Duration::from_millis(1);
-/// Status codes of a server that has no such page; some servers answer only that the request is invalid.
-pub(super) const NO_SUCH_PAGE: [StatusCode; 4] = [
-    StatusCode::NOT_FOUND,
-    StatusCode::BAD_REQUEST,
-    StatusCode::METHOD_NOT_ALLOWED,
-    StatusCode::NOT_IMPLEMENTED,
-];
-/// Pause if the server has no `/slots`, or another key.
+/// Pause if no link is expected, or none could be opened several times.
 const LONG_PAUSE: Duration = Duration::from_secs(30);
+/// So many times in a row: a server that has just come may not answer the first.
+const ATTEMPTS: u32 = 5;
 
 impl SlotLink {
-    /// Keeps the link, for ever.
-    pub(super) async fn keep(self, mut messages: UnboundedReceiver<ToSimulationServer>) {
-        let mut is_warned = false;
+    /// Keeps the link, for ever. `reserves` is whether the server says that it reserves slots.
+    pub(super) async fn keep(
+        self,
+        mut messages: UnboundedReceiver<ToSimulationServer>,
+        mut reserves: watch::Receiver<bool>,
+    ) {
+        let mut failed = 0;
         loop {
-            let Err(error) = self.open(&mut messages).await else {
-                return;
+            let error = match self.open().await {
+                Ok(link) => {
+                    failed = 0;
+                    match self.use_link(link, &mut messages).await {
+                        Ok(()) => return,
+                        Err(error) => error,
+                    }
+                }
+                Err(error) => {
+                    failed = if *reserves.borrow_and_update() { failed + 1 } else { 0 };
+                    error
+                }
             };
-            let is_refused = matches!(error, LinkError::WrongKey);
-            self.tell(if is_refused {
-                LinkChange::Refused
+            log::debug!("{}: no slots are reserved: {error}", self.server);
+            if failed == ATTEMPTS {
+                log::warn!(
+                    "{}: its /slots can't be used: {error}: clients of the line get no passes to it",
+                    self.server
+                );
+            }
+            let has_failed = failed >= ATTEMPTS;
+            self.tell(if has_failed {
+                LinkChange::Failed
             } else {
                 LinkChange::Down
             })
             .await;
-            log::debug!("{}: no slots are reserved: {error}", self.server);
-            let pause = match error {
-                LinkError::Broken(_) | LinkError::Refused => PAUSE,
-                LinkError::Unsupported => LONG_PAUSE,
-                LinkError::WrongKey => {
-                    if !is_warned {
-                        log::warn!("{}: {error}: clients of the line get no passes to it", self.server);
-                    }
-                    is_warned = true;
-                    LONG_PAUSE
-                }
-            };
-            sleep(pause).await;
+            let is_expected = *reserves.borrow_and_update() && !has_failed;
+            let pause = if is_expected { PAUSE } else { LONG_PAUSE };
+            timeout(pause, reserves.changed()).await.ok();
         }
     }
 
-    /// Opens a link and keeps it until it ends. Returns without an error when its monitor has ended.
-    async fn open(&self, messages: &mut UnboundedReceiver<ToSimulationServer>) -> Result<(), LinkError> {
+    /// Opens a link: the first message of the server, and its first answer.
+    async fn open(&self) -> Result<(Socket, Hello, Offers), LinkError> {
         let opening = timeout(CONNECT, self.client.ws(&self.url).max_frame_size(MAX_MESSAGE).connect()).await;
         let opened = opening.map_err(|_| LinkError::Broken("no connection in time".to_owned()))?;
-        let (_, mut socket) = opened.map_err(LinkError::of_handshake)?;
+        let (_, mut socket) = opened.map_err(|error| LinkError::Broken(error.to_string()))?;
         let hello: Hello = receive(&mut socket, CONNECT).await?;
         send(&mut socket, &hello.prove(&self.key)).await?;
         // A server with another key refuses the proof.
-        let first: Offers = receive(&mut socket, CONNECT).await.map_err(|error| match error {
+        let first = receive(&mut socket, CONNECT).await.map_err(|error| match error {
             LinkError::Refused => LinkError::WrongKey,
             error => error,
         })?;
+        Ok((socket, hello, first))
+    }
+
+    /// Uses a link until it ends. Returns without an error when its monitor has ended.
+    async fn use_link(
+        &self,
+        (mut socket, hello, first): (Socket, Hello, Offers),
+        messages: &mut UnboundedReceiver<ToSimulationServer>,
+    ) -> Result<(), LinkError> {
         // Those for an earlier link.
         while messages.try_recv().is_ok() {}
         let mut followed = hello.roster.then(|| Followed::new(self));
@@ -307,20 +308,6 @@ async fn receive<M: DeserializeOwned>(socket: &mut Socket, limit: Duration) -> R
             Some(Ok(Frame::Close(Some(why)))) if why.code == CloseCode::Policy => return Err(LinkError::Refused),
             Some(Ok(_)) | None => return Err(broken("it has ended")),
             Some(Err(error)) => return Err(broken(&error.to_string())),
-        }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn only_a_server_without_the_page_is_not_asked_again_soon() {
-        for (status, is_unsupported) in [(404, true), (400, true), (502, false), (503, false), (504, false)] {
-            let status = StatusCode::from_u16(status).unwrap();
-            let error = LinkError::of_handshake(WsClientError::InvalidResponseStatus(status));
-            assert_eq!(matches!(error, LinkError::Unsupported), is_unsupported, "{status}");
         }
     }
 }

@@ -356,8 +356,8 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
                 link.is_some_and(|link| link.passed.iter().any(|passed| waiting.is_of(passed)))
             };
             let terms = |server: &Server, load| {
-                let is_ready = self.links.contains_key(server) || !will_reserve(server);
-                admission(server, &waiting.group.world, load).filter(|_| is_ready && !passes_over(server))
+                let takes_part = self.links.contains_key(server) || !will_reserve(server);
+                admission(server, &waiting.group.world, load).filter(|_| takes_part && !passes_over(server))
             };
             let world: &ProjectUrl = &waiting.world;
             let picked = if ready.has(world) {

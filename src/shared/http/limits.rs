@@ -24,6 +24,8 @@ pub enum ConnectionKind {
     Client,
     /// A page that listens to `/events`.
     Page,
+    /// The WebSocket of a session server.
+    Link,
     /// What is relayed from a simulation: its stream, or a file.
     Stream,
 }
@@ -35,7 +37,7 @@ pub const TCP_PER_CLIENT: usize = 2;
 pub const STREAMS_PER_CLIENT: usize = 7;
 /// Default limit of web clients per address.
 const MAX_CLIENTS_PER_ADDRESS: usize = 1000;
-/// Limit of pages that listen to `/events`.
+/// Limit of pages that listen to `/events`, and of session servers: anybody may connect as one, and prove nothing.
 const MAX_PAGES: usize = 1000;
 
 /// Default limit for one address, out of `all` slots or connections: three quarters. A class often shares one address,
@@ -113,7 +115,7 @@ impl ConnectionLimiter {
                 self.max_clients.saturating_mul(STREAMS_PER_CLIENT),
                 self.per_address.saturating_mul(STREAMS_PER_CLIENT),
             ),
-            ConnectionKind::Page => (MAX_PAGES, self.per_address.min(share(MAX_PAGES))),
+            ConnectionKind::Page | ConnectionKind::Link => (MAX_PAGES, self.per_address.min(share(MAX_PAGES))),
         };
         let address = peer.rate_limit_key();
         let mut open = self.open.lock();
@@ -254,6 +256,7 @@ mod tests {
                 (ConnectionKind::Tcp, tcp),
                 (ConnectionKind::Client, clients),
                 (ConnectionKind::Page, MAX_PAGES),
+                (ConnectionKind::Link, MAX_PAGES),
             ] {
                 let one: Vec<_> = std::iter::repeat_with(|| connections.admit(kind, client("203.0.113.9")))
                     .take(all)

@@ -65,7 +65,7 @@ async fn slots(
     let key = server.fleet_key.clone();
     let key = key.ok_or_else(|| ErrorNotFound("Error: no slots are reserved here."))?;
     let peer = server.config.trusted_proxies.peer(&request);
-    let permit = server.connections.admit(ConnectionKind::Page, peer)?;
+    let permit = server.connections.admit(ConnectionKind::Link, peer)?;
     let server = Arc::clone(&server);
     let limit = MessageLimit::default();
     let link = SlotLink::new(server, peer, key, limit.clone(), permit);
