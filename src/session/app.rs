@@ -216,6 +216,7 @@ fn reload(file: &Path, server: &AppState) {
             log::info!("read {} again: {entries} entries in simulationServers", file.display());
             // What clients have got follows the values of these keys from the start, so the monitors keep them too.
             let config = SessionConfig {
+                port: server.config.port,
                 ssl: server.config.ssl,
                 fleet_key: server.config.fleet_key.clone(),
                 ..loaded.config

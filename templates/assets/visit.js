@@ -270,7 +270,7 @@ function transition(state, event, around) {
     case 'waiting':
       return whileWaiting(state, event, around);
     case 'redirected':
-      return event.type === 'tick' && around.now >= state.until ? ask(state.goal, around) : undefined;
+      return event.type === 'tick' && around.now >= state.until ? askOnceThere(state.goal, around) : undefined;
     case 'connecting':
     case 'starting':
       return whileStarting(state, event, around);
@@ -306,6 +306,17 @@ function ask(goal, { fleet, asked, now }, { waitsFor, line, before = [] } = {}) 
     to: { is: 'asking', goal, request: { is: 'sent', id, until, line, hasTicket: false }, waitsFor },
     effects: [...before, { do: 'ask', id, world: goal.world }],
   };
+}
+
+/**
+ * Requests a simulation server, if the connection to the session server is broken once that is there again.
+ * @param {Goal} goal
+ * @param {Surroundings} around
+ * @returns {Transition}
+ */
+function askOnceThere(goal, around) {
+  const isThere = around.fleet === 'free' || around.fleet === 'busy';
+  return isThere ? ask(goal, around) : { to: held(goal, { ahead: undefined }) };
 }
 
 /**
@@ -414,14 +425,25 @@ function whileWaiting(state, event, around) {
   if (event.type === 'available' && event.now) {
     return { to: { ...state, until: around.now + JITTER * around.random() } };
   }
+  if (event.type === 'available' && state.until === undefined) {
+    return { to: { ...state, until: around.now + pauseWhileBusy(around) } };
+  }
   if (event.type !== 'tick' || state.until === undefined || around.now < state.until) {
     return undefined;
   }
   if (around.fleet === 'unreachable') {
-    // The next report that a server is free sets another time.
+    // The next report sets another time.
     return { to: { ...state, until: undefined } };
   }
   return ask({ ...state.goal, attempt: 0 }, around, { waitsFor: state.why });
+}
+
+/**
+ * While clients wait in the line, no server is free for others: who asks again gets a place in it.
+ * @param {Pick<Surroundings, 'random'>} around
+ */
+function pauseWhileBusy({ random }) {
+  return LONGEST_WAIT * (0.5 + random());
 }
 
 /**
@@ -436,7 +458,7 @@ function waitOrEnd(problem, goal, from, { fleet, now, random }) {
   if (!helpsToWait(reasonOf(problem))) {
     return { to: end(problem, from) };
   }
-  const until = fleet === 'free' ? now + goal.wait * (0.5 + random()) : undefined;
+  const until = now + (fleet === 'free' ? goal.wait * (0.5 + random()) : pauseWhileBusy({ random }));
   return { to: { is: 'waiting', goal: { ...goal, wait: Math.min(LONGEST_WAIT, 2 * goal.wait) }, why: problem, until } };
 }
 

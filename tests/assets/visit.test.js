@@ -184,9 +184,16 @@ test('while all are busy it waits, and starts when one is free', () => {
     assert.equal(visit.state.is, 'waiting', why.code);
     assert.equal(visit.view.leave, 'Stop waiting');
     assert.equal(visit.view.problem, undefined);
-    visit.pass(3600);
+    // Others may wait in the line, and no server is free for those who don't.
+    visit.pass(14);
     assert.equal(visit.state.is, 'waiting');
     visit.did();
+    const begin = visit.now;
+    while (visit.state.is === 'waiting' && visit.now < begin + 31_000) {
+      visit.pass(0.5);
+    }
+    assert.deepEqual([visit.state.is, visit.did()], ['asking', ['ask']]);
+    visit.answer(`reason: ${JSON.stringify(FULL)}`, 'Error: none');
     visit.take({ type: 'available', now: true }).pass(1.6);
     assert.deepEqual([visit.state.is, visit.did()], ['asking', ['ask']]);
     assert.equal(visit.view.leave, 'Stop waiting', 'the notice stays until a server is chosen');
@@ -249,6 +256,15 @@ test('another server is asked for three times at most, after growing pauses', ()
     .answer(SERVER)
     .receive(...error('this server is about to stop', DRAINING));
   assert.equal(visit.state.is, 'redirected');
+});
+
+test('a redirection survives the loss of the session server', () => {
+  const visit = connecting().receive(...error('this server is about to stop', DRAINING));
+  visit.take({ type: 'disconnected' }).pass(60);
+  assert.equal(visit.state.is, 'asking');
+  visit.did();
+  visit.take({ type: 'connected' }, { type: 'available', now: true });
+  assert.deepEqual([visit.state.is, visit.did()], ['asking', ['ask']]);
 });
 
 test('after a redirection a refusal that is not final is asked about again', () => {

@@ -539,6 +539,12 @@ async fn a_lesson_is_one_list_of_all_servers() {
         let duration = line.rsplit(',').nth(3).unwrap();
         assert!(duration.parse::<u64>().is_ok(), "{line}");
     }
+    // A list that is cut off is none.
+    let cut = format!("HTTP/1.1 200 OK\r\nContent-Length: 9999\r\n\r\n{}\n20261", lines[0]);
+    python.set(Manner::RawRecords(cut.into_bytes()));
+    let answer = get_as_administrator(&session.url("/simulations.csv")).await;
+    assert_eq!(answer.header("webots-missing"), Some(python.address().as_str()));
+    assert_eq!(answer.text(), text);
     // A server without the key has seen the token with which its records were requested. It reads, and does nothing else.
     let token = python.token().unwrap();
     let bearer = format!("Bearer {token}");

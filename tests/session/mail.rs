@@ -53,11 +53,12 @@ async fn every_kind_of_failure_is_mailed_and_so_is_its_end() {
         ),
         (Manner::Status(evil), DOWN, "no display at :0"),
         (Manner::idle(97.0, 10), FULL, "97.0%"),
+        (Manner::status(7.0, 10, 10), FULL, "10 in 10 places"),
     ];
     let mut smtp = Smtp::start(&[]).await;
     let servers: Vec<StandIn> = failures.iter().map(|_| StandIn::start(Manner::idle(7.0, 10))).collect();
     let session = mailing(&addresses(&servers), smtp.port).start().await;
-    until_states(&session, &["up"; 8]).await;
+    until_states(&session, &["up"; 9]).await;
     for (server, (manner, ..)) in servers.iter().zip(&failures) {
         server.set(manner.clone());
     }

@@ -25,6 +25,8 @@ pub enum Manner {
     Raw(Vec<u8>),
     /// Has no `/status`; answers `/load` with these bytes and closes the connection.
     RawLoad(Vec<u8>),
+    /// Answers a request for `simulations.csv` with these bytes and closes the connection; has a `/load`.
+    RawRecords(Vec<u8>),
     /// Accepts connections and sends nothing.
     Hang,
     /// Accepts connections and resets them.
@@ -186,7 +188,14 @@ async fn answer(stream: &mut TcpStream, path: &str, manner: Manner) -> std::io::
             stream.write_all(&bytes).await?;
             return Ok(false);
         }
-        Manner::Status(_) | Manner::Load(_) | Manner::RawLoad(_) => send(stream, 404, b"404: Not Found").await?,
+        Manner::RawRecords(_) if path == "/load" => send(stream, 200, b"3.0").await?,
+        Manner::RawRecords(bytes) if path.starts_with("/simulations.csv") => {
+            stream.write_all(&bytes).await?;
+            return Ok(false);
+        }
+        Manner::Status(_) | Manner::Load(_) | Manner::RawLoad(_) | Manner::RawRecords(_) => {
+            send(stream, 404, b"404: Not Found").await?
+        }
         Manner::Body(status, body) => send(stream, status, &body).await?,
         Manner::Raw(bytes) => {
             stream.write_all(&bytes).await?;

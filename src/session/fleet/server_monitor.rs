@@ -18,9 +18,10 @@ use std::time::{Duration, Instant};
 use actix::prelude::*;
 use actix_tls::connect::{Connector as TcpConnector, Resolver};
 use actix_web::web::Bytes;
-use awc::error::{ConnectError, SendRequestError};
+use awc::error::{ConnectError, PayloadError, SendRequestError};
 use awc::http::StatusCode;
 use awc::http::header::CONTENT_LENGTH;
+use futures_util::Stream;
 use rustls::ClientConfig;
 use tokio::sync::mpsc::{UnboundedSender, unbounded_channel};
 use tokio::sync::watch;
@@ -267,8 +268,7 @@ impl Handler<GetRecords> for ServerMonitor {
                 if !answer.status().is_success() {
                     return Err(bad_answer(format!("status {}", answer.status())));
                 }
-                let body = answer.timeout(NEVER).body().limit(MAX_RECORDS);
-                body.await.map_err(bad_answer)
+                whole_body(answer, MAX_RECORDS).await
             };
             let late = |_| Err(Failure::new(Reason::NoAnswer, "it did not send its records in time"));
             timeout(RECORDS, fetching).await.unwrap_or_else(late)
@@ -322,17 +322,26 @@ async fn get(client: &awc::Client, url: &str) -> Result<Option<Bytes>, Failure> 
     if !status.is_success() {
         return Err(bad_answer(format!("status {status}")));
     }
+    whole_body(answer, MAX_ANSWER_SIZE).await.map(Some)
+}
+
+/// The body of an answer, which has this many bytes at most.
+///
+/// # Errors
+/// When it is longer, or cut off: awc takes the end of the connection for the end of the body, so that 95.5 may arrive as 9.
+async fn whole_body<S>(answer: awc::ClientResponse<S>, limit: usize) -> Result<Bytes, Failure>
+where
+    S: Stream<Item = Result<Bytes, PayloadError>> + Unpin,
+{
     let length = answer
         .headers()
         .get(CONTENT_LENGTH)
         .and_then(|value| value.to_str().ok()?.parse::<usize>().ok());
-    let body = answer.timeout(NEVER).body().limit(MAX_ANSWER_SIZE).await;
-    let body = body.map_err(bad_answer)?;
-    // awc takes the end of the connection for the end of the body: 95.5 may arrive as 9.
+    let body = answer.timeout(NEVER).body().limit(limit).await.map_err(bad_answer)?;
     if length != Some(body.len()) {
         return Err(bad_answer("it does not end as its Content-Length says"));
     }
-    Ok(Some(body))
+    Ok(body)
 }
 
 /// Whether an established connection broke.

@@ -243,11 +243,15 @@ impl ServerRecord {
         }
         self.since = timestamp(SystemTime::now());
         let server = self.address.to_string();
+        let last = self.state.last_answer().map(|answer| &answer.report);
         let notice = event(&before, &self.state).map(|(event, failure)| Notice {
             server: server.clone(),
             event,
             // The last known one: a server that does not answer reports none.
-            load: self.state.last_answer().map(|answer| answer.report.load),
+            load: last.map(|report| report.load),
+            places: last
+                .and_then(|report| report.instances)
+                .map(|instances| (instances.present(), instances.slots)),
             failure: failure.cloned(),
             at: self.since.clone(),
         });

@@ -37,12 +37,16 @@ fn paragraph(notice: &Notice) -> String {
         .load
         .map(|load| format!("  Load:       {:.1}%\n", load.percent()))
         .unwrap_or_default();
+    let places = notice
+        .places
+        .map(|(clients, places)| format!("  Clients:    {clients} in {places} places\n"))
+        .unwrap_or_default();
     let error = notice.failure.as_ref().map(|failure| {
         let text = excerpt(&failure.in_full(), MAX_LETTERS);
         format!("  Last error: {text}\n  Reason:     {}\n", failure.reason)
     });
     format!(
-        "{server}: {event}\n  Time:       {}\n{load}{}\n",
+        "{server}: {event}\n  Time:       {}\n{load}{places}{}\n",
         notice.at,
         error.unwrap_or_default()
     )

@@ -23,6 +23,8 @@ pub struct Notice {
     pub event: NoticeKind,
     /// Its load, if known.
     pub load: Option<Load>,
+    /// The number of its clients and of its places, if known.
+    pub places: Option<(u32, u32)>,
     /// The failed probe that begins or ends with it, if any.
     pub failure: Option<Failure>,
     /// When it happened, as text.
@@ -36,9 +38,9 @@ pub enum NoticeKind {
     NotResponding,
     /// They succeed again.
     WorkingAgain,
-    /// Its load reached the threshold.
+    /// Its load has reached the threshold, or all its places are taken.
     MaximumLoad,
-    /// Its load is below the threshold again.
+    /// It takes clients again.
     AvailableAgain,
 }
 
@@ -176,6 +178,7 @@ mod tests {
             server: format!("host:{port}"),
             event,
             load: None,
+            places: None,
             failure: None,
             at: String::new(),
         }
