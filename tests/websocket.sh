@@ -37,8 +37,10 @@ listen() {
     local head length
     while head=$(take 2); do
         length=$((16#${head:2} & 127))
-        ((length != 126)) || length=$((16#$(take 2))) || return
-        ((length != 127)) || length=$((16#$(take 8))) || return
+        case $length in
+            126) length=$((16#$(take 2))) || return ;;
+            127) length=$((16#$(take 8))) || return ;;
+        esac
         case $((16#${head:0:2} & 15)) in
             1 | 0) head -c "$length" <&3 && echo ;;
             8) return ;;

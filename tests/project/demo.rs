@@ -2,11 +2,15 @@
 
 use std::process::Stdio;
 
+use futures_util::SinkExt;
 use nix::sys::signal::{Signal, kill, killpg};
 use nix::unistd::Pid;
 use tokio::io::AsyncBufReadExt;
+use tokio::net::TcpListener;
+use tokio_tungstenite::accept_async;
+use tokio_tungstenite::tungstenite::Message;
 
-use super::copy::{Project, nothing_is_left, processes_in};
+use super::copy::{Project, nothing_is_left, processes_in, root};
 use crate::support::client::Client;
 use crate::support::webots::instance_folders_in;
 use crate::support::{SOON, http, until};
@@ -49,6 +53,35 @@ async fn talk(project: &Project, url: &str, message: &str, last: &str) -> Vec<St
     killpg(group, Signal::SIGINT).unwrap();
     actix_rt::time::timeout(SOON, child.wait()).await.unwrap().unwrap();
     heard
+}
+
+/// The header of a frame tells a length in three ways.
+#[actix_rt::test]
+async fn the_client_of_the_documentation_prints_texts_of_any_length() {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let url = format!("ws://{}/", listener.local_addr().unwrap());
+    let texts = [1, 125, 126, 127, 128, 65_535, 65_536].map(|length| "x".repeat(length));
+    let sent = texts.clone();
+    actix_rt::spawn(async move {
+        let (socket, _) = listener.accept().await.unwrap();
+        let mut socket = accept_async(socket).await.unwrap();
+        for text in sent {
+            socket.send(Message::text(text)).await.unwrap();
+        }
+        socket.close(None).await.unwrap();
+    });
+    let client = tokio::process::Command::new(root().join("tests/websocket.sh"))
+        .arg(url)
+        .stdin(Stdio::null())
+        .kill_on_drop(true)
+        .output();
+    let output = actix_rt::time::timeout(SOON, client).await.unwrap().unwrap();
+    let told = String::from_utf8_lossy(&output.stdout);
+    assert!(
+        told.lines().eq(&texts),
+        "{:?}",
+        told.lines().map(str::len).collect::<Vec<_>>()
+    );
 }
 
 #[actix_rt::test]
