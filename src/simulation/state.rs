@@ -230,15 +230,19 @@ impl AppState {
     pub fn admit(&self, url: &str, pass: Option<&str>) -> Result<(ProjectUrl, Option<ReservationId>), Failure> {
         let world = ProjectUrl::parse(url).map_err(|wrong| Failure::new(Reason::InvalidWorld, wrong.to_string()))?;
         let reservation = self.reservation(&world, pass)?;
-        // A slot that was reserved before is given.
-        if self.is_draining() && reservation.is_none() {
+        let load = if reservation.is_some() {
+            // A slot that was reserved before is given, although the server drains or its load has risen.
+            Load::ZERO
+        } else if self.is_draining() {
             let message = "This simulation server is about to end, and takes no new clients";
             return Err(Failure::new(Reason::Draining, message));
-        }
+        } else {
+            self.load()
+        };
         if let Some(problem) = self.problem() {
             return Err(Failure::new(Reason::NotReady, problem));
         }
-        self.rules.admit(&world, self.load())?;
+        self.rules.admit(&world, load)?;
         Ok((world, reservation))
     }
 

@@ -7,8 +7,9 @@ use webots_fleet::shared::domain::{
     FleetKey, Hello, Offers, Pass, PassedOver, ProjectUrl, ReservationId, ServerRun, Wish, Wishes,
 };
 
+use super::readings::gpu_driver;
 use crate::support::program::{Builder, Server};
-use crate::support::{Client, SOON, arm, arm_at, demo_server, until};
+use crate::support::{Client, SOON, arm, arm_at, demo_server, make_program, until, world};
 
 const SECRET: &str = "a secret of this test";
 
@@ -78,11 +79,15 @@ impl Link {
     }
 
     fn pass(&self, reservation: ReservationId) -> String {
+        self.pass_for(&arm(), reservation)
+    }
+
+    fn pass_for(&self, world: &str, reservation: ReservationId) -> String {
         let pass = Pass {
             server: self.hello.server,
             reservation,
         };
-        pass.write(&FleetKey::new(SECRET), &ProjectUrl::parse(&arm()).unwrap())
+        pass.write(&FleetKey::new(SECRET), &ProjectUrl::parse(world).unwrap())
     }
 }
 
@@ -274,6 +279,39 @@ async fn a_draining_server_keeps_its_promises_and_makes_no_others() {
     assert_eq!(link.offers().await.offers, []);
     client.leave().await;
     assert_eq!(server.ended().await, Some(0));
+}
+
+#[actix_rt::test]
+async fn a_slot_that_was_reserved_is_given_although_the_load_has_risen() {
+    needs!("cc");
+    // All commands of this Docker succeed: the client's start has only to begin.
+    let programs = tempfile::tempdir().unwrap();
+    make_program(&programs.path().join("docker"), "exit 0");
+    let path = format!("{}:{}", programs.path().display(), std::env::var("PATH").unwrap());
+    let library = gpu_driver();
+    let busy = library.path().join("busy");
+    let server = reserving()
+        .set("docker", true)
+        .set("shareIdleTime", 100)
+        .env("PATH", &path)
+        .env("LD_LIBRARY_PATH", library.path().to_str().unwrap())
+        .env("NVML_BUSY", busy.to_str().unwrap())
+        .start()
+        .await;
+    let other = world("other/world", "main", "worlds/a.wbt");
+    let mut link = Link::open(&server).await;
+    link.want(&[(1, 0)]).await;
+    let slots = link.slots().await;
+    std::fs::write(&busy, "").unwrap();
+    until("the load is high", async || {
+        server.status().await["load"].as_f64() > Some(100.0)
+    })
+    .await;
+    let mut without = Client::start(&server, &other).await;
+    without.until("loading: Error: ").await;
+    assert_eq!(without.reason()["code"], "no-idle-time");
+    let mut client = start(&server, &other, &link.pass_for(&other, slots[0].1)).await;
+    client.until("session: ").await;
 }
 
 #[actix_rt::test]
