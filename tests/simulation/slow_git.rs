@@ -1,4 +1,4 @@
-//! A git that is slow, hangs or is stopped disturbs nobody else: fetches into one cached repository run one at a time, each
+//! A git that is slow, hangs, is stopped or killed disturbs nobody else: fetches into one cached repository run one at a time, each
 //! commit once, each within the time limit of a checkout.
 
 use std::time::Duration;
@@ -109,4 +109,35 @@ async fn a_git_that_is_stopped_fails_once() {
         assert!(told.contains("opened [main]"), "git {command}: {told}");
     });
     join_all(kinds).await;
+}
+
+#[actix_rt::test]
+async fn a_git_that_is_killed_blames_the_server_and_costs_no_cache() {
+    let forge = forge(&["main", "next"]);
+    let webots = reader();
+    let folder = tempfile::tempdir().unwrap();
+    let next = folder.path().join("next");
+    // The next command that this file names is killed, as by a kernel without memory.
+    let wrapper = Wrapper::git(&format!(
+        "if read -r command 2>/dev/null <{next}; then case \" $* \" in *\" $command \"*) rm {next}; kill -KILL $$;; esac; fi",
+        next = next.display()
+    ));
+    let builder = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path());
+    let server = builder.start().await;
+    is_told(&server, &arm(), "opened [main]").await;
+    for (command, branch) in [
+        ("ls-remote", "main"),
+        ("ls-tree", "main"),
+        ("checkout", "main"),
+        ("fetch", "next"),
+    ] {
+        std::fs::write(&next, format!("{command}\n")).unwrap();
+        let mut client = Client::start(&server, &arm_at(branch)).await;
+        let told = client.until("loading: Error:").await;
+        assert_eq!(client.reason()["code"], "server-fault", "git {command}: {told}");
+        assert_eq!(client.closed().await, Some(1013), "git {command}");
+        is_told(&server, &arm_at(branch), &format!("opened [{branch}]")).await;
+    }
+    // That of each branch, and the one that was killed.
+    assert_eq!(wrapper.count(" fetch "), 3);
 }

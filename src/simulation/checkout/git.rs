@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
+use nix::libc::SIGKILL;
 use rustix::process::Resource;
 
 use super::disk::spawn_blocking_io;
@@ -42,11 +43,6 @@ pub struct GitExit {
 }
 
 impl GitExit {
-    /// Whether a signal has ended it.
-    pub fn is_signal(&self) -> bool {
-        matches!(self.ending, ExitReason::Signal(_))
-    }
-
     /// It as a failure for this reason.
     pub fn failure(self, reason: Reason) -> Failure {
         let Self {
@@ -170,12 +166,22 @@ impl Git {
                 ending: ExitReason::Code(0),
                 answer,
             }) => Ok(answer),
-            Ok(Ran { ending, .. }) if ending != ExitReason::NotStarted => Err(GitError::Ended(GitExit {
-                command,
-                ending,
-                output,
-            })),
-            Ok(_) => Err(GitError::NotRun(not_started("it is not there"))),
+            Ok(Ran {
+                ending: ExitReason::NotStarted,
+                ..
+            }) => Err(GitError::NotRun(not_started("it is not there"))),
+            Ok(Ran { ending, .. }) => {
+                let exit = GitExit {
+                    command,
+                    ending,
+                    output,
+                };
+                Err(match ending {
+                    // Nothing that it reads does this. As a rule the kernel does, when memory has run out.
+                    ExitReason::Signal(SIGKILL) => GitError::NotRun(exit.failure(Reason::ServerFault)),
+                    _ => GitError::Ended(exit),
+                })
+            }
             Err(error) => Err(GitError::NotRun(not_run(&command, &error))),
         }
     }

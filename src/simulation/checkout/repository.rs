@@ -239,10 +239,6 @@ impl Repository {
                 message,
             )));
         }
-        // Somebody has ended git.
-        if exit.is_signal() {
-            return Err(CheckoutError::OfRepository(exit.failure(Reason::RemoteFailed)));
-        }
         self.ask(&ANY).await?;
         // The remote answers: either it does not serve this, or the cached repository is damaged.
         let fresh = self.git.scratch()?;
