@@ -18,8 +18,8 @@ use actix::prelude::*;
 use futures_util::StreamExt;
 use tokio::net::TcpStream;
 use tokio::sync::Notify;
-use tokio_tungstenite::connect_async;
-use tokio_tungstenite::tungstenite::Message as Frame;
+use tokio_tungstenite::connect_async_with_config;
+use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 
 use crate::simulation::process::process_tree;
 use crate::simulation::progress::{Progress, Step};
@@ -60,6 +60,10 @@ const REQUESTS: Pace = Pace {
 /// Bounds of the timeout of a request behind a proxy, until one was answered. It is the time since the start: the proxy
 /// may accept the first request before anything inside listens, and Webots answers none while it reads a world.
 const TIMEOUT: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(10));
+/// Size limit of a message with progress, in bytes. In containers the project decides what sends it.
+const MAX_MESSAGE: usize = 4096;
+/// Pause after a message. Webots sends some per second; a program that floods this server is blocked.
+const AFTER_MESSAGE: Duration = Duration::from_millis(20);
 
 /// What shows that Webots listens.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -186,13 +190,17 @@ impl Startup {
 
     /// Sends what Webots reports about its progress. It reports to each WebSocket, also to one that requests nothing.
     async fn forward_progress(&self) -> Infallible {
+        let url = format!("ws://{}/", self.address);
+        let limits = WebSocketConfig::default()
+            .max_message_size(Some(MAX_MESSAGE))
+            .max_frame_size(Some(MAX_MESSAGE));
         loop {
             self.processing.notified().await;
-            let Ok((mut socket, _)) = connect_async(format!("ws://{}/", self.address)).await else {
+            let Ok((mut socket, _)) = connect_async_with_config(&url, Some(limits), false).await else {
                 continue;
             };
             while let Some(Ok(frame)) = socket.next().await {
-                let Frame::Text(text) = frame else { continue };
+                let text = frame.to_text().unwrap_or_default();
                 if let Some(progress) = text.strip_prefix("loading:") {
                     // A full mailbox drops this line.
                     self.events.try_send(StartupEvent::Loading(parsed(progress))).ok();
@@ -200,6 +208,7 @@ impl Startup {
                     self.loaded.notify_one();
                     break;
                 }
+                actix_rt::time::sleep(AFTER_MESSAGE).await;
             }
         }
     }
@@ -225,6 +234,8 @@ mod tests {
     use tokio::io::{AsyncReadExt, AsyncWriteExt};
     use tokio::net::TcpListener;
     use tokio::sync::mpsc;
+    use tokio_tungstenite::WebSocketStream;
+    use tokio_tungstenite::tungstenite::Message as Frame;
 
     use super::*;
     use crate::simulation::relay::REQUEST;
@@ -262,6 +273,23 @@ mod tests {
         stream
     }
 
+    /// The next WebSocket for progress. Requests before it and beside it are answered.
+    async fn progress_socket(listener: &TcpListener) -> WebSocketStream<TcpStream> {
+        let opened = async {
+            loop {
+                let (mut stream, _) = listener.accept().await.unwrap();
+                let mut first = [0; 3];
+                stream.peek(&mut first).await.unwrap();
+                if first == *b"GET" {
+                    break tokio_tungstenite::accept_async(stream).await.unwrap();
+                }
+                stream.write_all(b"PROCESSING").await.unwrap();
+            }
+        };
+        let opened = actix_rt::time::timeout(Duration::from_secs(20), opened).await;
+        opened.expect("progress is asked for")
+    }
+
     #[actix_rt::test]
     async fn an_accepted_connection_shows_that_it_listens_and_an_answer_that_it_is_ready() {
         let (listener, mut events) = start(ListenSign::Accepts).await;
@@ -291,18 +319,8 @@ mod tests {
     #[actix_rt::test]
     async fn progress_is_forwarded_and_the_world_ends_the_wait() {
         let (listener, mut events) = start(ListenSign::Accepts).await;
-        request(&listener).await.write_all(b"PROCESSING").await.unwrap();
+        let mut socket = progress_socket(&listener).await;
         assert_eq!(events.recv().await, Some(StartupEvent::Listening));
-        // Requests continue beside the WebSocket.
-        let mut socket = loop {
-            let (mut stream, _) = listener.accept().await.unwrap();
-            let mut first = [0; 3];
-            stream.peek(&mut first).await.unwrap();
-            if first == *b"GET" {
-                break tokio_tungstenite::accept_async(stream).await.unwrap();
-            }
-            stream.write_all(b"PROCESSING").await.unwrap();
-        };
         socket.send(Frame::text("loading:Downloading assets:40")).await.unwrap();
         let progress = Progress {
             percent: Some(40),
@@ -315,5 +333,28 @@ mod tests {
             .unwrap();
         request(&listener).await.write_all(b"FAILED").await.unwrap();
         assert_eq!(events.recv().await, Some(StartupEvent::Ready));
+    }
+
+    #[actix_rt::test]
+    async fn progress_is_short_and_comes_at_its_pace_whatever_is_sent() {
+        let (listener, mut events) = start(ListenSign::Accepts).await;
+        let mut socket = progress_socket(&listener).await;
+        assert_eq!(events.recv().await, Some(StartupEvent::Listening));
+        let long = format!("loading:{}", "x".repeat(1 << 20));
+        // The connection may break before all is sent.
+        socket.send(Frame::text(long)).await.ok();
+        let mut socket = progress_socket(&listener).await;
+        let begin = Instant::now();
+        for percent in 0..20 {
+            socket.send(Frame::text(format!("loading:x:{percent}"))).await.unwrap();
+        }
+        for percent in 0..20 {
+            let event = events.recv().await;
+            assert!(
+                matches!(&event, Some(StartupEvent::Loading(progress)) if progress.percent == Some(percent)),
+                "{event:?}"
+            );
+        }
+        assert!(begin.elapsed() > Duration::from_millis(300), "{:?}", begin.elapsed());
     }
 }
