@@ -36,7 +36,7 @@ impl SceneKind {
 pub struct Snapshot {
     /// The numbers by state.
     pub instances: Instances,
-    /// Each simulation that has a client, sorted by id.
+    /// Each simulation that has a client: first those of older processes, sorted by id within each process.
     pub simulations: Vec<Simulation>,
 }
 
