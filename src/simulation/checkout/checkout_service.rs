@@ -98,7 +98,7 @@ impl CheckoutService {
     async fn ask_tips(&self, worlds: &[ProjectUrl], is_due: bool) -> Result<Tips, CheckoutError> {
         let mut current = worlds.to_vec();
         let mut redirects = 0;
-        let found = loop {
+        let (repository, tips) = loop {
             match self.resolver.tips(&current, is_due).await {
                 Err(CheckoutError::Moved(location)) if redirects < redirect::MAX_REDIRECTS => {
                     redirects += 1;
@@ -109,7 +109,6 @@ impl CheckoutService {
                 done => break done?,
             }
         };
-        let (repository, tips) = found.ok_or(CheckoutError::NoCommit)?;
         Ok(Tips {
             tips: worlds.iter().cloned().zip(tips).collect(),
             kept: KeptRepository {

@@ -88,8 +88,8 @@ impl CommitResolver {
         &self,
         worlds: &[ProjectUrl],
         is_due: bool,
-    ) -> Result<Option<(Arc<Repository>, Vec<Tip>)>, CheckoutError> {
-        let Some(first) = worlds.first() else { return Ok(None) };
+    ) -> Result<(Arc<Repository>, Vec<Tip>), CheckoutError> {
+        let first = worlds.first().ok_or(CheckoutError::NoCommit)?;
         let repository = self.repository(first, COMMITS).await?;
         let has_name = |world: &&ProjectUrl| revision::commit_of(world, self.config.any_commit).is_none();
         let named: Vec<&ProjectUrl> = worlds.iter().filter(has_name).collect();
@@ -104,7 +104,7 @@ impl CommitResolver {
         } else {
             Vec::new()
         };
-        Ok(Some((repository, tips)))
+        Ok((repository, tips))
     }
 
     /// The same world in the repository to which its Git host redirects.
