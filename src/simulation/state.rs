@@ -164,14 +164,14 @@ impl AppState {
 
     /// Stops the simulations with these ids, for a reason, which may be empty; `by` is who stops them, for the log. Returns
     /// the ids of those that are there.
-    pub fn stop(&self, ids: &[String], reason: &str, by: &str) -> Vec<String> {
+    pub async fn stop(&self, ids: &[String], reason: &str, by: &str) -> Vec<String> {
         let order = ForwardedStop {
             ids: ids.to_vec(),
             reason: reason.to_owned(),
             by: by.to_owned(),
         };
         let mut stopped = self.stop_here(ids, reason, by);
-        stopped.extend(self.predecessors.stop(&order));
+        stopped.extend(self.predecessors.stop(order).await);
         stopped
     }
 

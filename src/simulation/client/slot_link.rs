@@ -13,7 +13,7 @@ use serde::Serialize;
 
 use super::roster_feed::RosterFeed;
 use crate::shared::domain::{
-    FleetKey, Follow, Hello, KeepReady, Proof, Stopped, ToSessionServer, ToSimulationServer, Wishes,
+    FleetKey, Follow, Hello, KeepReady, Proof, StopOrder, Stopped, ToSessionServer, ToSimulationServer, Wishes,
 };
 use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::websocket::MessageLimit;
@@ -119,18 +119,23 @@ impl SlotLink {
                 }
                 Ok(ToSimulationServer::Wishes(wishes)) => self.server.slots.wish(*id, &wishes),
                 Ok(ToSimulationServer::Follow(follow)) => self.follow(&follow, ctx),
-                Ok(ToSimulationServer::Stop(order)) => {
-                    let by = format!("session server {}, {}", self.peer, one_line(&order.by));
-                    let ids = self.server.stop(&order.ids, &order.reason, &by);
-                    let number = order.number;
-                    Self::send(&ToSessionServer::Stopped(Stopped { number, ids }), ctx);
-                }
+                Ok(ToSimulationServer::Stop(order)) => self.stop(order, ctx),
                 Err(error) => {
                     log::warn!("client {}: {error}", self.peer);
                     Self::close(CloseCode::Policy, ctx);
                 }
             },
         }
+    }
+
+    /// Stops simulations, and answers which.
+    fn stop(&self, order: StopOrder, ctx: &mut Context) {
+        let by = format!("session server {}, {}", self.peer, one_line(&order.by));
+        let server = Arc::clone(&self.server);
+        async move { (order.number, server.stop(&order.ids, &order.reason, &by).await) }
+            .into_actor(self)
+            .map(|(number, ids), _, ctx| Self::send(&ToSessionServer::Stopped(Stopped { number, ids }), ctx))
+            .spawn(ctx);
     }
 
     /// Tells all simulations, and from now on what changes.

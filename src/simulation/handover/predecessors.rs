@@ -1,6 +1,6 @@
 //! The processes of this server that were started before this one, and serve their last clients.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
@@ -102,32 +102,31 @@ impl Predecessors {
         Some(self.folder(*run))
     }
 
-    /// Has those of these simulations stopped that they have. Returns the ids of these.
-    pub fn stop(self: &Arc<Self>, order: &ForwardedStop) -> Vec<String> {
-        let theirs = |id: &&String| self.with_simulation(id).is_some();
-        let ids: Vec<String> = order.ids.iter().filter(theirs).cloned().collect();
-        if !ids.is_empty() {
-            self.tell_all(Request::Stop(order.clone()));
-        }
-        ids
+    /// Has those of these simulations stopped that they have. Returns the ids of those that are being stopped.
+    pub async fn stop(&self, order: ForwardedStop) -> Vec<String> {
+        let processes: BTreeSet<PathBuf> = order.ids.iter().filter_map(|id| self.with_simulation(id)).collect();
+        let request = Request::Stop(order);
+        let answers = processes
+            .iter()
+            .map(async |folder| match ask(folder, &request, ANSWER).await {
+                Ok(Reply::Done(ids)) => ids.split_whitespace().map(str::to_owned).collect(),
+                other => {
+                    log::warn!("the process of {} stops nothing: {other:?}", folder.display());
+                    Vec::new()
+                }
+            });
+        join_all(answers).await.concat()
     }
 
     /// Has all of them end in an orderly way.
-    pub fn end(self: &Arc<Self>) {
-        if !self.is_empty() {
-            self.tell_all(Request::End);
-        }
-    }
-
-    fn tell_all(self: &Arc<Self>, request: Request) {
-        let this = Arc::clone(self);
-        actix_rt::spawn(async move {
-            let runs: Vec<RunId> = this.known.lock().keys().copied().collect();
-            for run in runs {
-                if let Err(error) = ask(&this.folder(run), &request, ANSWER).await {
-                    log::warn!("the process of {} does not answer: {error}", run.folder());
+    pub fn end(&self) {
+        let runs: Vec<RunId> = self.known.lock().keys().copied().collect();
+        for folder in runs.into_iter().map(|run| self.folder(run)) {
+            actix_rt::spawn(async move {
+                if let Err(error) = ask(&folder, &Request::End, ANSWER).await {
+                    log::warn!("the process of {} does not answer: {error}", folder.display());
                 }
-            }
-        });
+            });
+        }
     }
 }

@@ -41,9 +41,12 @@ async fn stop(
         Ok(order) => order,
         Err(refusal) => return Ok(refusal),
     };
-    let stopped = server.stop(&[id.into_inner()], &reason, &administrator.to_string());
+    let by = administrator.to_string();
+    let stopped = server.stop(&[id.into_inner()], &reason, &by).await;
     if stopped.is_empty() {
-        return Err(ErrorNotFound("Error: there is no such simulation; it may have ended."));
+        return Err(ErrorNotFound(
+            "Error: there is no such simulation, or its process does not answer; it may have ended.",
+        ));
     }
     Ok(HttpResponse::Accepted().json(json!({"stopped": stopped, "failed": []})))
 }
