@@ -247,15 +247,20 @@ fn the_schema_has_the_keys_kinds_and_defaults_of_the_page() {
 }
 
 #[test]
-fn the_examples_of_the_page_are_taken_without_a_warning() {
-    for kind in kinds() {
-        let page = kind.page();
+fn the_examples_of_the_pages_are_taken_without_a_warning() {
+    let embedding = std::fs::read_to_string(root().join("docs/embedding.md")).unwrap();
+    let [session, simulation] = kinds();
+    for (kind, page) in [
+        (&session, session.page()),
+        (&simulation, simulation.page()),
+        (&session, embedding),
+    ] {
         let examples: Vec<&str> = page
             .split("```json\n")
             .skip(1)
             .map(|text| text.split("```").next().unwrap())
             .collect();
-        assert!(!examples.is_empty(), "{}", kind.heading);
+        assert!(!examples.is_empty(), "{page}");
         for example in examples {
             let output = kind.check(example);
             assert!(
