@@ -78,6 +78,7 @@ export const words = {
     clearStopped: '您已停止等待。',
     webotsViewer: 'Webots 的查看器',
     noWebotsViewer: (why) => `无法加载 Webots 的查看器：${why}。请选择小型查看器并重新连接。`,
+    onlyInside: '此页面只能在其他页面中显示它',
     onlySmall: '这里没有 Webots 自带的查看器，仿真由小型查看器显示。',
   },
   steps: {

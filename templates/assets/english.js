@@ -84,6 +84,7 @@ export const words = {
     webotsViewer: 'Webots’ viewer',
     /** @param {unknown} why */
     noWebotsViewer: (why) => `Webots’ viewer can’t be loaded: ${why}. Choose the small viewer and connect again.`,
+    onlyInside: 'this page shows it only inside of another one',
     onlySmall: 'Webots’ own viewer is not to be had here; the small viewer shows the simulation.',
   },
   steps: {

@@ -79,6 +79,7 @@ export const words = {
     webotsViewer: 'Visualiseur de Webots',
     noWebotsViewer: (why) =>
       `Le visualiseur de Webots ne peut pas être chargé : ${why}. Choisissez le petit visualiseur et reconnectez-vous.`,
+    onlyInside: 'cette page ne l’affiche qu’à l’intérieur d’une autre',
     onlySmall: 'Le visualiseur de Webots n’est pas disponible ici ; le petit visualiseur affiche la simulation.',
   },
   steps: {

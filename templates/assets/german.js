@@ -80,6 +80,7 @@ export const words = {
     webotsViewer: 'Ansicht von Webots',
     noWebotsViewer: (why) =>
       `Die Ansicht von Webots lässt sich nicht laden: ${why}. Wähle die kleine Ansicht und verbinde dich neu.`,
+    onlyInside: 'Diese Seite zeigt sie nur innerhalb einer anderen',
     onlySmall: 'Die Ansicht von Webots gibt es hier nicht; die kleine Ansicht zeigt die Simulation.',
   },
   steps: {

@@ -80,6 +80,7 @@ export const words = {
     webotsViewer: 'Webots のビューアー',
     noWebotsViewer: (why) =>
       `Webots のビューアーを読み込めません: ${why}。小型ビューアーを選んで、もう一度接続してください。`,
+    onlyInside: 'このページは、ほかのページの中でのみ表示できます',
     onlySmall: 'ここでは Webots のビューアーを使えません。小型ビューアーで表示します。',
   },
   steps: {

@@ -79,6 +79,7 @@ export const words = {
     webotsViewer: 'Visor de Webots',
     noWebotsViewer: (why) =>
       `No se puede cargar el visor de Webots: ${why}. Elige el visor pequeño y conéctate de nuevo.`,
+    onlyInside: 'esta página solo lo muestra dentro de otra',
     onlySmall: 'El visor de Webots no está disponible aquí; el visor pequeño muestra la simulación.',
   },
   steps: {

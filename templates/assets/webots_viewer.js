@@ -82,7 +82,7 @@ Object.assign(document.head, {
 try {
   // A page that is not embedded could be opened by a link that names any script.
   if (window === top || !script) {
-    throw new Error('no viewer is named');
+    throw new Error(words.stage.onlyInside);
   }
   await import(script);
   const view = /** @type {WebotsView} */ (document.createElement('webots-view'));

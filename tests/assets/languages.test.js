@@ -132,6 +132,8 @@ test('modules have no words of their own', () => {
       assert.doesNotMatch(text.replace(/\$\{[^}]*\}/g, ''), /^[A-Z][a-z]+ [a-z]+|[a-z]\.$/, `${name}: ${text}`);
     }
   }
+  // This page shows what it throws.
+  assert.doesNotMatch(read('assets/webots_viewer.js'), /Error\(['"`]/);
 });
 
 test('the language is the first of the wanted ones that there is', () => {
