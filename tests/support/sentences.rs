@@ -89,13 +89,18 @@ pub fn all() -> Vec<String> {
         ]
         .map(str::to_owned),
     );
-    texts.extend(OF_OTHERS.map(str::to_owned));
-    texts.extend((1..134).map(|number| Errno::from_raw(number).desc().to_owned()));
+    texts.extend(of_others());
     let lines = texts.iter().flat_map(|text| text.lines()).map(str::trim);
     let has_words =
         |text: &&str| (4..400).contains(&text.len()) && text.contains(' ') && text.contains(char::is_alphabetic);
     let unique: BTreeSet<&str> = lines.filter(has_words).collect();
     unique.into_iter().map(str::to_owned).collect()
+}
+
+/// The texts of git, Docker, a registry, a shell and the kernel.
+pub fn of_others() -> impl Iterator<Item = String> {
+    let of_kernel = (1..134).map(|number| Errno::from_raw(number).desc());
+    OF_OTHERS.into_iter().chain(of_kernel).map(str::to_owned)
 }
 
 fn files(folder: &Path) -> Vec<PathBuf> {
