@@ -157,8 +157,13 @@ async fn a_lock_that_a_killed_git_has_left_does_not_stop_packing() {
     std::fs::write(&settings, "[gc]\n\tautoPackLimit = 2\n").unwrap();
     let builder = simulation_server(&webots.path(), forge.path(), 1);
     let server = builder.set("gitConfig", settings.to_str().unwrap()).start().await;
+    let commit = forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("first"))]);
     assert!(outcome(&server, &arm()).await.contains("opened"));
     let repository = &cached(&server)[0];
+    // git leaves a few references as they are, and needs no lock then.
+    for number in 0..50 {
+        std::fs::write(repository.join(format!("refs/tags/{number}")), &commit).unwrap();
+    }
     for lock in ["packed-refs.lock", "gc.pid.lock"] {
         std::fs::write(repository.join(lock), "").unwrap();
         for _ in 0..4 {
