@@ -427,7 +427,7 @@ async fn servers_that_tell_nothing_are_shown_as_what_they_are() {
     for (number, note) in [
         (0, "as the Python server"),
         (1, "no fleetKey"),
-        (2, "no fleetKey"),
+        (2, "fleetKey is another one"),
         (3, ""),
     ] {
         let said = lines[number]["note"].as_str().unwrap();

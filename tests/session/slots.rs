@@ -8,6 +8,7 @@ use webots_fleet::shared::domain::{Offer, Offers, ReservationId};
 
 use super::stand_in::{Manner, StandIn};
 use super::{times_logged, until_states};
+use crate::support::SOON;
 use crate::support::client::Client;
 use crate::support::git::arm;
 use crate::support::http::{PASSWORD, get_as_administrator};
@@ -118,7 +119,7 @@ async fn a_server_whose_slots_cant_be_asked_for_takes_its_turn_by_its_reports() 
     until_states(&session, &["up"]).await;
     for _ in 0..2 {
         let mut client = enter(&session).await;
-        assert_eq!(client.until("ws://").await, server.url());
+        assert_eq!(client.within("ws://", SOON).await, server.url());
         assert!(
             !client.heard.iter().any(|text| text.starts_with("pass:")),
             "{:?}",

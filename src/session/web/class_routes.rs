@@ -257,8 +257,8 @@ fn server_lines(server: &AppState, status: &FleetStatus) -> Vec<ServerLine> {
         } else if report.is_some_and(|report| report.docker.is_none()) {
             "Without a list of its simulations, as the Python server: only its load is known".to_owned()
         } else if report.is_some_and(|report| report.reserves) {
-            "Its simulations are listed on its own page only: its /slots can't be used, and the log of this session \
-             server says why"
+            "Its simulations are listed on its own page only: its fleetKey is another one, or its /slots can't be \
+             reached; the log of this session server says which"
                 .to_owned()
         } else {
             "Its simulations are listed on its own page only: it has no fleetKey".to_owned()
