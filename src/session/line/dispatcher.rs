@@ -271,6 +271,7 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
             mut assigned,
             starved,
             plain,
+            placed,
         } = self.share(fleet, &admission, &will_reserve, ready, now);
         let mut turns = Vec::new();
         for (place, server) in plain {
@@ -283,6 +284,7 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
         for (server, link) in self.links.iter_mut().filter(|(_, link)| !link.owes_answer()) {
             let mut first = assigned.remove(server).unwrap_or_default();
             let mut all = first.len();
+            // With those it gets now: a slot that becomes free later is for one of the others, as the load falls with it.
             let load = fleet.effective_load(server).filter(|_| fleet.would_take(server));
             let may_come = |class: &&ClassId| {
                 let world = line.classes().get(**class).map(|class| &class.world);
@@ -295,9 +297,10 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
                 let waiting: usize = waiting.map(|class| class.waiting as usize).sum();
                 if link.passed.is_empty() {
                     let list = lists.entry(taken);
-                    first.extend(list.or_insert_with_key(|taken| line.told_of(taken, &[])).iter());
+                    first.extend(list.or_insert_with_key(|taken| line.told_of(taken, &[], false)).iter());
                 } else {
-                    first.extend(line.told_of(&taken, &link.passed));
+                    // Where room is left, all others have got some.
+                    first.extend(line.told_of(&taken, &link.passed, fleet.has_room(server)));
                 }
                 first.sort_unstable();
                 first.dedup();
@@ -309,11 +312,14 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
             let told = link.wishes(first, all, waits, |place| line.wish(*place, now.unix));
             wishes.extend(told.map(|told| (server.clone(), told)));
         }
+        // The room that they get is counted once they have offers.
+        for server in placed {
+            fleet.withdraw(&server);
+        }
         Served { turns, wishes }
     }
 
-    /// Shares the room of the fleet out, in the order of the line; servers that keep a client's world ready come first. The
-    /// room that clients of reserving servers get is counted only once they have offers.
+    /// Shares the room of the fleet out, in the order of the line; servers that keep a client's world ready come first.
     fn share(
         &self,
         fleet: &mut LoadBalancer<Server>,
@@ -326,15 +332,15 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
             assigned: HashMap::new(),
             starved: Vec::new(),
             plain: Vec::new(),
+            placed: Vec::new(),
         };
         // Until a server has answered, it may offer slots to those that it was told of.
         let mut pending = HashSet::new();
-        let mut placed = Vec::new();
         for (server, link) in &self.links {
             for place in link.unanswered() {
                 if self.line.place_of(place.number).is_some() && fleet.has_room(server) && pending.insert(*place) {
                     fleet.place(server, now.instant);
-                    placed.push(server.clone());
+                    shares.placed.push(server.clone());
                 }
             }
         }
@@ -384,13 +390,10 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
                 }
                 Some(server) if self.links.contains_key(&server) => {
                     shares.assigned.entry(server.clone()).or_default().push(*place);
-                    placed.push(server);
+                    shares.placed.push(server);
                 }
                 Some(server) => shares.plain.push((*place, server)),
             }
-        }
-        for server in placed {
-            fleet.withdraw(&server);
         }
         shares.starved.sort_unstable();
         shares
@@ -520,6 +523,8 @@ struct Shares<Server> {
     starved: Vec<ClassId>,
     /// The clients that servers take which only report.
     plain: Vec<(Place, Server)>,
+    /// The reserving servers, once for each client that is counted as sent there.
+    placed: Vec<Server>,
 }
 
 #[cfg(test)]
@@ -543,6 +548,7 @@ mod tests {
         taken: u32,
         freed: u64,
         arrivals: u64,
+        load: f64,
         wishes: Vec<Wish>,
     }
 
@@ -593,6 +599,7 @@ mod tests {
                 taken: slots,
                 freed: 0,
                 arrivals: 0,
+                load: 0.0,
                 wishes: Vec::new(),
             };
             let mut fleet = Self {
@@ -646,7 +653,7 @@ mod tests {
                 };
                 let report = ServerReport {
                     instances: Some(instances),
-                    ..ServerReport::load_only(Load::ZERO)
+                    ..ServerReport::load_only(Load::try_from(server.load).unwrap())
                 };
                 self.balancer.report(&id, self.now.instant, &report, true);
                 self.dispatcher.count_freed(&id, server.freed, self.now.instant);
@@ -979,6 +986,27 @@ mod tests {
             fleet.enter(0, None, number);
         }
         assert_eq!(fleet.turns.iter().filter(|(_, server)| *server == 1).count(), 5);
+    }
+
+    #[test]
+    fn no_more_have_their_turn_at_once_than_the_load_leaves_room_for() {
+        let mut fleet = Fleet::new(&[(&[0], true, 60)]);
+        fleet.balancer.set_policy(PlacementPolicy::default());
+        fleet.servers[0].taken = 0;
+        fleet.servers[0].load = 96.0;
+        for _ in 0..2 {
+            fleet.report();
+            fleet.pass_time(Duration::from_secs(20));
+        }
+        for number in 1..=50 {
+            fleet.enter(0, None, number);
+        }
+        assert_eq!(fleet.turns, []);
+        // At 95 % it takes nobody, and a client costs 2 %.
+        fleet.servers[0].load = 92.0;
+        fleet.report();
+        fleet.serve();
+        assert_eq!(fleet.turns, [(1, 0), (2, 0)]);
     }
 
     #[test]

@@ -263,8 +263,8 @@ impl<Server: Clone + Eq, Client: Clone> WaitingLine<Server, Client> {
     }
 
     /// The first clients of these classes, as many as a simulation server is told of. `passed` are those whom it passes
-    /// over.
-    pub(super) fn told_of(&self, classes: &[ClassId], passed: &[PassedOver]) -> Vec<Place> {
+    /// over; with `only_passed`, it is told of no others.
+    pub(super) fn told_of(&self, classes: &[ClassId], passed: &[PassedOver], only_passed: bool) -> Vec<Place> {
         let mut listed = Vec::new();
         let mut passed: Vec<(&PassedOver, usize)> = passed.iter().map(|one| (one, LISTED_OF_PASSED)).collect();
         let mut texts = 0;
@@ -280,6 +280,8 @@ impl<Server: Clone + Eq, Client: Clone> WaitingLine<Server, Client> {
                     continue;
                 }
                 *left -= 1;
+            } else if only_passed {
+                continue;
             }
             texts += waiting.world.to_string().len() + waiting.user.as_ref().map_or(0, |user| user.len());
             if texts > MAX_TEXTS && !listed.is_empty() {
