@@ -110,7 +110,7 @@
 //! | `ServerMonitor` | when its server is removed from the configuration, or no name resolves to that server any more | the registry starts a new one |
 //! | mailer | never | it is restarted; the notices that it held are lost |
 //! | the tasks that look after slots, times and older processes (`simulation/app.rs`, `keep_up`) | never, or with the last older process | they are restarted |
-//! | `WebClient` | with its connection | its connection closes, and its session is notified |
+//! | `WebClient` | with its connection | its connection closes, and it leaves the line, or its session is notified |
 //! | `Session` | with its simulation, or its client | its slot is released, and its client is notified |
 //! | Webots | with its process tree; it is never restarted, its client is notified | its process tree is killed at once, its directory removed, its slot released |
 //!

@@ -58,7 +58,8 @@ struct Visitor<'class> {
     reloads: bool,
 }
 
-fn place(ticket: &str) -> (u64, u64) {
+/// The time of arrival in a ticket, and its number.
+pub(super) fn place(ticket: &str) -> (u64, u64) {
     let bytes = URL_SAFE_NO_PAD.decode(ticket).unwrap();
     let number = |at: usize| u64::from_be_bytes(bytes[at..at + 8].try_into().unwrap());
     (number(0), number(8))

@@ -6,14 +6,15 @@ use std::time::{Duration, Instant};
 use serde_json::json;
 use webots_fleet::shared::domain::{Offer, Offers, ReservationId};
 
+use super::fleet_line::place;
 use super::stand_in::{Manner, StandIn};
 use super::{times_logged, until_states};
-use crate::support::SOON;
 use crate::support::client::Client;
 use crate::support::git::arm;
 use crate::support::http::{PASSWORD, get_as_administrator};
 use crate::support::program::{Server, demo_server, session_server};
 use crate::support::reserving::ReservingServer;
+use crate::support::{SOON, until};
 
 const SECRET: &str = "a secret of this test";
 
@@ -132,4 +133,38 @@ async fn a_server_whose_slots_cant_be_asked_for_takes_its_turn_by_its_reports() 
         "{}",
         session.log()
     );
+}
+
+#[actix_rt::test]
+async fn who_asks_again_when_its_turn_comes_and_leaves_does_not_stay_in_the_line() {
+    let mut server = ReservingServer::start(1, 10.0).await;
+    let session = session_server(&[server.address.clone()])
+        .set("fleetKey", SECRET)
+        .set("loadThreshold", 1000)
+        .start()
+        .await;
+    until_states(&session, &["up"]).await;
+    let mut link = server.link().await;
+    // The turn meets the second request now and then.
+    for _ in 0..100 {
+        let mut client = Client::connect(&session.websocket("/session")).await;
+        let request = json!({"url": arm(), "wait": true}).to_string();
+        client.send(&request).await;
+        let (_, ticket) = place(&client.until("ticket: ").await.replace("ticket: ", ""));
+        let wishes = loop {
+            let wishes = link.wishes().await.unwrap();
+            if wishes.first.iter().any(|wish| wish.ticket == ticket) {
+                break wishes;
+            }
+            link.reserve(wishes.number, []).await;
+        };
+        link.reserve(wishes.number, [ticket]).await;
+        client.send(&request).await;
+        client.until("ticket: ").await;
+        client.leave().await;
+    }
+    until("nobody waits any more", async || {
+        session.status().await["line"]["waiting"] == 0
+    })
+    .await;
 }

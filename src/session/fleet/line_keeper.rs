@@ -26,10 +26,10 @@ pub struct Wait {
     pub world: ProjectUrl,
     /// The place that the client had.
     pub ticket: Option<Ticket>,
+    /// Identifies this wait: those of one connection follow each other.
+    pub number: u64,
     /// Receives what happens to the client.
     pub client: Recipient<LineEvent>,
-    /// Identifies its connection.
-    pub connection: u64,
     /// The client's address, if it is known.
     pub from: Option<IpAddr>,
     /// The client's user, if it is known.
@@ -38,15 +38,24 @@ pub struct Wait {
     pub label: Option<String>,
 }
 
-/// The client of this connection waits no longer, if it does. Another connection may have its place by now.
+/// This wait is over, if it is not yet. Another one may have its place by now.
 #[derive(Message, Debug)]
 #[rtype(result = "()")]
 pub struct StopWaiting(pub u64);
 
 /// What happens to a client in the line.
-#[derive(Message, Debug, Clone)]
+#[derive(Message, Debug)]
 #[rtype(result = "()")]
-pub enum LineEvent {
+pub struct LineEvent {
+    /// The wait to which it happens; the client may wait for something else by now.
+    pub wait: u64,
+    /// What happens.
+    pub news: LineNews,
+}
+
+/// What happens to a client in the line.
+#[derive(Debug)]
+pub enum LineNews {
     /// Its place, for which it needs a new ticket.
     Ticket(Place),
     /// How it stands.
@@ -57,9 +66,22 @@ pub enum LineEvent {
     TakenOver,
 }
 
+/// A wait, and who receives what happens to its client.
+#[derive(Clone)]
+struct Waiter {
+    wait: u64,
+    client: Recipient<LineEvent>,
+}
+
+impl Waiter {
+    fn tell(&self, news: LineNews) {
+        self.client.do_send(LineEvent { wait: self.wait, news });
+    }
+}
+
 /// The line, and how long clients have waited in it.
 pub(super) struct LineKeeper {
-    dispatcher: Dispatcher<PublicAddress, Recipient<LineEvent>>,
+    dispatcher: Dispatcher<PublicAddress, Waiter>,
     waited: Histogram,
     /// Whether this server has a key, for which others reserve slots.
     has_key: bool,
@@ -99,11 +121,14 @@ impl LineKeeper {
         if matches!(refused.reason, Reason::RepositoryNotAllowed | Reason::RepositoryBlocked) {
             return Err(refused);
         }
-        let client = wait.client;
+        let client = Waiter {
+            wait: wait.number,
+            client: wait.client,
+        };
         let entry = Entry {
             world: wait.world,
             client: client.clone(),
-            connection: wait.connection,
+            wait: wait.number,
             address: wait.from,
             user: wait.user,
             label: wait.label,
@@ -125,12 +150,12 @@ impl LineKeeper {
             .enter(wait.ticket, entry, number, is_up, terms, moment())
         {
             Entered::Again(turn) => {
-                client.do_send(LineEvent::Turn(turn));
+                client.tell(LineNews::Turn(turn));
                 Ok(None)
             }
             Entered::Waits(place, displaced) => {
                 for client in displaced {
-                    client.do_send(LineEvent::TakenOver);
+                    client.tell(LineNews::TakenOver);
                 }
                 Ok(Some(place))
             }
@@ -138,8 +163,8 @@ impl LineKeeper {
     }
 
     /// A client waits no longer.
-    pub(super) fn leave(&mut self, StopWaiting(connection): StopWaiting) {
-        self.dispatcher.leave(connection);
+    pub(super) fn leave(&mut self, StopWaiting(wait): StopWaiting) {
+        self.dispatcher.leave(wait);
     }
 
     /// Something has happened to the link of a server. What follows is up to [`Self::serve`].
@@ -199,10 +224,10 @@ impl LineKeeper {
         self.told = now;
         self.dispatcher.forget(now);
         for (client, progress) in self.dispatcher.news(now) {
-            client.do_send(LineEvent::Position(progress));
+            client.tell(LineNews::Position(progress));
         }
         for (client, place) in self.dispatcher.renewals(now) {
-            client.do_send(LineEvent::Ticket(place));
+            client.tell(LineNews::Ticket(place));
         }
     }
 
@@ -246,18 +271,18 @@ impl LineKeeper {
         let Served { turns, wishes } = served;
         self.give(turns, ready);
         for (client, progress) in self.dispatcher.first_news(now.instant) {
-            client.do_send(LineEvent::Position(progress));
+            client.tell(LineNews::Position(progress));
         }
         for (server, wishes) in wishes {
             servers.ask(&server, wishes);
         }
     }
 
-    fn give(&self, turns: Vec<(Recipient<LineEvent>, Turn<PublicAddress>)>, ready: &mut ReadyWorlds<PublicAddress>) {
+    fn give(&self, turns: Vec<(Waiter, Turn<PublicAddress>)>, ready: &mut ReadyWorlds<PublicAddress>) {
         for (client, turn) in turns {
             ready.place(&turn.server, &turn.world, Instant::now());
             self.waited.observe(turn.waited.as_secs_f64());
-            client.do_send(LineEvent::Turn(turn));
+            client.tell(LineNews::Turn(turn));
         }
     }
 }

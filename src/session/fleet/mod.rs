@@ -13,7 +13,7 @@ mod server_table;
 mod slot_link;
 mod state_history;
 
-pub use line_keeper::{LineEvent, StopWaiting, Wait};
+pub use line_keeper::{LineEvent, LineNews, StopWaiting, Wait};
 pub use ready_requests::ReadyRequests;
 pub use registry::{GetMonitors, GetStatus, GetWaiting, Pick, Reconfigure, Registry};
 pub use server_monitor::GetRecords;

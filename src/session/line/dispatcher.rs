@@ -171,9 +171,9 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
         is_up(&turn.server) && turn.pass.is_none_or(|pass| run == Some(pass.server))
     }
 
-    /// The client of a connection waits no longer.
-    pub fn leave(&mut self, connection: u64) {
-        self.line.leave(connection);
+    /// A wait is over.
+    pub fn leave(&mut self, wait: u64) {
+        self.line.leave(wait);
     }
 
     /// A server reserves slots from now on.
@@ -583,7 +583,7 @@ mod tests {
         Entry {
             world: ProjectUrl::parse(&world).unwrap(),
             client: number,
-            connection: number,
+            wait: number,
             address: None,
             user: None,
             label: None,

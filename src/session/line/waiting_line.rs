@@ -27,8 +27,8 @@ pub struct Entry<Client> {
     pub world: ProjectUrl,
     /// Receives what happens to it.
     pub client: Client,
-    /// Identifies its connection: it may come back on another one before the first has ended.
-    pub connection: u64,
+    /// Identifies its wait: it may come back, on another connection too, before this one is known to be over.
+    pub wait: u64,
     /// Its address, if that is known.
     pub address: Option<IpAddr>,
     /// Its user, if a trusted reverse proxy names one.
@@ -66,7 +66,7 @@ pub(super) struct Waiting<Client> {
     pub(super) group: Rc<Group>,
     pub(super) world: Arc<ProjectUrl>,
     pub(super) client: Client,
-    connection: u64,
+    wait: u64,
     address: Option<IpAddr>,
     user: Option<Arc<str>>,
     /// What it heard last, and when.
@@ -75,13 +75,12 @@ pub(super) struct Waiting<Client> {
     ticket: Instant,
 }
 
-/// The clients that wait. Everything about one of them is in one entry, and in the indices by number, connection and
-/// user.
+/// The clients that wait. Everything about one of them is in one entry, and in the indices by number, wait and user.
 #[derive(Debug)]
 pub(super) struct WaitingLine<Server, Client> {
     waiting: BTreeMap<Place, Waiting<Client>>,
     since: HashMap<u64, u64>,
-    connections: HashMap<u64, Place>,
+    waits: HashMap<u64, Place>,
     users: HashMap<Arc<str>, Place>,
     /// The groups of those who wait by their repositories, each with the number of them.
     groups: HashMap<String, (Rc<Group>, u32)>,
@@ -93,7 +92,7 @@ impl<Server, Client> Default for WaitingLine<Server, Client> {
         Self {
             waiting: BTreeMap::new(),
             since: HashMap::new(),
-            connections: HashMap::new(),
+            waits: HashMap::new(),
             users: HashMap::new(),
             groups: HashMap::new(),
             classes: Classes::default(),
@@ -158,14 +157,14 @@ impl<Server: Clone + Eq, Client: Clone> WaitingLine<Server, Client> {
             group: Rc::clone(group),
             world,
             client: entry.client,
-            connection: entry.connection,
+            wait: entry.wait,
             address: entry.address,
             user: user.clone(),
             heard: None,
             ticket: now,
         };
         self.since.insert(first.number, first.since);
-        self.connections.insert(entry.connection, first);
+        self.waits.insert(entry.wait, first);
         if let Some(user) = user {
             self.users.insert(user, first);
         }
@@ -173,9 +172,9 @@ impl<Server: Clone + Eq, Client: Clone> WaitingLine<Server, Client> {
         (first, displaced)
     }
 
-    /// Removes the client of a connection, if it waits. Another connection may have its place by now.
-    pub(super) fn leave(&mut self, connection: u64) {
-        if let Some(place) = self.connections.get(&connection) {
+    /// Removes the client of a wait, if that is not over. Another one may have its place by now.
+    pub(super) fn leave(&mut self, wait: u64) {
+        if let Some(place) = self.waits.get(&wait) {
             self.remove(*place);
         }
     }
@@ -184,7 +183,7 @@ impl<Server: Clone + Eq, Client: Clone> WaitingLine<Server, Client> {
     pub(super) fn remove(&mut self, place: Place) -> Option<Waiting<Client>> {
         let waiting = self.waiting.remove(&place)?;
         self.since.remove(&place.number);
-        self.connections.remove(&waiting.connection);
+        self.waits.remove(&waiting.wait);
         if let Some(user) = &waiting.user {
             self.users.remove(user);
         }
@@ -400,7 +399,7 @@ mod tests {
         Entry {
             world: ProjectUrl::parse(&format!("https://github.com/{repository}/blob/main/worlds/a.wbt")).unwrap(),
             client,
-            connection: client.into(),
+            wait: client.into(),
             address: None,
             user: user.map(str::to_owned),
             label: None,
@@ -461,7 +460,7 @@ mod tests {
         line.leave(6);
         line.leave(3);
         assert!(line.waiting.is_empty() && line.since.is_empty() && line.users.is_empty() && line.groups.is_empty());
-        assert!(line.connections.is_empty() && line.classes.occupied() == 0);
+        assert!(line.waits.is_empty() && line.classes.occupied() == 0);
     }
 
     #[test]

@@ -4,7 +4,6 @@
 //! latest value, and never the same twice in a row. A text from the client requests a simulation server, at once or when
 //! it is its turn in the line.
 
-use std::hash::{DefaultHasher, Hash, Hasher};
 use std::sync::Arc;
 
 use actix::prelude::*;
@@ -17,10 +16,10 @@ use serde_json::Value;
 use tokio::sync::watch;
 
 use super::refusal;
-use crate::session::fleet::{LineEvent, StopWaiting, Wait};
+use crate::session::fleet::{LineEvent, LineNews, StopWaiting, Wait};
 use crate::session::line::{Place, Position, Ticket};
 use crate::session::state::{AppState, PLACED, read_world};
-use crate::shared::domain::{Failure, ProjectUrl, Reason};
+use crate::shared::domain::{Failure, Reason};
 use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::websocket::wrong_message;
 use crate::shared::http::{ConnectionPermit, Peer};
@@ -36,8 +35,6 @@ pub struct WebClient {
     user: Option<String>,
     /// Whether it has requested announcements.
     wants_announcements: bool,
-    /// Identifies this connection in the line.
-    connection: u64,
     /// What it heard last of its place in the line, if it has one.
     waiting: Option<Waiting>,
     _permit: ConnectionPermit,
@@ -45,8 +42,8 @@ pub struct WebClient {
 
 /// A client that waits in the line.
 struct Waiting {
-    /// The hash of the world that it waits for: the world itself is kept once, in the line.
-    world: u64,
+    /// Identifies this wait in the line.
+    number: u64,
     /// The seconds until its turn, as last sent.
     estimate: Option<u32>,
     /// Whether it understands a text with the reason before that of an error.
@@ -69,7 +66,6 @@ impl WebClient {
             user,
             liveness: Liveness::default(),
             wants_announcements,
-            connection: rand::random(),
             waiting: None,
             _permit: permit,
         }
@@ -115,16 +111,17 @@ impl WebClient {
             Ok(world) => world,
             Err(failure) => return Self::refuse(&failure, request.wants_reason, ctx),
         };
+        let number = rand::random();
         self.waiting = Some(Waiting {
-            world: hash(&world),
+            number,
             estimate: None,
             wants_reason: request.wants_reason,
         });
         let wait = Wait {
             world,
             ticket: ticket.and_then(|text| Ticket::read(text, &self.server.key, milliseconds_since_1970())),
+            number,
             client: ctx.address().recipient(),
-            connection: self.connection,
             from: self.peer.rate_limit_key(),
             user: self.user.clone(),
             label: request.name.clone(),
@@ -146,8 +143,8 @@ impl WebClient {
 
     /// Leaves the line, also if the registry has not answered yet: it handles what it was asked before first.
     fn stop_waiting(&mut self) {
-        if self.waiting.take().is_some() {
-            self.server.registry.do_send(StopWaiting(self.connection));
+        if let Some(waiting) = self.waiting.take() {
+            self.server.registry.do_send(StopWaiting(waiting.number));
         }
     }
 
@@ -165,12 +162,6 @@ impl WebClient {
         }
         ctx.text(refusal::sentence(failure));
     }
-}
-
-fn hash(world: &ProjectUrl) -> u64 {
-    let mut hasher = DefaultHasher::new();
-    world.hash(&mut hasher);
-    hasher.finish()
 }
 
 /// What a client's text requests.
@@ -243,8 +234,10 @@ impl Actor for WebClient {
             ctx.add_stream(announcements(self.server.announcement.subscribe()));
         }
     }
+}
 
-    fn stopped(&mut self, _: &mut Self::Context) {
+impl Drop for WebClient {
+    fn drop(&mut self) {
         self.stop_waiting();
     }
 }
@@ -252,21 +245,21 @@ impl Actor for WebClient {
 impl Handler<LineEvent> for WebClient {
     type Result = ();
 
-    fn handle(&mut self, event: LineEvent, ctx: &mut Context) {
-        // It has left the line meanwhile.
-        let Some(waiting) = &mut self.waiting else { return };
-        match event {
-            LineEvent::Ticket(place) => self.send_ticket(place, ctx),
-            LineEvent::Position(Position { ahead, estimate }) => {
+    fn handle(&mut self, LineEvent { wait, news }: LineEvent, ctx: &mut Context) {
+        // It has left the line meanwhile, or waits for something else.
+        let Some(waiting) = self.waiting.as_mut().filter(|waiting| waiting.number == wait) else {
+            return;
+        };
+        match news {
+            LineNews::Ticket(place) => self.send_ticket(place, ctx),
+            LineNews::Position(Position { ahead, estimate }) => {
                 ctx.text(format!("queue: {ahead}"));
                 if let Some(seconds) = estimate.filter(|_| waiting.estimate != estimate) {
                     ctx.text(format!("estimate: {seconds}"));
                 }
                 waiting.estimate = estimate;
             }
-            // It has asked for another world meanwhile.
-            LineEvent::Turn(turn) if hash(&turn.world) != waiting.world => {}
-            LineEvent::Turn(turn) => {
+            LineNews::Turn(turn) => {
                 if let Some(pass) = turn.pass {
                     ctx.text(format!("pass: {}", pass.write(&self.server.key, &turn.world)));
                 }
@@ -274,7 +267,7 @@ impl Handler<LineEvent> for WebClient {
                 self.server.picks.with_label_values(&[PLACED]).inc();
                 self.waiting = None;
             }
-            LineEvent::TakenOver => {
+            LineNews::TakenOver => {
                 let words = "another connection has this place in the line";
                 Self::refuse(&Failure::new(Reason::TakenOver, words), waiting.wants_reason, ctx);
                 self.waiting = None;
