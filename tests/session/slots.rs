@@ -136,6 +136,33 @@ async fn a_server_whose_slots_cant_be_asked_for_takes_its_turn_by_its_reports() 
 }
 
 #[actix_rt::test]
+async fn idle_time_is_shared_up_to_the_load_that_a_server_will_have() {
+    let mut server = ReservingServer::start(100, 10.0).await;
+    let report = |load: f64, running: u32| {
+        server.report_also(json!({"load": load, "docker": true, "shareIdleTime": 50,
+            "allowedRepositories": ["https://github.com/school"],
+            "instances": {"running": running, "places": 100}}));
+    };
+    report(70.0, 10);
+    let session = session_server(&[server.address.clone()])
+        .set("fleetKey", SECRET)
+        .start()
+        .await;
+    until_states(&session, &["up"]).await;
+    let mut clients = Vec::new();
+    for _ in 0..12 {
+        clients.push(enter(&session).await);
+    }
+    // Ten have left, and the load shows them for five seconds more. A client costs 2 %.
+    report(55.0, 0);
+    let mut link = server.link().await;
+    let wishes = link.wishes().await.unwrap();
+    link.reserve(wishes.number, [wishes.first[0].ticket]).await;
+    clients[0].within("pass: ", SOON).await;
+    assert!(wishes.first.len() < clients.len(), "{wishes:?}");
+}
+
+#[actix_rt::test]
 async fn who_asks_again_when_its_turn_comes_and_leaves_does_not_stay_in_the_line() {
     let mut server = ReservingServer::start(1, 10.0).await;
     let session = session_server(&[server.address.clone()])

@@ -14,6 +14,7 @@ use super::server_monitor::{Ask, GetRecords, Parent, ServerMonitor, Stop};
 use super::server_record::ServerRecord;
 use super::slot_link::{LinkChange, LinkEvent};
 use crate::session::config::SessionConfig;
+use crate::session::line::Terms;
 use crate::session::placement::{LoadBalancer, ReadyWorlds};
 use crate::shared::domain::{
     Admission, Failure, KeepReady, Load, ProjectUrl, PublicAddress, ToSimulationServer, Wishes,
@@ -173,13 +174,14 @@ pub fn admission(
     }
 }
 
-/// On what terms a server takes a client for a world at the load of its last report.
-pub fn terms(
-    records: &HashMap<PublicAddress, ServerRecord>,
-) -> impl Fn(&PublicAddress, &ProjectUrl) -> Option<Admission> {
+/// On what terms a server takes a client for a world, by its last report.
+pub fn terms(records: &HashMap<PublicAddress, ServerRecord>) -> impl Fn(&PublicAddress, &ProjectUrl) -> Option<Terms> {
     |server, world| {
-        let answer = records.get(server)?.state.last_answer()?;
-        answer.report.check(world, answer.report.load).ok()
+        let report = &records.get(server)?.state.last_answer()?.report;
+        Some(Terms {
+            admission: report.check(world, Load::ZERO).ok()?,
+            is_open: report.check(world, report.load).is_ok(),
+        })
     }
 }
 

@@ -10,6 +10,15 @@ use std::sync::Arc;
 use super::rate::Basis;
 use crate::shared::domain::{Admission, ProjectUrl};
 
+/// On what terms a server takes a world.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Terms {
+    /// By its rules alone, whatever its load.
+    pub admission: Admission,
+    /// Whether it does at the load that it has reported: who waits for its idle time is ahead of nobody until then.
+    pub is_open: bool,
+}
+
 /// The worlds of one repository: each server accepts all of them, or none.
 #[derive(Debug)]
 pub(super) struct Group {
@@ -32,8 +41,8 @@ pub(super) struct Class {
     /// Number of those who wait.
     pub(super) waiting: u32,
     /// The terms of each server, in the order of [`Classes::servers`].
-    terms: Vec<Option<Admission>>,
-    /// The classes that some server takes too, and itself.
+    terms: Vec<Option<Terms>>,
+    /// The classes that some server takes too at its load, and itself.
     competitors: Vec<ClassId>,
 }
 
@@ -64,23 +73,20 @@ impl<Server> Default for Classes<Server> {
 
 impl<Server: Clone + Eq> Classes<Server> {
     /// The class of a world. `terms` is on what terms a server takes it.
-    pub(super) fn of(
-        &mut self,
-        world: &ProjectUrl,
-        terms: impl Fn(&Server, &ProjectUrl) -> Option<Admission>,
-    ) -> ClassId {
+    pub(super) fn of(&mut self, world: &ProjectUrl, terms: impl Fn(&Server, &ProjectUrl) -> Option<Terms>) -> ClassId {
         let terms = self.servers.iter().map(|server| terms(server, world)).collect();
         self.with_terms(terms, world)
     }
 
-    fn with_terms(&mut self, terms: Vec<Option<Admission>>, world: &ProjectUrl) -> ClassId {
+    fn with_terms(&mut self, terms: Vec<Option<Terms>>, world: &ProjectUrl) -> ClassId {
         if let Some(known) = self.all.iter().position(|class| class.terms == terms) {
             return known;
         }
         let new = self.all.len();
+        let is_open = |terms: &Option<Terms>| terms.is_some_and(|terms| terms.is_open);
         let is_shared = |other: &Class| {
             let both = other.terms.iter().zip(&terms);
-            both.into_iter().any(|(other, own)| other.is_some() && own.is_some())
+            both.into_iter().any(|(other, own)| is_open(other) && is_open(own))
         };
         let mut competitors = vec![new];
         for (id, other) in self.all.iter_mut().enumerate() {
@@ -103,7 +109,7 @@ impl<Server: Clone + Eq> Classes<Server> {
         &mut self,
         servers: &[Server],
         groups: impl Iterator<Item = (&'line Rc<Group>, u32)>,
-        terms: impl Fn(&Server, &ProjectUrl) -> Option<Admission>,
+        terms: impl Fn(&Server, &ProjectUrl) -> Option<Terms>,
     ) {
         servers.clone_into(&mut self.servers);
         self.classify(groups, |server, world, _| terms(server, world));
@@ -114,7 +120,7 @@ impl<Server: Clone + Eq> Classes<Server> {
         &mut self,
         changed: &Server,
         groups: impl Iterator<Item = (&'line Rc<Group>, u32)>,
-        terms: impl Fn(&Server, &ProjectUrl) -> Option<Admission>,
+        terms: impl Fn(&Server, &ProjectUrl) -> Option<Terms>,
     ) {
         let of = |server: &Server, world: &ProjectUrl, before| {
             if server == changed {
@@ -130,7 +136,7 @@ impl<Server: Clone + Eq> Classes<Server> {
     fn classify<'line>(
         &mut self,
         groups: impl Iterator<Item = (&'line Rc<Group>, u32)>,
-        terms: impl Fn(&Server, &ProjectUrl, Option<Admission>) -> Option<Admission>,
+        terms: impl Fn(&Server, &ProjectUrl, Option<Terms>) -> Option<Terms>,
     ) {
         let before = std::mem::take(&mut self.all);
         for (group, waiting) in groups {
@@ -175,11 +181,21 @@ impl<Server: Clone + Eq> Classes<Server> {
         self.all.iter().filter(|class| class.waiting > 0).count()
     }
 
-    /// The servers that take a class.
+    /// Whether a server takes a class by its rules.
+    pub(super) fn may_use(&self, class: ClassId, server: &Server) -> bool {
+        self.terms_of(class).any(|(one, _)| one == server)
+    }
+
+    /// The servers that take a class at the load that they have reported.
     pub(super) fn servers_of(&self, class: ClassId) -> impl Iterator<Item = &Server> {
+        let open = self.terms_of(class).filter(|(_, terms)| terms.is_open);
+        open.map(|(server, _)| server)
+    }
+
+    fn terms_of(&self, class: ClassId) -> impl Iterator<Item = (&Server, &Terms)> {
         let terms = self.all.get(class).map(|class| class.terms.as_slice());
         let all = self.servers.iter().zip(terms.unwrap_or_default());
-        all.filter(|(_, terms)| terms.is_some()).map(|(server, _)| server)
+        all.filter_map(|(server, terms)| Some((server, terms.as_ref()?)))
     }
 
     /// Number of clients ahead that compete with one of this class, if `ahead` are those ahead by class.

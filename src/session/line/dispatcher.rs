@@ -8,7 +8,7 @@ use std::hash::Hash;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use super::classes::{ClassId, Classes, Doors};
+use super::classes::{ClassId, Classes, Doors, Terms};
 use super::link::Link;
 use super::rate::{Basis, Rate};
 use super::ticket::Ticket;
@@ -138,7 +138,7 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
         entry: Entry<Client>,
         number: u64,
         is_up: impl Fn(&Server) -> bool,
-        terms: impl Fn(&Server, &ProjectUrl) -> Option<Admission>,
+        terms: impl Fn(&Server, &ProjectUrl) -> Option<Terms>,
         now: Moment,
     ) -> Entered<Server, Client> {
         let mut place = Place {
@@ -187,7 +187,7 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
     }
 
     /// The fleet consists of these servers now. `terms` is on what terms one takes a world by its last report.
-    pub fn set_servers(&mut self, servers: &[Server], terms: impl Fn(&Server, &ProjectUrl) -> Option<Admission>) {
+    pub fn set_servers(&mut self, servers: &[Server], terms: impl Fn(&Server, &ProjectUrl) -> Option<Terms>) {
         let known: HashSet<&Server> = servers.iter().collect();
         self.links.retain(|server, _| known.contains(server));
         self.rates.retain(|server, _| known.contains(server));
@@ -195,7 +195,7 @@ impl<Server: Clone + Eq + Hash, Client: Clone> Dispatcher<Server, Client> {
     }
 
     /// A server takes other worlds now, or on other terms.
-    pub fn rules_changed(&mut self, server: &Server, terms: impl Fn(&Server, &ProjectUrl) -> Option<Admission>) {
+    pub fn rules_changed(&mut self, server: &Server, terms: impl Fn(&Server, &ProjectUrl) -> Option<Terms>) {
         self.line.rules_changed(server, terms);
     }
 
@@ -572,9 +572,13 @@ mod tests {
         }
     }
 
-    fn terms(servers: &[FakeServer]) -> impl Fn(&usize, &ProjectUrl) -> Option<Admission> + use<> {
+    fn terms(servers: &[FakeServer]) -> impl Fn(&usize, &ProjectUrl) -> Option<Terms> + use<> {
         let accepts = accepts(servers);
-        move |server, world| accepts(server, world).then_some(Admission::Dedicated)
+        let terms = Terms {
+            admission: Admission::Dedicated,
+            is_open: true,
+        };
+        move |server, world| accepts(server, world).then_some(terms)
     }
 
     /// A client that wants a world of this owner.

@@ -16,6 +16,7 @@ mod rate;
 mod ticket;
 mod waiting_line;
 
+pub use classes::Terms;
 pub use dispatcher::{Dispatcher, Entered, LineStatus, Moment, Served, Turn, WaitingFor};
 pub use ticket::Ticket;
 pub use waiting_line::{Entry, Place, Position, WaitingClient};

@@ -7,9 +7,9 @@ use std::rc::Rc;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use super::classes::{ClassId, Classes, Doors, Group};
+use super::classes::{ClassId, Classes, Doors, Group, Terms};
 use super::rate::estimate;
-use crate::shared::domain::{Admission, PassedOver, ProjectUrl, Wish};
+use crate::shared::domain::{PassedOver, ProjectUrl, Wish};
 
 /// A place in the line. Places sort by the time of arrival.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -120,7 +120,7 @@ impl<Server: Clone + Eq, Client: Clone> WaitingLine<Server, Client> {
         &mut self,
         place: Place,
         entry: Entry<Client>,
-        terms: impl Fn(&Server, &ProjectUrl) -> Option<Admission>,
+        terms: impl Fn(&Server, &ProjectUrl) -> Option<Terms>,
         now: Instant,
     ) -> (Place, Vec<Client>) {
         let user: Option<Arc<str>> = entry.user.map(Arc::from);
@@ -207,7 +207,7 @@ impl<Server: Clone + Eq, Client: Clone> WaitingLine<Server, Client> {
     pub(super) fn place_at(&self, server: &Server, number: u64) -> Option<Place> {
         let place = self.place_of(number)?;
         let class = self.waiting.get(&place)?.group.class.get();
-        self.classes.servers_of(class).any(|one| one == server).then_some(place)
+        self.classes.may_use(class, server).then_some(place)
     }
 
     /// All who wait, in order, for administrators.
@@ -246,17 +246,13 @@ impl<Server: Clone + Eq, Client: Clone> WaitingLine<Server, Client> {
     }
 
     /// The fleet consists of these servers now.
-    pub(super) fn set_servers(
-        &mut self,
-        servers: &[Server],
-        terms: impl Fn(&Server, &ProjectUrl) -> Option<Admission>,
-    ) {
+    pub(super) fn set_servers(&mut self, servers: &[Server], terms: impl Fn(&Server, &ProjectUrl) -> Option<Terms>) {
         let groups = self.groups.values().map(|(group, count)| (group, *count));
         self.classes.set_servers(servers, groups, terms);
     }
 
     /// A server has other rules now.
-    pub(super) fn rules_changed(&mut self, server: &Server, terms: impl Fn(&Server, &ProjectUrl) -> Option<Admission>) {
+    pub(super) fn rules_changed(&mut self, server: &Server, terms: impl Fn(&Server, &ProjectUrl) -> Option<Terms>) {
         let groups = self.groups.values().map(|(group, count)| (group, *count));
         self.classes.rules_changed(server, groups, terms);
     }
@@ -394,6 +390,7 @@ fn progress<Server: Clone + Eq>(
 mod tests {
     use super::*;
     use crate::session::line::rate::Basis;
+    use crate::shared::domain::Admission;
 
     fn entry(repository: &str, client: u32, user: Option<&str>) -> Entry<u32> {
         Entry {
@@ -421,8 +418,11 @@ mod tests {
         clippy::trivially_copy_pass_by_ref,
         reason = "the terms of a server"
     )]
-    fn takes_all(_: &u32, _: &ProjectUrl) -> Option<Admission> {
-        Some(Admission::Dedicated)
+    fn takes_all(_: &u32, _: &ProjectUrl) -> Option<Terms> {
+        Some(Terms {
+            admission: Admission::Dedicated,
+            is_open: true,
+        })
     }
 
     fn clients(line: &WaitingLine<u32, u32>) -> Vec<u32> {
