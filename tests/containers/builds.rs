@@ -223,9 +223,13 @@ async fn on_a_quiet_machine_of_several_builds_the_one_that_fills_the_disk_ends()
     }
     // Nobody else may write as much meanwhile.
     let server = server(2).set("diskReserve", free - 1000);
+    // The modest one goes on until the other has ended.
     for (branch, line) in [
         ("greedy", "RUN fallocate -l 1500M /file && sleep 60"),
-        ("modest", "RUN fallocate -l 20M /file && sleep 20"),
+        (
+            "modest",
+            "LABEL test.modest=yes\nRUN fallocate -l 20M /file && until [ -e /done ]; do sleep 0.1; done",
+        ),
     ] {
         server
             .forge()
@@ -233,12 +237,15 @@ async fn on_a_quiet_machine_of_several_builds_the_one_that_fills_the_disk_ends()
     }
     let server = server.start().await;
     let mut modest = Client::start(&server, &arm_at("modest")).await;
-    modest.patiently("loading: Step 4/6").await;
+    modest.patiently("loading: Step 5/7").await;
     let mut greedy = Client::start(&server, &arm_at("greedy")).await;
     greedy.patiently("loading: Error:").await;
     assert_eq!(greedy.reason()["code"], "image-too-large");
     assert_eq!(greedy.closed().await, Some(1000));
     assert_eq!(server.status().await["failedStarts"], 0);
+    let build = ask(&["ps", "--quiet", "--filter", "label=test.modest=yes"]);
+    assert!(!build.is_empty(), "the modest one was ended too");
+    ask(&["exec", &build, "touch", "/done"]);
     modest.patiently("webots:").await;
 }
 
