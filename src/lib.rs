@@ -19,7 +19,7 @@
 //! | [`session::web`] | routes, pages, `/status`, Prometheus metrics (gauges in `metrics`, counters and histograms in `app`) and the WebSocket of the session server with its messages (`web_client`: `Request` is what comes in, its handlers and `updates` write what goes out) |
 //! | [`simulation::process`] | process trees: how they start and end (`process_group`: SIGTERM, grace period, SIGKILL; leftovers of a dead server: `process_tree`, `guardian`; what has left the group ends with its control group or its containers, see `simulation::isolation` and `simulation::container`); directories of simulations |
 //! | [`simulation::machine`] | readings of the machine (`sensors`) and its GPUs (`gpus`), the load that follows from them (`sensors`), its mean and `monitor.csv` (`load_monitor`), what each simulation uses (`usage`); which GPU a simulation gets if they are spread over several (`spread`) |
-//! | [`simulation::checkout`] | worlds checked out with git; `timing.checkout` limits a whole checkout (`checkout_service`), each git command, and by a quarter of it a silent remote (`git`); `projectSize` limits its size; the simulation server's `config/mirrors` has GitHub's address and the other Git hosts (`gitMirrors`) |
+//! | [`simulation::checkout`] | worlds checked out with git; `timing.checkout` limits a whole checkout (`checkout_service`), each git command, and by a quarter of it a silent remote (`Git::command`, in `git`); `projectSize` limits its size; the simulation server's `config/mirrors` has GitHub's address and the other Git hosts (`gitMirrors`) |
 //! | `simulation::isolation` | how a simulation is launched: its level of isolation (`launcher`), the variables that it inherits, limits; the GPUs that a sandbox shows (`devices` in `sandbox`); the control group that ends with it (`cgroup`) |
 //! | [`simulation::container`] | simulations in containers: what a project requests, its image, its compose project (`compose_project`, with its GPU and user) |
 //! | [`simulation::ends`] | how simulations have ended: counter, table, their logs (`kept_output`); for which reasons an end can be requested (`stop_reason`) |
@@ -30,7 +30,7 @@
 //! | [`simulation::slots`] | the slots that clients wait for: the slot of a simulation (`slot`), its states and what pages show of them (`simulation_record`), the queue and the shares of addresses and users (`slot_pool`), those that are reserved for the line of session servers (`reservations`), how many run in real time (`real_time_places`), the streams of simulations and the tokens that identify them (`stream`) |
 //! | [`simulation::spare_wishes`] | which worlds are kept ready before clients ask for them, and how many; the actor that does it is `spare_keeper` in [`simulation::client`], a spare's slot is in `spare` of [`simulation::slots`] |
 //! | `simulation::relay` | a stream between a client and the port of its Webots; what a watcher may send (`watcher`) |
-//! | `simulation::web` | routes, pages (also the one on which an administrator watches a simulation: `page_routes`), `/status` and Prometheus metrics of the simulation server (gauges in `metrics`, counters and histograms in `app` and `ends`) |
+//! | `simulation::web` | routes, pages (also the one on which an administrator watches a simulation: `page_routes`; its stream: see *watcher* below), `/status` and Prometheus metrics of the simulation server (gauges in `metrics`, counters and histograms in `app` and `ends`) |
 //!
 //! The HTML of pages is in `templates/session` and `templates/simulation` (in each, `monitor.html`: the head of the
 //! monitor's table, `row.html`: a row), their styles (`style.css`) and scripts in `templates/assets`. A column of
@@ -39,7 +39,7 @@
 //!
 //! Each server also has a directory `config` (keys: `session_config`, `simulation_config`; nested ones: the file of their group, such as `timing`;
 //! `docs/configuration.md` lists all), its `app` (start and end) and its `state` (what its routes share). Files of
-//! `simulation` are the [`protocol`](simulation::protocol) with the texts of messages to clients (except the reason in
+//! `simulation` are the [`protocol`](simulation::protocol) with the texts of messages to clients, which `client/session` sends (except the reason in
 //! an error and the [`progress`](simulation::progress) of a start, which their causes define: a checkout's is in
 //! `checkout/steps`), the `snapshot` of all simulations, the `simulation_id`, the `run_id` of a
 //! process, the `simulated_time`, the `client_identity`, the `announcer` (key `notify`), `preflight`
