@@ -118,11 +118,6 @@ start "${CARGO[@]}" --test integration --test faults on_a_quiet_machine -- --tes
 finish "${CARGO[@]}" --test integration --test faults on_a_quiet_machine -- --test-threads=1
 start tests/own_network.sh "${CARGO[@]}" --test containers on_a_quiet_machine
 finish tests/own_network.sh "${CARGO[@]}" --test containers on_a_quiet_machine
-drawing='env QUIET_MACHINE=1 tests/browser/run test_embedding.PrintedPages.test_on_a_quiet_machine_it_is_drawn_within_100_ms'
-# shellcheck disable=SC2086
-start $drawing
-# shellcheck disable=SC2086
-finish $drawing
 rm "$logs/busy"
 [[ -n ${jobs[tests/swarm.sh]-} ]] || start tests/swarm.sh
 # The guide mostly unpacks packages with apt, while the Swarm test waits.
