@@ -53,7 +53,8 @@ async fn whoever_joins_a_world_that_is_being_loaded_gets_its_scene() {
             let stage = Stage::new();
             let webots = Webots::launcher();
             let files = [
-                ("worlds/a.wbt", &*slow("download=0.6 load=1")),
+                // Long enough that a busy machine asks while it downloads.
+                ("worlds/a.wbt", &*slow("download=2 load=1")),
                 ("worlds/b.wbt", &*slow("load=0.5")),
             ];
             stage.forge.commit("lab/arm", "slow", &files);
