@@ -65,7 +65,7 @@ async fn whoever_joins_a_world_that_is_being_loaded_gets_its_scene() {
                 .set("sandbox.network", network)
                 .set("streaming", streaming)
                 .set("timing.heartbeat", 0.1)
-                .set("hangLimit", 0.2);
+                .set("hangLimit", 1);
             whole_way(builder).await;
         }
     }
