@@ -384,6 +384,7 @@ fn load(folder: &std::path::Path, tag: &str, owner: &str, created: &str) {
         .output()
         .unwrap();
     let name = image(tag);
+    // Projects give their images labels of any size.
     let created = String::from_utf8(time.stdout).unwrap().trim().to_owned();
     let files = folder.join("image");
     std::fs::create_dir_all(&files).unwrap();
@@ -392,7 +393,7 @@ fn load(folder: &std::path::Path, tag: &str, owner: &str, created: &str) {
     let layer = "sha256:5f70bf18a086007016e948b04aed3b82103a36bea41755b6cddfaf10ace3c6ef";
     let config = serde_json::json!({
         "architecture": "amd64", "os": "linux", "created": created, "author": name,
-        "config": {"Labels": {"webots-fleet.owner": owner}}, "rootfs": {"type": "layers", "diff_ids": [layer]},
+        "config": {"Labels": {"webots-fleet.owner": owner, "large": "x".repeat(1 << 20)}}, "rootfs": {"type": "layers", "diff_ids": [layer]},
     });
     std::fs::write(files.join("config.json"), config.to_string()).unwrap();
     let manifest = serde_json::json!([{"Config": "config.json", "RepoTags": [name], "Layers": ["layer.tar"]}]);

@@ -19,6 +19,7 @@ use crate::shared::run::closing;
 use crate::simulation::attachment::{ClientAction, Connection, NewClient, ToClient, Token};
 use crate::simulation::checkout::Project;
 use crate::simulation::client_identity::ClientIdentity;
+use crate::simulation::container::ImageUse;
 use crate::simulation::ends::{StopReason, lost};
 use crate::simulation::progress::Progress;
 use crate::simulation::protocol;
@@ -60,8 +61,8 @@ pub(super) struct Expected {
 #[derive(Message, Debug)]
 #[rtype(result = "()")]
 pub enum SpareEvent {
-    /// One is ready.
-    Ready(SpareKind),
+    /// One is ready, in a container with these images.
+    Ready(SpareKind, Vec<ImageUse>),
     /// One has failed to start, or has ended although nobody has asked for that.
     Failed(SpareKind, Failure),
 }
@@ -428,6 +429,7 @@ impl Session {
             // It has ended meanwhile.
             other => return self.state = other,
         };
+        let project = launched.project.upgrade();
         self.state = State::Ready(ReadySimulation {
             launched,
             port,
@@ -437,7 +439,13 @@ impl Session {
             arrival: Arrival::Settled,
         });
         match &self.client {
-            Client::Expected(Expected { kind, keeper }) => keeper.do_send(SpareEvent::Ready(kind.clone())),
+            Client::Expected(Expected { kind, keeper }) => {
+                // A Git host may have redirected from the listed world to this one.
+                let images = project
+                    .zip(self.server.containers.as_ref())
+                    .map(|(project, containers)| containers.keep_images_of(&project.url));
+                keeper.do_send(SpareEvent::Ready(kind.clone(), images.unwrap_or_default()));
+            }
             Client::Connected(_) | Client::Away(_) => {
                 self.server.failed_starts.reset();
                 self.hand_over(ctx);

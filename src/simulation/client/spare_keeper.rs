@@ -294,9 +294,9 @@ impl SpareKeeper {
     }
 
     /// One of this world is ready.
-    fn is_ready(&mut self, kind: &SpareKind) {
-        if let Some((world, containers)) = self.worlds.get_mut(kind).zip(self.server.containers.as_ref()) {
-            world.images = containers.keep_images_of(&kind.world);
+    fn is_ready(&mut self, kind: &SpareKind, images: Vec<ImageUse>) {
+        if let Some(world) = self.worlds.get_mut(kind) {
+            world.images = images;
         }
         self.server.spare_wishes.set_problem(kind, None);
     }
@@ -380,7 +380,7 @@ impl Handler<SpareEvent> for SpareKeeper {
 
     fn handle(&mut self, event: SpareEvent, _: &mut Self::Context) {
         match event {
-            SpareEvent::Ready(kind) => self.is_ready(&kind),
+            SpareEvent::Ready(kind, images) => self.is_ready(&kind, images),
             SpareEvent::Failed(kind, failure) => self.failed(&kind, &failure),
         }
     }

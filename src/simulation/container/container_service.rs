@@ -122,7 +122,10 @@ impl ContainerService {
                 .pull(&self.config.container.editor_image, address, progress)
                 .await?;
         }
-        self.images.store.used_for(&project.url, &kept);
+        // It has no client: it is kept ready.
+        if address.is_none() {
+            self.images.store.used_for(&project.url, &kept);
+        }
         let compose = ComposeProject {
             name: guard.name.clone(),
             request,
@@ -170,7 +173,7 @@ impl ContainerService {
         })
     }
 
-    /// Keeps the images that the last simulation of a world has had, until the returned values are dropped.
+    /// Keeps the images that the last simulation of a world that is kept ready has had, until the returned values are dropped.
     pub fn keep_images_of(&self, world: &ProjectUrl) -> Vec<ImageUse> {
         self.images.store.keep_for(world)
     }

@@ -28,7 +28,7 @@ pub struct ImageStore {
     owner: ResourceOwner,
     config: Arc<SimulationConfig>,
     uses: Arc<Mutex<HashMap<String, Use>>>,
-    /// The images of the last simulation of each world.
+    /// The images of the last simulation of each world that is kept ready.
     worlds: Mutex<HashMap<ProjectUrl, Vec<String>>>,
     /// Images that were not there, and are pulled, or will be by a build.
     expected: Mutex<HashSet<String>>,
@@ -37,7 +37,7 @@ pub struct ImageStore {
 }
 
 /// The uses of an image in this run of the server.
-#[derive(Default)]
+#[derive(Debug, Default)]
 struct Use {
     /// Number of builds and simulations that need it now, and have no container of it yet.
     now: usize,
@@ -46,6 +46,7 @@ struct Use {
 }
 
 /// The use of an image, which is not removed meanwhile. Dropping it ends the use.
+#[derive(Debug)]
 pub struct ImageUse {
     name: String,
     uses: Arc<Mutex<HashMap<String, Use>>>,
@@ -61,8 +62,8 @@ struct Image {
     built: u64,
     /// When it got its last name, in seconds since 1970.
     named: u64,
-    /// The server that has built it.
-    owner: Option<String>,
+    /// Whether this server has built it.
+    is_built: bool,
     names: Vec<String>,
     layers: Vec<String>,
 }
@@ -74,7 +75,7 @@ const RETRY_INTERVAL: Duration = Duration::from_secs(5);
 const MIN_AGE: u64 = 5;
 /// What is read about an image.
 const FORMAT: &str = "{{.Id}} {{.Size}} {{json .Created}} {{json .Metadata.LastTagTime}} {{json .RepoTags}} \
-    {{json .RepoDigests}} {{json .RootFS.Layers}} {{json .Config.Labels}}";
+    {{json .RepoDigests}} {{json .RootFS.Layers}}";
 /// Number of images that are read at a time.
 const AT_A_TIME: usize = 100;
 /// The beginning of the tag of an image that was pulled.
@@ -90,20 +91,18 @@ impl Drop for ImageUse {
 }
 
 impl Image {
-    /// Parses a line of [`FORMAT`].
-    fn read(line: &str) -> Option<Self> {
-        // A label may have spaces.
-        let mut words = line.splitn(8, ' ');
+    /// Parses a line of [`FORMAT`]. `built_here` are the ids of those that this server has built.
+    fn read(line: &str, built_here: &HashSet<&str>) -> Option<Self> {
+        let mut words = line.split(' ');
         let (id, size, built, named) = (words.next()?, words.next()?, words.next()?, words.next()?);
         let mut list = || serde_json::from_str::<Option<Vec<String>>>(words.next()?).ok();
         let (tags, digests, layers) = (list()?, list()?, list()?);
-        let labels: Option<HashMap<String, String>> = serde_json::from_str(words.next()?).ok()?;
         Some(Self {
             id: id.to_owned(),
             size: size.parse().ok()?,
             built: seconds(built).unwrap_or_default(),
             named: seconds(named).unwrap_or_default(),
-            owner: labels.and_then(|mut labels| labels.remove(LABEL)),
+            is_built: built_here.contains(id),
             names: tags.into_iter().chain(digests).flatten().collect(),
             layers: layers.unwrap_or_default(),
         })
@@ -182,13 +181,13 @@ impl ImageStore {
         }
     }
 
-    /// Notes which images a simulation of a world has.
+    /// Notes which images a simulation of a world has, which is kept ready.
     pub fn used_for(&self, world: &ProjectUrl, uses: &[ImageUse]) {
         let names = uses.iter().map(|one| one.name.clone()).collect();
         self.worlds.lock().insert(world.clone(), names);
     }
 
-    /// Keeps the images that the last simulation of a world has had in this run, until the returned values are dropped.
+    /// Keeps the images that were noted for a world in this run, until the returned values are dropped.
     pub fn keep_for(&self, world: &ProjectUrl) -> Vec<ImageUse> {
         let names = self.worlds.lock().get(world).cloned().unwrap_or_default();
         names.iter().map(|name| self.keep(name)).collect()
@@ -320,8 +319,7 @@ impl ImageStore {
 
     /// Whether this server has built or pulled it. One without a name is a leftover, or a step of another.
     fn is_own(&self, image: &Image) -> bool {
-        let is_built = !image.names.is_empty() && image.owner.as_deref() == Some(self.owner.0.as_str());
-        is_built || image.is_named(&self.prefix())
+        image.is_built && !image.names.is_empty() || image.is_named(&self.prefix())
     }
 
     fn is_in_use(&self, name: &str) -> bool {
@@ -358,6 +356,11 @@ impl ImageStore {
         let mut ids: Vec<&str> = list.lines().collect();
         ids.sort_unstable();
         ids.dedup();
+        // Labels can't be read with the rest: a project's may be of any size.
+        let mine = format!("label={LABEL}={}", self.owner.0);
+        let built = ["image", "ls", "--quiet", "--no-trunc", "--filter", &mine];
+        let built = self.docker.run(&built, SHORT_TIMEOUT).await?;
+        let built: HashSet<&str> = built.lines().collect();
         let mut all = Vec::new();
         for some in ids.chunks(AT_A_TIME) {
             let words: Vec<&str> = ["image", "inspect", "--format", FORMAT]
@@ -365,7 +368,7 @@ impl ImageStore {
                 .chain(some.iter().copied())
                 .collect();
             let told = self.docker.run(&words, SHORT_TIMEOUT).await?;
-            all.extend(told.lines().filter_map(Image::read));
+            all.extend(told.lines().filter_map(|line| Image::read(line, &built)));
         }
         Ok(all)
     }
@@ -384,18 +387,15 @@ mod tests {
         };
         let time = "2026-11-24T10:35:49.97185664+01:00";
         let layers = layers.join(",");
-        let labels = r#"{"a":"b c","webots-fleet.owner":"o"}"#;
-        Image::read(&format!(
-            r#"{id} {size} "2026-11-24T08:35:49Z" "{time}" {names} null [{layers}] {labels}"#
-        ))
-        .unwrap()
+        let line = format!(r#"{id} {size} "2026-11-24T08:35:49Z" "{time}" {names} null [{layers}]"#);
+        Image::read(&line, &HashSet::from(["a"])).unwrap()
     }
 
     #[test]
     fn a_line_of_docker_is_read() {
         let read = image("a", 7, "xy", "webots-fleet/o:a");
         assert_eq!((read.size, read.built, read.named), (7, 1_795_509_349, 1_795_512_949));
-        assert_eq!(read.owner.as_deref(), Some("o"));
+        assert!(read.is_built && !image("b", 7, "xy", "webots-fleet/o:a").is_built);
         assert_eq!(read.names, ["webots-fleet/o:a"]);
         assert_eq!(read.layers, ["x", "y"]);
         assert_eq!(seconds("\"0001-01-01T00:00:00Z\""), None);
