@@ -136,5 +136,11 @@ for command in "${failed[@]}"; do
     printf '\n--- the end of what failed: %s\n' "$command"
     tail -n 80 "$logs/${command//\//-}"
 done >&2
+# Why, once more, where it is found soonest.
+for command in "${failed[@]}"; do
+    printf '\n--- why %s failed\n' "$command"
+    grep --text --extended-regexp --after-context 2 '^error: |panicked at|^(ERROR|FAIL): |^AssertionError' \
+        "$logs/${command//\//-}" | cut --characters -300 | head -n 30 || true
+done >&2
 printf 'FAILED: %s\n' "${failed[@]}" >&2
 exit 1

@@ -213,34 +213,29 @@ async fn a_name_whose_lookup_hangs_holds_up_only_its_own_server() {
     let mut servers: Vec<String> = (0..HANGING).map(|number| format!("{number}.test:2000")).collect();
     servers.push(well.address());
     let builder = looking_up(&servers, &names)
-        .set("timing", json!({"answer": 0.5}))
+        .set("timing", json!({"answer": 2}))
         .set("loadRefresh", 0.05);
     let mut session = builder.start().await;
     until_states(&session, &[vec!["down"; HANGING], vec!["up"]].concat()).await;
-    assert!(session.log().contains("0.test:2000: down: no answer within 0.5 s"));
-    // After some polls, no threads have piled up, and the other server is polled as before.
-    let threads = || {
-        procfs::process::Process::new(session.pid())
-            .unwrap()
-            .stat()
-            .unwrap()
-            .num_threads
-    };
-    let before = threads();
+    assert!(session.log().contains("0.test:2000: down: no answer within 2 s"));
+    // The other server is polled as before, and no lookup has a thread of its own.
     let asked = well.requests();
     let begin = Instant::now();
     until("it is asked twenty times more", async || well.requests() >= asked + 20).await;
     let took = begin.elapsed();
+    // If each waited for a lookup that hangs, they would take 40 s.
     assert!(
-        took < Duration::from_secs(5),
+        took < Duration::from_secs(20),
         "twenty looks, one each 0.05 s, took {took:?}"
     );
-    assert!(threads() <= before, "{} threads, {before} before", threads());
+    let process = procfs::process::Process::new(session.pid()).unwrap();
+    let threads = process.stat().unwrap().num_threads;
+    assert!(threads < HANGING as i64, "{threads} threads");
     // The pending lookups don't delay the stop either.
     let begin = Instant::now();
     session.stops().await;
     assert!(
-        begin.elapsed() < Duration::from_secs(5),
+        begin.elapsed() < Duration::from_secs(8),
         "the end took {:?}",
         begin.elapsed()
     );

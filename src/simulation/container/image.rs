@@ -263,7 +263,10 @@ impl Images {
         if size.is_none_or(|size| size.parse().is_ok_and(|size: u64| size <= limit << 20)) {
             return Ok(());
         }
-        self.docker.run(&["image", "rm", name], SHORT_TIMEOUT).await?;
+        // A large image, on a disk that other builds write to. If it stayed, the next client would get it.
+        self.docker
+            .run(&["image", "rm", name], self.config.timing.build)
+            .await?;
         let message = format!("The image of this project is larger than {limit} MiB (container.imageSize)");
         Err(Failure::new(Reason::ImageTooLarge, message))
     }
