@@ -15,7 +15,7 @@ if ! cmp -s "$JS/package-lock.json" "$TOOLS/installed.json"; then
 fi
 biome() {
     # It takes its settings from the folder that it runs in.
-    (cd "$JS" && node_modules/.bin/biome check "$@" . ../../templates/assets ../../templates/embed.js)
+    (cd "$JS" && node_modules/.bin/biome check "$@" . ../../templates/assets)
 }
 ruff() {
     "$(dirname "$(tests/python.sh)")/ruff" "$@" "${python[@]}"

@@ -17,8 +17,8 @@ import { VisitRunner } from './visit_runner.js';
 
 /** Pause before the words are loaded again, in milliseconds. */
 const RELOAD = 5000;
-/** The URL of the session server: these files are its assets. */
-const BASE = new URL('..', import.meta.url).href;
+/** The URL of the session server, which sends this module as its `embed.js`, with all that it imports. */
+const BASE = new URL('.', import.meta.url).href;
 const NAME = 'webots-simulation';
 /** The looks of all elements. */
 const SHEET = new CSSStyleSheet();

@@ -4,7 +4,7 @@
 const small = () => import('./small_viewer.js');
 
 /** Time in which the page of Webots' own viewer reports after its frame has loaded, in milliseconds. */
-const REPORT = 2000;
+const FRAME_REPORT = 2000;
 /** What that page reports: that it may be framed, and that its viewer shows the scene and takes orders. */
 const HERE = 'webots-viewer';
 const READY = 'webots-viewer-ready';
@@ -13,7 +13,7 @@ const HEARD = 500;
 /** The program whose scenes are for the small viewer. */
 const DEMO = 'demo-simulator';
 /** How long a simulation server may take to say whether Webots' viewer fits, in milliseconds. */
-const ANSWER = 3000;
+const STATUS_LIMIT = 3000;
 
 /** @typedef {import('./visit.js').Event} VisitEvent */
 /** @typedef {Extract<import('./visit.js').Effect, { do: 'show' }>} Show */
@@ -160,7 +160,7 @@ export class Stage {
         this.#tell({ type: 'sceneFailed', why: 'no-frame' });
       }
     };
-    frame.addEventListener('load', () => setTimeout(check, REPORT), { once: true });
+    frame.addEventListener('load', () => setTimeout(check, FRAME_REPORT), { once: true });
     this.#element.replaceChildren(frame);
     /** The frame has no origin. @type {(text: string) => void} */
     const send = (text) => frame.contentWindow?.postMessage(text, '*');
@@ -222,7 +222,9 @@ export class Stage {
 async function webotsViewer(server, script, isChosen) {
   const base = server.startsWith('ws') ? `http${server.slice('ws'.length)}` : server;
   try {
-    const { viewer, simulator } = await (await fetch(`${base}/status`, { signal: AbortSignal.timeout(ANSWER) })).json();
+    const { viewer, simulator } = await (
+      await fetch(`${base}/status`, { signal: AbortSignal.timeout(STATUS_LIMIT) })
+    ).json();
     if (simulator === DEMO && !isChosen) {
       return undefined;
     }

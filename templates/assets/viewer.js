@@ -1,10 +1,10 @@
 // The page on which visitors try worlds: a form around the element that runs them (`embed.js`).
 
+import { WebotsSimulation } from '../embed.js';
 import { find } from './dom.js';
-import { WebotsSimulation } from './embed.js';
 import { wordsOfPage } from './language.js';
 
-/** @typedef {import('./embed.js').StateDetail} StateDetail */
+/** @typedef {import('../embed.js').StateDetail} StateDetail */
 
 const search = new URLSearchParams(location.search);
 /** Where the browser keeps the visitor's name. */

@@ -16,33 +16,53 @@ use crate::shared::http::routing::{GET, READ, path};
 use crate::shared::http::{ConnectionKind, FOREIGN_SCRIPTS, OWN_FILES, PageView, VIEWER, framed_by, html};
 use crate::shared::run::timestamp;
 
+/// The name and the text of a file of `templates/assets`.
+macro_rules! module {
+    ($name:literal) => {
+        ($name, include_str!(concat!("../../../templates/assets/", $name)))
+    };
+}
+
 /// Assets of this server's pages, besides those that both servers share.
-static ASSETS: [Asset; 19] = [
+static ASSETS: [Asset; 6] = [
     asset!("viewer.js"),
     asset!("viewer.css"),
-    asset!("embed.js"),
-    asset!("panel.js"),
-    asset!("visit_runner.js"),
-    asset!("visit.js"),
-    asset!("page_view.js"),
-    asset!("reasons.js"),
-    asset!("messages.js"),
-    asset!("session_server.js"),
-    asset!("simulation_link.js"),
-    asset!("stage.js"),
-    Asset::new("styles.js", || {
-        Content::style_module(&[
-            include_str!("../../../templates/assets/theme.css"),
-            include_str!("../../../templates/assets/simulation.css"),
-        ])
-    }),
-    asset!("kept.js"),
-    asset!("turn.js"),
     asset!("class.css"),
     asset!("class.js"),
     asset!("announce.js"),
     asset!("lessons.js"),
 ];
+
+/// The modules of the element `<webots-simulation>`, each after those that it imports, besides `styles.js`.
+const ELEMENT_MODULES: [(&str, &str); 14] = [
+    module!("dom.js"),
+    module!("language.js"),
+    module!("kept.js"),
+    module!("turn.js"),
+    module!("reasons.js"),
+    module!("visit.js"),
+    module!("messages.js"),
+    module!("session_server.js"),
+    module!("simulation_link.js"),
+    module!("page_view.js"),
+    module!("stage.js"),
+    module!("panel.js"),
+    module!("visit_runner.js"),
+    module!("embed.js"),
+];
+
+/// The element for pages of other sites, and for the viewer page. The styles come with it, since links to style sheets would
+/// be asked for only after it.
+static ELEMENT: Asset = Asset::new("embed.js", || {
+    let styles = Content::style_module(&[
+        include_str!("../../../templates/assets/theme.css"),
+        include_str!("../../../templates/assets/simulation.css"),
+    ]);
+    let modules = ELEMENT_MODULES.map(|(_, text)| text);
+    let script = Content::joined(&[&[&*styles], &modules[..]].concat());
+    // What it loads later is where its modules are.
+    Content::of(script.replace("import('./", "import('./assets/").into())
+});
 
 /// Adds the routes to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
@@ -127,14 +147,11 @@ async fn webots_viewer(server: web::Data<AppState>) -> HttpResponse {
     html(WebotsViewer.render(), &policy)
 }
 
-/// The element `<webots-simulation>`, for pages of other sites.
-async fn embed_script() -> HttpResponse {
-    HttpResponse::Ok()
-        .content_type("text/javascript; charset=utf-8")
-        .body(include_str!("../../../templates/embed.js"))
+async fn embed_script(request: HttpRequest) -> HttpResponse {
+    ELEMENT.answer(&request)
 }
 
-/// Its types.
+/// The types of the element.
 async fn embed_types() -> HttpResponse {
     HttpResponse::Ok()
         .content_type("text/plain; charset=utf-8")
@@ -143,4 +160,32 @@ async fn embed_types() -> HttpResponse {
 
 async fn asset(request: HttpRequest) -> HttpResponse {
     assets::answer(&request, &ASSETS)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The modules that a module imports.
+    fn imported(text: &str) -> impl Iterator<Item = &str> {
+        text.lines().filter_map(|line| {
+            let path = line.strip_suffix("';")?.rsplit_once("'./")?;
+            (path.0.starts_with("import ") || path.0.starts_with("} from ")).then_some(path.1)
+        })
+    }
+
+    #[test]
+    fn each_module_of_the_element_comes_after_those_that_it_imports() {
+        assert_eq!(
+            imported("import './a.js';\nimport {\n  b,\n} from './b.js';\n").count(),
+            2
+        );
+        let mut before = vec!["styles.js"];
+        for (name, text) in ELEMENT_MODULES {
+            for module in imported(text) {
+                assert!(before.contains(&module), "{name} imports {module}");
+            }
+            before.push(name);
+        }
+    }
 }

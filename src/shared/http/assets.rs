@@ -24,6 +24,21 @@ impl Asset {
             content: LazyLock::new(content),
         }
     }
+
+    /// Answers a request for it.
+    pub fn answer(&self, request: &HttpRequest) -> HttpResponse {
+        let mut response = HttpResponse::Ok();
+        response
+            .content_type(file_extension_to_mime(extension(self.name)))
+            .insert_header((header::VARY, "Accept-Encoding"));
+        if accepts_gzip(request) {
+            response
+                .insert_header((header::CONTENT_ENCODING, "gzip"))
+                .body(self.content.gzip.clone())
+        } else {
+            response.body(self.content.plain.clone())
+        }
+    }
 }
 
 /// What is sent: the same for all requests.
@@ -42,14 +57,34 @@ impl Content {
         Self::of(plain)
     }
 
-    /// A module with these style sheets, for elements in pages of others: it comes with the scripts, where links would be
-    /// asked for only after them.
-    pub fn style_module(sheets: &[&str]) -> Self {
-        let styles: String = sheets.iter().map(|sheet| without_comments(sheet)).collect();
-        Self::of(format!("export const styles = {};\n", serde_json::Value::from(styles)).into())
+    /// Modules as one script: a browser asks once, not once for each that another imports. Each comes after those that it
+    /// imports, all have different names at their top level, and only the last exports anything.
+    pub fn joined(modules: &[&str]) -> String {
+        let mut script = String::new();
+        for (number, module) in modules.iter().enumerate() {
+            let mut is_import = false;
+            for line in without_comments(module).lines() {
+                is_import |= line.starts_with("import ");
+                if !is_import {
+                    let is_last = number + 1 == modules.len();
+                    let own = line.strip_prefix("export ").filter(|_| !is_last).unwrap_or(line);
+                    script.push_str(own);
+                    script.push('\n');
+                }
+                is_import &= !line.ends_with(';');
+            }
+        }
+        script
     }
 
-    fn of(plain: Bytes) -> Self {
+    /// A module that exports these style sheets.
+    pub fn style_module(sheets: &[&str]) -> String {
+        let styles: String = sheets.iter().map(|sheet| without_comments(sheet)).collect();
+        format!("export const styles = {};\n", serde_json::Value::from(styles))
+    }
+
+    /// A content that is sent as it is.
+    pub fn of(plain: Bytes) -> Self {
         let gzip = compressed(&plain);
         Self { plain, gzip }
     }
@@ -68,8 +103,19 @@ macro_rules! asset {
     };
 }
 
+/// The words of a language, with the formats that they use.
+macro_rules! language {
+    ($name:literal) => {
+        Asset::new($name, || {
+            let formats = include_str!("../../../templates/assets/intl.js");
+            let words = include_str!(concat!("../../../templates/assets/", $name));
+            Content::of(Content::joined(&[formats, words]).into())
+        })
+    };
+}
+
 /// Assets that pages of both servers use: of each page, of live pages, and of the viewers.
-static COMMON: [Asset; 26] = [
+static COMMON: [Asset; 25] = [
     asset!("theme.css"),
     asset!("style.css"),
     asset!("icon.svg"),
@@ -79,13 +125,12 @@ static COMMON: [Asset; 26] = [
     asset!("times.js"),
     asset!("dom.js"),
     asset!("language.js"),
-    asset!("intl.js"),
-    asset!("english.js"),
-    asset!("german.js"),
-    asset!("french.js"),
-    asset!("spanish.js"),
-    asset!("chinese.js"),
-    asset!("japanese.js"),
+    language!("english.js"),
+    language!("german.js"),
+    language!("french.js"),
+    language!("spanish.js"),
+    language!("chinese.js"),
+    language!("japanese.js"),
     asset!("simulation.css"),
     asset!("stream.js"),
     asset!("small_viewer.js"),
@@ -101,20 +146,14 @@ static COMMON: [Asset; 26] = [
 /// Answers a request for one of these files. Browsers fetch it again for each page.
 pub fn answer(request: &HttpRequest, assets: &[Asset]) -> HttpResponse {
     let name = request.match_info().get("name").unwrap_or_default();
-    let Some(asset) = assets.iter().chain(&COMMON).find(|asset| asset.name == name) else {
-        return HttpResponse::NotFound().body("Error: there is no such file.");
-    };
-    let mut response = HttpResponse::Ok();
-    response
-        .content_type(file_extension_to_mime(extension(name)))
-        .insert_header((header::VARY, "Accept-Encoding"));
-    if accepts_gzip(request) {
-        response
-            .insert_header((header::CONTENT_ENCODING, "gzip"))
-            .body(asset.content.gzip.clone())
-    } else {
-        response.body(asset.content.plain.clone())
-    }
+    assets
+        .iter()
+        .chain(&COMMON)
+        .find(|asset| asset.name == name)
+        .map_or_else(
+            || HttpResponse::NotFound().body("Error: there is no such file."),
+            |asset| asset.answer(request),
+        )
 }
 
 /// Whether the client of a request can read an answer that is compressed by gzip.
@@ -192,6 +231,14 @@ mod tests {
             let text = std::fs::read_to_string(&path).unwrap();
             assert_eq!(damaged(&text), None, "{}", path.display());
         }
+    }
+
+    #[test]
+    fn joined_modules_import_nothing_of_each_other_and_export_what_the_last_exports() {
+        let one = "// One.\nexport const a = 1;\nexport function b() {\n  return import('./d.js');\n}\n";
+        let two = "import { a } from './one.js';\nimport {\n  b,\n} from './one.js';\n\nexport const c = a + b();\n";
+        let script = "const a = 1;\nfunction b() {\n  return import('./d.js');\n}\nexport const c = a + b();\n";
+        assert_eq!(Content::joined(&[one, two]), script);
     }
 
     #[test]
