@@ -373,12 +373,12 @@ fn image(tag: &str) -> String {
     format!("webots-fleet.test/{tag}:1")
 }
 
-fn is_there(tag: &str) -> bool {
+pub fn is_there(tag: &str) -> bool {
     !ask(&["image", "ls", "--quiet", &image(tag)]).is_empty()
 }
 
 /// Loads an image into the daemon, as if a server had built it at this time, as `date` reads it.
-fn load(folder: &std::path::Path, tag: &str, owner: &str, created: &str) {
+pub fn load(folder: &std::path::Path, tag: &str, owner: &str, created: &str) {
     let time = std::process::Command::new("date")
         .args(["--utc", "+%FT%TZ", "--date", created])
         .output()

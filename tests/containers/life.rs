@@ -4,7 +4,9 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
+use webots_fleet::simulation::container::ResourceOwner;
 
+use super::builds::{is_there, load};
 use super::daemon::{self, ask, containers, docker, of_service, running, server};
 use super::image::NAME;
 use crate::support::{Client, SOON, WORLD, arm, instance_folders_in, is_told, until, world};
@@ -224,12 +226,16 @@ async fn an_upgrade_ends_no_container() {
         .await;
     let now = viewer.time().await;
     let before = containers(&server);
+    // An image that is old enough to be removed, if the older process did not need it.
+    let owner = ResourceOwner::of(&server.cache()).0;
+    load(&server.folder, "of-both", &owner, "-6 years");
     let (succeeds, told) = server.upgrade().await;
     assert!(succeeds, "{told}");
     assert!(viewer.time().await >= now, "it began anew");
     let mut second = Client::start(&server, &arm()).await;
     second.patiently("webots:").await;
     assert_eq!(containers(&server).len(), 2);
+    assert!(is_there("of-both"));
     drop(viewer);
     first.leave().await;
     until("the older process has ended", async || server.processes().len() == 1).await;

@@ -3,7 +3,8 @@
 use serde_json::Value;
 
 use crate::support::{
-    Forge, Server, Webots, arm, demo_server, http, is_told, make_program, session_server, simulation_server, until,
+    Client, Forge, Server, Webots, arm, demo_server, http, is_told, make_program, session_server, simulation_server,
+    until,
 };
 
 /// Whether the session server considers its only simulation server working; on a busy machine it may be full.
@@ -97,6 +98,24 @@ async fn one_late_answer_of_docker_refuses_nobody_and_two_do() {
     let (server, _docker) = with_docker(&["exit 1", "exit 1"]).await;
     assert!(server.log().contains(REFUSES), "{}", server.log());
     until("it is asked again", async || server.health().await.0 == 200).await;
+}
+
+#[actix_rt::test]
+async fn a_docker_that_stops_when_it_is_asked_for_an_image_is_told_as_such() {
+    let folder = tempfile::tempdir().unwrap();
+    // Only a stub stops at a given command. From then on it answers no more, and notes what it is asked.
+    let program = "cd \"$(dirname \"$0\")\"\n[ \"$1 $2\" != 'network inspect' ] || exit 1\n[ \"$1 $2\" != 'image inspect' ] || touch stopped\n\
+                   [ -f stopped ] || exit 0\necho \"$*\" >>asked\nexit 1";
+    make_program(&folder.path().join("docker"), program);
+    let path = format!("{}:{}", folder.path().display(), std::env::var("PATH").unwrap());
+    let server = demo_server(1).set("isolation", "container").set("webots", Value::Null);
+    let server = server.env("PATH", &path).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("loading: Error: ").await;
+    assert_eq!(client.reason()["code"], "docker-unavailable");
+    // What is taken for an image that is not there is pulled, and removed one day.
+    let asked = std::fs::read_to_string(folder.path().join("asked")).unwrap();
+    assert!(!asked.contains("pull"), "{asked}");
 }
 
 #[actix_rt::test]

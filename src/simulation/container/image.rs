@@ -14,7 +14,7 @@ use super::build_plan::{self, ImageBuild};
 use super::builders::{Builder, Builders};
 use super::built_image::BuiltImage;
 use super::compose_project::DEFAULT_MEMORY;
-use super::docker::{Docker, DockerError, SHORT_TIMEOUT, data_folder, docker_disk_fault};
+use super::docker::{Docker, DockerError, SHORT_TIMEOUT, daemon_fault, data_folder, docker_disk_fault};
 use super::dockerfile::Dockerfile;
 use super::engine;
 use super::failures::{of_project, on_thread};
@@ -395,7 +395,11 @@ impl Images {
             .await
         {
             Ok(found) => Ok(Some(found.trim().to_owned())),
-            Err(DockerError::Failed { .. }) => Ok(None),
+            // Also if Docker does not answer.
+            Err(DockerError::Failed { .. }) => match spawn_blocking(daemon_fault).await {
+                Ok(Some(fault)) => Err(fault),
+                _ => Ok(None),
+            },
             Err(error) => Err(error.into()),
         }
     }

@@ -21,6 +21,7 @@ use super::owned_resources::ResourceOwner;
 use crate::shared::domain::ProjectUrl;
 use crate::shared::run::seconds_since_1970;
 use crate::simulation::config::SimulationConfig;
+use crate::simulation::process::has_several_runs;
 
 /// The images of a server.
 pub struct ImageStore {
@@ -235,7 +236,11 @@ impl ImageStore {
         let old = format!("until={minutes}m");
         let prune = ["image", "prune", "--force", "--filter", &mine, "--filter", &old];
         self.docker.run(&prune, SHORT_TIMEOUT).await?;
-        self.evict().await?;
+        // Another process of this server may need an image of which it has no container yet.
+        let cache = self.config.cache_dir.0.clone();
+        if spawn_blocking(move || !has_several_runs(&cache)).await.unwrap_or(false) {
+            self.evict().await?;
+        }
         Ok(!self.is_disk_full().await)
     }
 
