@@ -429,6 +429,7 @@ impl Session {
             // It has ended meanwhile.
             other => return self.state = other,
         };
+        self.server.failed_starts.reset();
         let project = launched.project.upgrade();
         self.state = State::Ready(ReadySimulation {
             launched,
@@ -446,10 +447,7 @@ impl Session {
                     .map(|(project, containers)| containers.keep_images_of(&project.url));
                 keeper.do_send(SpareEvent::Ready(kind.clone(), images.unwrap_or_default()));
             }
-            Client::Connected(_) | Client::Away(_) => {
-                self.server.failed_starts.reset();
-                self.hand_over(ctx);
-            }
+            Client::Connected(_) | Client::Away(_) => self.hand_over(ctx),
         }
     }
 

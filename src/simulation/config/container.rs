@@ -43,7 +43,8 @@ pub struct ContainerSettings {
     /// Maximum size of all images that this server has built or pulled, in MiB. Default: 65536.
     #[serde(with = "Whole::<1, 100_000_000>")]
     pub images_size: u64 = 65_536,
-    /// Days after which an image that this server has built is removed, unless a container uses it. Default: 14.
+    /// Days without use after which an image that this server has built or pulled is removed, unless a container uses it.
+    /// Default: 14.
     #[serde(with = "Whole::<1, 10_000>")]
     pub images_age: u64 = 14,
 }

@@ -75,7 +75,7 @@ pub struct SimulationConfig {
     pub real_time: RealTime = RealTime::default(),
     /// Run Webots in containers: the original's key for `isolation: "container"`. Default: false.
     pub docker: bool = false,
-    /// A key of the original, without effect: only images that this server has built are ever removed.
+    /// Images that this server never removes, although it has pulled them. Default: none.
     #[serde(alias = "persistentDockerImages", with = "OneOrMany::<String>")]
     pub persistant_docker_images: Vec<String> = Vec::new(),
     /// Repositories whose worlds may run, as URL prefixes of whole path segments. Default: none.
