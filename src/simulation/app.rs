@@ -461,7 +461,8 @@ fn assemble(
     let disk_monitor = DiskMonitor::start(run.path().to_owned(), config.disk_reserve)?;
     let starts = count_starts(&metrics)?;
     let fleet_key = config.fleet_key.as_ref().map(|key| FleetKey::new(key.reveal()));
-    let admin_auth = admin_auth(&config, fleet_key.as_ref(), &sign_in);
+    let server_run = ServerRun(RunId::number());
+    let admin_auth = admin_auth(&config, (fleet_key.as_ref(), server_run), &sign_in);
     let spare_wishes = SpareWishes::default();
     spare_wishes.configure(config.ready.clone());
     let failed_starts = Arc::default();
@@ -476,7 +477,7 @@ fn assemble(
         predecessors: Arc::new(predecessors),
         rules,
         fleet_key,
-        server_run: ServerRun(RunId::number()),
+        server_run,
         problem,
         failed_starts,
         ends,
@@ -525,12 +526,13 @@ fn count_starts(metrics: &Metrics) -> Result<IntCounterVec, AppError> {
 }
 
 /// Tells administrators from others. In a fleet without a key, `sign_in` is the secret for their sign-ins.
-fn admin_auth(config: &SimulationConfig, fleet_key: Option<&FleetKey>, sign_in: &str) -> AdminAuth {
+fn admin_auth(config: &SimulationConfig, (fleet_key, run): (Option<&FleetKey>, ServerRun), sign_in: &str) -> AdminAuth {
     AdminAuth::new(AuthSettings {
         password: config.admin_password.clone(),
         tokens: config.api_tokens.clone(),
         key: fleet_key.cloned().unwrap_or_else(|| FleetKey::new(sign_in)),
         has_fleet: fleet_key.is_some(),
+        entered: fleet_key.map(|_| run),
         port: config.port,
         ssl: config.ssl,
         trusted_proxies: config.trusted_proxies.clone(),

@@ -489,7 +489,14 @@ async fn an_administrator_signs_in_once_for_the_whole_fleet() {
         403,
         "without a password nobody can sign in here otherwise"
     );
-    // Another entry, and another server.
+    // No other server takes the entry: the one for which it is may be without the key, and show it to others.
+    let second = keyed(1).start().await;
+    for other in [second.url(""), session.url("")] {
+        let other = other.trim_end_matches('/');
+        let (_, _, cookie, _) = get(to.replace(server.url("").trim_end_matches('/'), other), &[]).await;
+        assert_eq!(cookie, None, "{other}");
+    }
+    // Another entry, and a server with another key.
     let forged = to.replacen("entry=", "entry=A", 1);
     assert_eq!(get(forged, &[]).await.1.as_deref(), Some("sign-in"));
     let foreign = demo_server(1).set("fleetKey", "another key for a fleet").start().await;

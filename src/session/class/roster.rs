@@ -14,7 +14,7 @@ use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
 use tokio::sync::{oneshot, watch};
 use tokio::time::timeout;
 
-use crate::shared::domain::{PublicAddress, RosterUpdate, SimulationReport, Stage};
+use crate::shared::domain::{PublicAddress, RosterUpdate, ServerRun, SimulationReport, Stage};
 
 /// Somebody of the class: a simulation, or a client that waits in the line. Times are in seconds since 1970.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -123,7 +123,14 @@ struct List {
     /// The version before the first of these.
     gone_since: u64,
     /// The links to simulation servers.
-    links: HashMap<PublicAddress, UnboundedSender<StopRequest>>,
+    links: HashMap<PublicAddress, Link>,
+}
+
+/// A simulation server that tells its simulations.
+#[derive(Debug)]
+struct Link {
+    run: ServerRun,
+    requests: UnboundedSender<StopRequest>,
 }
 
 /// A page that shows the list, until this is dropped.
@@ -146,9 +153,10 @@ const ANSWER: Duration = Duration::from_secs(5);
 
 impl Roster {
     /// A simulation server tells its simulations from now on. Returns what it must do, as long as it does.
-    pub fn link(&self, server: PublicAddress) -> UnboundedReceiver<StopRequest> {
+    pub fn link(&self, server: PublicAddress, run: ServerRun) -> UnboundedReceiver<StopRequest> {
         let (sender, requests) = unbounded_channel();
-        self.list.lock().links.insert(server, sender);
+        let link = Link { run, requests: sender };
+        self.list.lock().links.insert(server, link);
         requests
     }
 
@@ -156,7 +164,7 @@ impl Roster {
     /// have begun meanwhile.
     pub fn unlink(&self, server: &PublicAddress) {
         let mut list = self.list.lock();
-        if list.links.get(server).is_some_and(UnboundedSender::is_closed) {
+        if list.links.get(server).is_some_and(|link| link.requests.is_closed()) {
             list.links.remove(server);
             list.remove_all(Some(server));
         }
@@ -165,6 +173,11 @@ impl Roster {
     /// Whether a simulation server tells its simulations.
     pub fn is_linked(&self, server: &PublicAddress) -> bool {
         self.list.lock().links.contains_key(server)
+    }
+
+    /// The run of a simulation server that tells its simulations, by its own word.
+    pub fn run_of(&self, server: &PublicAddress) -> Option<ServerRun> {
+        self.list.lock().links.get(server).map(|link| link.run)
     }
 
     /// Adds what a simulation server has told.
@@ -295,7 +308,7 @@ impl Roster {
         };
         if let Some(link) = self.list.lock().links.get(server) {
             // The link may have ended; then nobody answers.
-            link.send(request).ok();
+            link.requests.send(request).ok();
         }
         async {
             timeout(ANSWER, answer)
@@ -451,9 +464,9 @@ mod tests {
         let roster = Roster::default();
         let server: PublicAddress = "host:2000".parse().unwrap();
         let other: PublicAddress = "host:2001".parse().unwrap();
-        let _link = roster.link(server.clone());
-        let before = roster.link(other.clone());
-        let mut link = roster.link(other.clone());
+        let _link = roster.link(server.clone(), ServerRun(1));
+        let before = roster.link(other.clone(), ServerRun(1));
+        let mut link = roster.link(other.clone(), ServerRun(1));
         drop(before);
         roster.unlink(&other);
         assert!(roster.is_linked(&other), "another link has begun");
@@ -491,7 +504,7 @@ mod tests {
     fn who_is_gone_for_long_is_forgotten() {
         let roster = Roster::default();
         let server: PublicAddress = "host:2000".parse().unwrap();
-        let _link = roster.link(server.clone());
+        let _link = roster.link(server.clone(), ServerRun(1));
         for number in 0..GONE + 10 {
             let id = number.to_string();
             roster
@@ -509,7 +522,7 @@ mod tests {
         let roster = Roster::default();
         let server: PublicAddress = "host:2000".parse().unwrap();
         let other: PublicAddress = "host:2001".parse().unwrap();
-        let links = [&server, &other].map(|server| roster.link(server.clone()));
+        let links = [&server, &other].map(|server| roster.link(server.clone(), ServerRun(1)));
         let one = |id: usize, world: usize| SimulationReport {
             world: "x".repeat(world),
             ..simulation(&id.to_string(), Stage::Running)
@@ -533,7 +546,9 @@ mod tests {
     fn a_simulation_is_told_from_one_with_its_id_at_another_server() {
         let roster = Roster::default();
         let servers: [PublicAddress; 2] = ["host:2000", "host:2001"].map(|server| server.parse().unwrap());
-        let _links = servers.each_ref().map(|server| roster.link(server.clone()));
+        let _links = servers
+            .each_ref()
+            .map(|server| roster.link(server.clone(), ServerRun(1)));
         for server in &servers {
             let list = vec![simulation("1", Stage::Running)];
             roster.update(server, update(true, list, &[])).unwrap();

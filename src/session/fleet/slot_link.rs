@@ -23,7 +23,7 @@ use tokio::time::{sleep, timeout};
 
 use crate::session::class::{Roster, StopRequest};
 use crate::shared::domain::{
-    FleetKey, Follow, Hello, MAX_LINK_MESSAGE, Offers, PublicAddress, RosterUpdate, StopOrder, Stopped,
+    FleetKey, Follow, Hello, MAX_LINK_MESSAGE, Offers, PublicAddress, RosterUpdate, ServerRun, StopOrder, Stopped,
     ToSessionServer, ToSimulationServer,
 };
 
@@ -95,7 +95,7 @@ type Socket = Framed<BoxedSocket, Codec>;
 const MAX_MESSAGE: usize = 1024 * 1024;
 /// Timeout of a new connection, and of the first messages on it.
 const CONNECT: Duration = Duration::from_secs(5);
-/// A server that sends nothing for this long is gone. It pings more often.
+/// A server that sends or receives nothing for this long is gone. It pings more often.
 const SILENCE: Duration = Duration::from_mins(2);
 /// Pause after a connection has broken.
 const PAUSE: Duration = Duration::from_millis(500);
@@ -171,7 +171,7 @@ impl SlotLink {
     ) -> Result<(), LinkError> {
         // Those for an earlier link.
         while messages.try_recv().is_ok() {}
-        let mut followed = hello.roster.then(|| Followed::new(self));
+        let mut followed = hello.roster.then(|| Followed::new(self, hello.server));
         self.tell(LinkChange::Up(hello)).await;
         self.tell(LinkChange::Offers(first)).await;
         let mut watching = self.roster.watching();
@@ -227,9 +227,9 @@ impl SlotLink {
 }
 
 impl Followed {
-    fn new(link: &SlotLink) -> Self {
+    fn new(link: &SlotLink, run: ServerRun) -> Self {
         Self {
-            requests: link.roster.link(link.server.clone()),
+            requests: link.roster.link(link.server.clone(), run),
             server: link.server.clone(),
             roster: Arc::clone(&link.roster),
             pending: HashMap::new(),
@@ -282,10 +282,8 @@ async fn send(socket: &mut Socket, message: &impl Serialize) -> Result<(), LinkE
         );
         return Ok(());
     }
-    socket
-        .send(Text::Text(text.into()))
-        .await
-        .map_err(|error| broken(&error))
+    let sent = timeout(SILENCE, socket.send(Text::Text(text.into()))).await;
+    sent.map_err(|error| broken(&error))?.map_err(|error| broken(&error))
 }
 
 /// The next message. Pings are answered.

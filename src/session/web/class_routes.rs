@@ -223,10 +223,12 @@ async fn visit(request: HttpRequest, which: web::Query<Visit>, server: web::Data
         let mut known = status.servers.iter().map(|one| &one.record.address);
         (known.find(is_it).ok_or_else(nothing)?.clone(), "monitor".to_owned())
     };
-    let page = if server.roster.is_linked(&address) {
-        format!("sign-in?{}", sign_in::entry(&server.admin_auth, administrator, &to))
-    } else {
-        to
+    let page = match server.roster.run_of(&address) {
+        Some(run) => format!(
+            "sign-in?{}",
+            sign_in::entry(&server.admin_auth, administrator, run, &to)
+        ),
+        None => to,
     };
     let url = format!("{}/{page}", server.client_urls.http_url(&address));
     Ok(HttpResponse::SeeOther().insert_header((header::LOCATION, url)).finish())

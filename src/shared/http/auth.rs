@@ -14,7 +14,7 @@ use super::guesses::{Guesser, Guesses, TooMany};
 use super::peer::{Peer, TrustedProxies};
 use super::routing::retry_after;
 use crate::shared::config::{ApiToken, Permission, Secret};
-use crate::shared::domain::FleetKey;
+use crate::shared::domain::{FleetKey, ServerRun};
 use crate::shared::run::seconds_since_1970;
 use crate::shared::text::one_line;
 
@@ -36,8 +36,10 @@ pub struct AuthSettings {
     pub tokens: Vec<ApiToken>,
     /// Signs cookies: that of the fleet, or a random one.
     pub key: FleetKey,
-    /// Whether the key is that of a fleet, whose session servers lead signed-in browsers here.
+    /// Whether the key is that of a fleet.
     pub has_fleet: bool,
+    /// The run of a simulation server with that key, to which session servers lead signed-in browsers.
+    pub entered: Option<ServerRun>,
     /// The key `port`.
     pub port: u16,
     /// Whether browsers send the cookie over encrypted connections only.

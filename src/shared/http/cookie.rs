@@ -7,7 +7,7 @@ use actix_web::http::header;
 use base64::Engine;
 use base64::engine::general_purpose::URL_SAFE_NO_PAD;
 
-use crate::shared::domain::{FleetKey, Purpose, SIGNATURE};
+use crate::shared::domain::{FleetKey, Purpose, SIGNATURE, ServerRun};
 
 /// An administrator's sign-in.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -25,8 +25,8 @@ pub struct SignIn {
 pub enum Use<'password> {
     /// A cookie of a server with this password. It is not valid any more after the password has changed.
     Cookie(&'password str),
-    /// A way for a browser to another server of the fleet.
-    Entry,
+    /// A way for a browser to this run of a simulation server. No other server takes it.
+    Entry(ServerRun),
     /// To read something from another server of the fleet. It signs no browser in.
     Reading,
 }
@@ -72,7 +72,7 @@ impl Use<'_> {
     fn sign(self, key: &FleetKey, content: &[u8]) -> [u8; SIGNATURE] {
         match self {
             Self::Cookie(password) => key.sign(Purpose::SignIn, &[content, password.as_bytes()]),
-            Self::Entry => key.sign(Purpose::Entry, &[content]),
+            Self::Entry(server) => key.sign(Purpose::Entry, &[content, &server.0.to_be_bytes()]),
             Self::Reading => key.sign(Purpose::Reading, &[content]),
         }
     }
@@ -80,7 +80,7 @@ impl Use<'_> {
     fn verifies(self, key: &FleetKey, content: &[u8], signature: &[u8]) -> bool {
         match self {
             Self::Cookie(password) => key.verifies(Purpose::SignIn, &[content, password.as_bytes()], signature),
-            Self::Entry => key.verifies(Purpose::Entry, &[content], signature),
+            Self::Entry(server) => key.verifies(Purpose::Entry, &[content, &server.0.to_be_bytes()], signature),
             Self::Reading => key.verifies(Purpose::Reading, &[content], signature),
         }
     }
@@ -123,9 +123,11 @@ mod tests {
             SignIn::read(&text, &FleetKey::random(), Use::Cookie("open sesame")),
             None
         );
-        assert_eq!(SignIn::read(&text, &key, Use::Entry), None);
-        let entry = anna().write(&key, Use::Entry);
-        assert_eq!(SignIn::read(&entry, &key, Use::Entry), Some(anna()));
+        let here = Use::Entry(ServerRun(1));
+        assert_eq!(SignIn::read(&text, &key, here), None);
+        let entry = anna().write(&key, here);
+        assert_eq!(SignIn::read(&entry, &key, here), Some(anna()));
+        assert_eq!(SignIn::read(&entry, &key, Use::Entry(ServerRun(2))), None);
         assert_eq!(SignIn::read(&entry, &key, Use::Cookie("")), None);
         assert_eq!(SignIn::read(&entry, &key, Use::Reading), None);
     }
@@ -133,14 +135,14 @@ mod tests {
     proptest! {
         #[test]
         fn any_text_is_read(text: String) {
-            prop_assert_eq!(SignIn::read(&text, &FleetKey::random(), Use::Entry), None);
+            prop_assert_eq!(SignIn::read(&text, &FleetKey::random(), Use::Reading), None);
         }
 
         #[test]
         fn any_name_is_kept(name in ".{0,60}") {
             let key = FleetKey::random();
             let one = SignIn { name, ..anna() };
-            prop_assert_eq!(SignIn::read(&one.write(&key, Use::Entry), &key, Use::Entry), Some(one));
+            prop_assert_eq!(SignIn::read(&one.write(&key, Use::Reading), &key, Use::Reading), Some(one));
         }
     }
 }

@@ -9,6 +9,7 @@ use super::auth::{AdminAuth, Administrator, AuthError, is_cross_site, opens_page
 use super::cookie::{SignIn, Use};
 use super::page::{OWN_FILES, html};
 use super::routing::{POST, body, path};
+use crate::shared::domain::ServerRun;
 use crate::shared::run::seconds_since_1970;
 
 /// How long a sign-in holds, in seconds.
@@ -52,10 +53,10 @@ pub fn refuse(error: AuthError, request: &HttpRequest, to: &str) -> HttpResponse
     HttpResponse::from_error(error)
 }
 
-/// The query of a URL that leads the browser of an administrator to a page of another server of the fleet, without
-/// signing in there.
-pub fn entry(auth: &AdminAuth, administrator: Administrator, to: &str) -> String {
-    let entry = signed(auth, administrator, Use::Entry);
+/// The query of a URL that leads the browser of an administrator to a page of this simulation server, without signing in
+/// there.
+pub fn entry(auth: &AdminAuth, administrator: Administrator, server: ServerRun, to: &str) -> String {
+    let entry = signed(auth, administrator, Use::Entry(server));
     form_urlencoded::Serializer::new(String::new())
         .append_pair("entry", &entry)
         .append_pair("to", to)
@@ -90,8 +91,8 @@ async fn sign_in(request: HttpRequest, payload: web::Payload, auth: web::Data<Ad
         }
     }
     let to = destination(&to, &auth);
-    if let Some(entry) = entry.filter(|_| auth.settings.has_fleet) {
-        return enter(&auth, &entry, to);
+    if let Some((entry, server)) = entry.zip(auth.settings.entered) {
+        return enter(&auth, &entry, server, to);
     }
     match auth.reader(&request) {
         Ok(_) => lead(to),
@@ -152,9 +153,10 @@ async fn check_form(request: &HttpRequest, payload: web::Payload, auth: &AdminAu
 }
 
 /// Signs a browser in that a session server of the fleet has led here.
-fn enter(auth: &AdminAuth, entry: &str, to: &str) -> HttpResponse {
+fn enter(auth: &AdminAuth, entry: &str, server: ServerRun, to: &str) -> HttpResponse {
     let now = seconds_since_1970();
-    let Some(entry) = SignIn::read(entry, &auth.settings.key, Use::Entry).filter(|entry| entry.holds(now)) else {
+    let read = SignIn::read(entry, &auth.settings.key, Use::Entry(server));
+    let Some(entry) = read.filter(|entry| entry.holds(now)) else {
         return lead("sign-in");
     };
     let sign_in = SignIn {
