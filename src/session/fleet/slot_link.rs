@@ -19,7 +19,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use tokio::sync::mpsc::UnboundedReceiver;
 use tokio::sync::{oneshot, watch};
-use tokio::time::{sleep, timeout};
+use tokio::time::{Instant, sleep, timeout, timeout_at};
 
 use crate::session::class::{Roster, StopRequest};
 use crate::shared::domain::{
@@ -153,13 +153,16 @@ impl SlotLink {
         let opening = timeout(CONNECT, self.client.ws(&self.url).max_frame_size(MAX_MESSAGE).connect()).await;
         let opened = opening.map_err(|_| LinkError::Broken("no connection in time".to_owned()))?;
         let (_, mut socket) = opened.map_err(|error| LinkError::Broken(error.to_string()))?;
-        let hello: Hello = receive(&mut socket, CONNECT).await?;
+        let mut heard = Instant::now();
+        let hello: Hello = receive(&mut socket, &mut heard, CONNECT).await?;
         send(&mut socket, &hello.prove(&self.key)).await?;
         // A server with another key refuses the proof.
-        let first = receive(&mut socket, CONNECT).await.map_err(|error| match error {
-            LinkError::Refused => LinkError::WrongKey,
-            error => error,
-        })?;
+        let first = receive(&mut socket, &mut heard, CONNECT)
+            .await
+            .map_err(|error| match error {
+                LinkError::Refused => LinkError::WrongKey,
+                error => error,
+            })?;
         Ok((socket, hello, first))
     }
 
@@ -174,13 +177,14 @@ impl SlotLink {
         let mut followed = hello.roster.then(|| Followed::new(self, hello.server));
         self.tell(LinkChange::Up(hello)).await;
         self.tell(LinkChange::Offers(first)).await;
+        let mut heard = Instant::now();
         let mut watching = self.roster.watching();
         if followed.is_some() {
             watching.mark_changed();
         }
         loop {
             tokio::select! {
-                message = receive(&mut socket, SILENCE) => {
+                message = receive(&mut socket, &mut heard, SILENCE) => {
                     match message? {
                         ToSessionServer::Offers(offers) => self.tell(LinkChange::Offers(offers)).await,
                         ToSessionServer::Roster(update) => self.follow(update)?,
@@ -286,13 +290,18 @@ async fn send(socket: &mut Socket, message: &impl Serialize) -> Result<(), LinkE
     sent.map_err(|error| broken(&error))?.map_err(|error| broken(&error))
 }
 
-/// The next message. Pings are answered.
-async fn receive<M: DeserializeOwned>(socket: &mut Socket, limit: Duration) -> Result<M, LinkError> {
+/// The next message, at most this long after the server was `heard` last. Pings are answered.
+async fn receive<M: DeserializeOwned>(
+    socket: &mut Socket,
+    heard: &mut Instant,
+    limit: Duration,
+) -> Result<M, LinkError> {
     let broken = |why: &str| LinkError::Broken(why.to_owned());
     loop {
-        let next = timeout(limit, socket.next())
+        let next = timeout_at(*heard + limit, socket.next())
             .await
             .map_err(|_| broken("it is silent"))?;
+        *heard = Instant::now();
         match next {
             Some(Ok(Frame::Text(text))) => {
                 return serde_json::from_slice(&text).map_err(|error| broken(&error.to_string()));
