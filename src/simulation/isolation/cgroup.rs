@@ -78,7 +78,11 @@ impl Cgroups {
             ("pids.max", (limits.processes + RUNNERS).to_string()),
             ("memory.oom.group", "1".to_owned()),
         ];
-        settings.extend(limits.memory.map(|memory| ("memory.max", (memory << 20).to_string())));
+        if let Some(memory) = limits.memory {
+            settings.push(("memory.max", (memory << 20).to_string()));
+            // Otherwise it would take the machine's swap too.
+            settings.push(("memory.swap.max", "0".to_owned()));
+        }
         settings.extend(
             limits
                 .cores
