@@ -192,7 +192,7 @@ async fn an_image_that_is_too_large_is_told_and_removed() {
     let base: u64 = ask(&["image", "inspect", "--format", "{{.Size}}", NAME])
         .parse()
         .unwrap();
-    let server = server(1).set("container", serde_json::json!({ "imageSize": (base >> 20) + 20 }));
+    let server = server(1);
     for (branch, size) in [("small", "10M"), ("large", "40M")] {
         let line = format!("RUN head -c {size} /dev/zero >/usr/local/file");
         server
@@ -200,7 +200,13 @@ async fn an_image_that_is_too_large_is_told_and_removed() {
             .commit("lab/arm", branch, &[("Dockerfile", &dockerfile(&line))]);
     }
     let server = server.start().await;
-    // The second time too, although Docker has kept the layers.
+    let mut client = Client::start(&server, &arm_at("large")).await;
+    client.patiently("webots:").await;
+    client.leave().await;
+    server.rewrite_config(|config| config["container"] = serde_json::json!({ "imageSize": (base >> 20) + 20 }));
+    let (succeeds, told) = server.upgrade().await;
+    assert!(succeeds, "{told}");
+    // First the one that is there, and then a new one, of which Docker has kept the layers.
     for _ in 0..2 {
         let (told, code) = refused(&server, &arm_at("large")).await;
         assert!(told.contains("container.imageSize"), "{told}");
@@ -296,8 +302,9 @@ async fn an_image_that_a_build_has_pulled_is_removed_too() {
     server.stops().await;
     drop(server);
     let full = server_with(&[]).folder(folder.path()).set("diskReserve", 100_000_000);
-    let _server = full.start().await;
+    let server = full.start().await;
     until("the base is gone", async || !is_there()).await;
+    until("it is told", async || server.log().contains("removed the image")).await;
 }
 
 #[actix_rt::test]

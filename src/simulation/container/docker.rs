@@ -41,6 +41,8 @@ pub enum DockerError {
         command: String,
         /// The last line that it has printed. It may be a text of the project.
         output: String,
+        /// Its standard output: what a query has found, if it has not found all.
+        found: String,
     },
 }
 
@@ -221,18 +223,21 @@ fn note(reason: &mut String, line: &str) {
 fn result(command: String, ran: Result<Ran, RunError>, output: String) -> Result<String, DockerError> {
     match ran {
         Ok(Ran {
-            ending: ExitReason::Code(0),
-            answer,
-        }) => Ok(String::from_utf8_lossy(&answer).into_owned()),
-        Ok(Ran {
             ending: ExitReason::NotStarted,
             ..
         }) => Err(DockerError::NotStarted(format!("there is no {command}"))),
-        Ok(_) => Err(DockerError::Failed { command, output }),
+        Ok(Ran { ending, answer }) => {
+            let found = String::from_utf8_lossy(&answer).into_owned();
+            match ending {
+                ExitReason::Code(0) => Ok(found),
+                _ => Err(DockerError::Failed { command, output, found }),
+            }
+        }
         Err(RunError::Slow(limit)) => Err(DockerError::Slow { command, limit }),
         Err(error @ RunError::TooLong) => Err(DockerError::Failed {
             command,
             output: error.to_string(),
+            found: String::new(),
         }),
         Err(error) => Err(DockerError::NotStarted(error.to_string())),
     }
@@ -242,7 +247,7 @@ fn result(command: String, ran: Result<Ran, RunError>, output: String) -> Result
 impl From<DockerError> for Failure {
     fn from(error: DockerError) -> Self {
         match error {
-            DockerError::Failed { command, output } => {
+            DockerError::Failed { command, output, .. } => {
                 Self::new(Reason::DockerUnavailable, format!("`{command}` failed")).with_output(output)
             }
             error => unavailable(error.to_string()),

@@ -58,10 +58,9 @@ impl Drop for RunningBuild<'_> {
 /// How a Dockerfile names the image of the world's version of Webots.
 const DEFAULT_BASE: [&str; 2] = ["$WEBOTS_DEFAULT_IMAGE", "${WEBOTS_DEFAULT_IMAGE}"];
 /// Formats of `docker image inspect`: the id, which differs from those of later images of the same name, the size in
-/// bytes, and the configuration of the image's programs.
+/// bytes with the configuration of the image's programs.
 const ID: &str = "{{.Id}}";
-const SIZE: &str = "{{.Size}}";
-const CONFIG: &str = "{{json .Config}}";
+const SIZE_AND_CONFIG: &str = "{{.Size}} {{json .Config}}";
 /// The longest version of a world that has an image.
 const MAX_VERSION: usize = 50;
 /// Interval between two looks at the disk of Docker during a build.
@@ -162,6 +161,7 @@ impl Images {
         let this = Arc::clone(self);
         let project = Arc::clone(project);
         let tag = name.clone();
+        let is_projects = build.folder.is_some();
         let job = move |steps: Steps| async move {
             // A build without steps of a project takes seconds, and is as large as the image of Webots.
             if build.folder.is_none() {
@@ -170,11 +170,14 @@ impl Images {
             let _builder = this.builder(address, &steps).await?;
             let done = this.build_now(&tag, &project, build, &steps).await;
             this.store.added();
-            done?;
-            this.check_size(&tag).await
+            done
         };
-        let config = self.made(&name, CONFIG, progress, job).await?;
-        let image = BuiltImage::read(name, &config).map_err(of_project)?;
+        let found = self.made(&name, SIZE_AND_CONFIG, progress, job).await?;
+        let (size, config) = found.split_once(' ').unwrap_or_default();
+        if is_projects {
+            self.check_size(&name, size).await?;
+        }
+        let image = BuiltImage::read(name, config).map_err(of_project)?;
         Ok((image, uses))
     }
 
@@ -256,17 +259,17 @@ impl Images {
         }
     }
 
-    /// Checks the size of an image that was built for a project, and removes the image if it is too large.
-    async fn check_size(&self, name: &str) -> Result<(), Failure> {
+    /// Checks the size in bytes of an image that was built for a project, whenever it is used. Removes one that is too large.
+    async fn check_size(&self, name: &str, size: &str) -> Result<(), Failure> {
         let limit = self.config.container.image_size;
-        let size = self.inspect(name, SIZE).await?;
-        if size.is_none_or(|size| size.parse().is_ok_and(|size: u64| size <= limit << 20)) {
+        if size.parse().is_ok_and(|size: u64| size <= limit << 20) {
             return Ok(());
         }
-        // A large image, on a disk that other builds write to. If it stayed, the next client would get it.
-        self.docker
-            .run(&["image", "rm", name], self.config.timing.build)
-            .await?;
+        // It may be gone already, or take long on a disk that other builds write to. Nobody gets it meanwhile.
+        let removed = self.docker.run(&["image", "rm", name], self.config.timing.build).await;
+        if let Err(error) = removed {
+            log::debug!("{name} is not removed: {error}");
+        }
         let message = format!("The image of this project is larger than {limit} MiB (container.imageSize)");
         Err(Failure::new(Reason::ImageTooLarge, message))
     }

@@ -54,7 +54,7 @@ pub struct ImageUse {
 }
 
 /// An image of this machine, as Docker reports it.
-#[derive(Debug, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 struct Image {
     id: String,
     /// With those that it begins with, in bytes.
@@ -213,7 +213,7 @@ impl ImageStore {
             let is_done = match self.clean().await {
                 Ok(has_room) => has_room,
                 Err(error) => {
-                    // Docker may be away, or prune for another server.
+                    // Docker may be away.
                     log::debug!("images are looked at again later: {error}");
                     false
                 }
@@ -235,7 +235,10 @@ impl ImageStore {
         let mine = format!("label={LABEL}={}", self.owner.0);
         let old = format!("until={minutes}m");
         let prune = ["image", "prune", "--force", "--filter", &mine, "--filter", &old];
-        self.docker.run(&prune, SHORT_TIMEOUT).await?;
+        if let Err(error) = self.docker.run(&prune, SHORT_TIMEOUT).await {
+            // Docker prunes for one at a time.
+            log::debug!("leftovers of builds stay for now: {error}");
+        }
         // Another process of this server may need an image of which it has no container yet.
         let cache = self.config.cache_dir.0.clone();
         if spawn_blocking(move || !has_several_runs(&cache)).await.unwrap_or(false) {
@@ -289,29 +292,33 @@ impl ImageStore {
             let Some(first) = candidates.min_by_key(|image| (self.last_use(image), Reverse(image.layers.len()))) else {
                 return Ok(());
             };
-            if self.remove(first).await? {
-                log::info!("removed the image {}", first.names.join(" "));
-                all = self.all().await?;
+            self.remove(first).await?;
+            let Image { id, names, .. } = first.clone();
+            all = self.all().await?;
+            // Its names, of which Docker removes some with others, tell more than the exit code.
+            if all.iter().any(|image| image.id == id && !image.names.is_empty()) {
+                stays.push(id);
             } else {
-                stays.push(first.id.clone());
+                log::info!("removed the image {}", names.join(" "));
             }
         }
     }
 
-    /// Removes an image with all of its names, unless it is used. Returns whether it did.
-    async fn remove(&self, image: &Image) -> Result<bool, DockerError> {
+    /// Removes an image with all of its names, unless it is used.
+    async fn remove(&self, image: &Image) -> Result<(), DockerError> {
         let of_image = format!("ancestor={}", image.id);
         let users = ["ps", "--all", "--quiet", "--filter", &of_image];
-        let is_used = image.names.iter().any(|name| self.is_in_use(name));
-        if is_used || !self.docker.run(&users, SHORT_TIMEOUT).await?.trim().is_empty() {
-            return Ok(false);
+        let has_containers = !self.docker.run(&users, SHORT_TIMEOUT).await?.trim().is_empty();
+        if has_containers || image.names.iter().any(|name| self.is_in_use(name)) {
+            return Ok(());
         }
         let words: Vec<&str> = ["image", "rm"]
             .into_iter()
             .chain(image.names.iter().map(String::as_str))
             .collect();
-        // A container may just have been created.
-        Ok(self.docker.run(&words, SHORT_TIMEOUT).await.is_ok())
+        // It fails if a container has just been created. On a busy disk it takes minutes.
+        self.docker.run(&words, self.config.timing.build).await.ok();
+        Ok(())
     }
 
     fn prefix(&self) -> String {
@@ -372,7 +379,11 @@ impl ImageStore {
                 .into_iter()
                 .chain(some.iter().copied())
                 .collect();
-            let told = self.docker.run(&words, SHORT_TIMEOUT).await?;
+            let told = match self.docker.run(&words, SHORT_TIMEOUT).await {
+                // Others may be gone meanwhile.
+                Err(DockerError::Failed { found, .. }) if !found.is_empty() => found,
+                told => told?,
+            };
             all.extend(told.lines().filter_map(|line| Image::read(line, &built)));
         }
         Ok(all)
