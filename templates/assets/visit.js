@@ -270,7 +270,7 @@ function transition(state, event, around) {
     case 'waiting':
       return whileWaiting(state, event, around);
     case 'redirected':
-      return event.type === 'tick' && around.now >= state.until ? askOnceThere(state.goal, around) : undefined;
+      return event.type === 'tick' && around.now >= state.until ? askOnceThere(state, around) : undefined;
     case 'connecting':
     case 'starting':
       return whileStarting(state, event, around);
@@ -309,14 +309,14 @@ function ask(goal, { fleet, asked, now }, { waitsFor, line, before = [] } = {}) 
 }
 
 /**
- * Requests a simulation server, if the connection to the session server is broken once that is there again.
- * @param {Goal} goal
+ * Requests another simulation server, if the connection to the session server is broken once that is there again.
+ * @param {Extract<State, { is: 'redirected' }>} state
  * @param {Surroundings} around
  * @returns {Transition}
  */
-function askOnceThere(goal, around) {
+function askOnceThere(state, around) {
   const isThere = around.fleet === 'free' || around.fleet === 'busy';
-  return isThere ? ask(goal, around) : { to: held(goal, { ahead: undefined }) };
+  return isThere ? ask(state.goal, around) : { to: { ...state, until: around.now + FIRST_ATTEMPT } };
 }
 
 /**

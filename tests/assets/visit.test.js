@@ -261,10 +261,12 @@ test('another server is asked for three times at most, after growing pauses', ()
 test('a redirection survives the loss of the session server', () => {
   const visit = connecting().receive(...error('this server is about to stop', DRAINING));
   visit.take({ type: 'disconnected' }).pass(60);
-  assert.equal(visit.state.is, 'asking');
+  assert.equal(visit.state.is, 'redirected', 'it has no place in the line');
   visit.did();
-  visit.take({ type: 'connected' }, { type: 'available', now: true });
+  visit.take({ type: 'connected' }, { type: 'available', now: true }).pass(1);
   assert.deepEqual([visit.state.is, visit.did()], ['asking', ['ask']]);
+  // Nobody who waited in no line is told that it is its turn.
+  assert.deepEqual(visit.answer(SERVER).did(), ['connect']);
 });
 
 test('after a redirection a refusal that is not final is asked about again', () => {
