@@ -175,9 +175,13 @@ impl Roster {
         self.list.lock().links.contains_key(server)
     }
 
-    /// The run of a simulation server that tells its simulations, by its own word.
+    /// The run of a simulation server that tells its simulations, by its own word. `None` if another one tells the same: one
+    /// of them lies.
     pub fn run_of(&self, server: &PublicAddress) -> Option<ServerRun> {
-        self.list.lock().links.get(server).map(|link| link.run)
+        let list = self.list.lock();
+        let run = list.links.get(server)?.run;
+        let tell_it = list.links.values().filter(|link| link.run == run);
+        (tell_it.count() == 1).then_some(run)
     }
 
     /// Adds what a simulation server has told.
@@ -498,6 +502,19 @@ mod tests {
         assert_eq!(roster.all().len(), 2, "a message that is late");
         // One who knows an old version, or that of another run.
         assert!(roster.since(Some(10_000)).all);
+    }
+
+    #[test]
+    fn a_run_that_two_servers_tell_is_neithers() {
+        let roster = Roster::default();
+        let [first, second] = ["host:2000", "host:2001"].map(|server| server.parse::<PublicAddress>().unwrap());
+        let _first = roster.link(first.clone(), ServerRun(1));
+        assert_eq!(
+            (roster.run_of(&first), roster.run_of(&second)),
+            (Some(ServerRun(1)), None)
+        );
+        let _second = roster.link(second.clone(), ServerRun(1));
+        assert_eq!((roster.run_of(&first), roster.run_of(&second)), (None, None));
     }
 
     #[test]
