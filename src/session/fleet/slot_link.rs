@@ -307,7 +307,8 @@ async fn receive<M: DeserializeOwned>(
                 return serde_json::from_slice(&text).map_err(|error| broken(&error.to_string()));
             }
             Some(Ok(Frame::Ping(content))) => {
-                let answered = socket.send(Text::Pong(content)).await;
+                let answered = timeout(limit, socket.send(Text::Pong(content))).await;
+                let answered = answered.map_err(|_| broken("it reads nothing"))?;
                 answered.map_err(|error| broken(&error.to_string()))?;
                 sleep(BETWEEN_MESSAGES).await;
             }

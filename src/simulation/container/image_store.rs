@@ -14,7 +14,7 @@ use parking_lot::Mutex;
 use sha2::{Digest, Sha256};
 use tokio::sync::Notify;
 
-use super::docker::{Docker, DockerError, SHORT_TIMEOUT, docker_disk_fault};
+use super::docker::{Docker, DockerError, SHORT_TIMEOUT, daemon_fault, docker_disk_fault};
 use super::dockerfile::LABEL;
 use super::engine::with_tag;
 use super::owned_resources::ResourceOwner;
@@ -253,10 +253,10 @@ impl ImageStore {
         for name in expected {
             let mark = format!("{}{BASE}{}", self.prefix(), hex::encode(Sha256::digest(&name)));
             let is_there = self.docker.run(&["tag", &name, &mark], SHORT_TIMEOUT).await.is_ok();
-            let mut expected = self.expected.lock();
-            // Else its build has failed, or it is the name of another stage.
-            if is_there || !self.is_in_use(&name) {
-                expected.remove(&name);
+            // Unless Docker does not answer, its build has failed, or it is the name of another stage.
+            let is_missing = !is_there && matches!(spawn_blocking(daemon_fault).await, Ok(None));
+            if is_there || is_missing && !self.is_in_use(&name) {
+                self.expected.lock().remove(&name);
             }
         }
     }
