@@ -100,6 +100,11 @@ async fn what_can_not_be_built_is_told_in_words_and_leaves_nothing() {
             dockerfile("RUN echo 'gcc: not found' && exit 3"),
             "The image of this project can't be built. Its last output: The command",
         ),
+        // The build ends with the code of a shell that does not find a program, and `docker` is there.
+        (
+            dockerfile("RUN no-such-program"),
+            "The image of this project can't be built. Its last output: The command",
+        ),
         (
             "FROM webots-fleet.test/nothing:1\n".to_owned(),
             "webots-fleet.test/nothing:1",

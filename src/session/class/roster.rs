@@ -144,6 +144,8 @@ pub struct RosterTooLarge;
 
 /// Most bytes that the entries of one server take; those of a simulation for each port take less.
 const MAX_OF_SERVER: usize = 64 << 20;
+/// Longest id of a simulation, in bytes; those of our servers have about 25.
+const LONGEST_ID: usize = 100;
 /// Number of entries that are gone and known as such.
 const GONE: usize = 10_000;
 /// Most ids in one order.
@@ -193,6 +195,10 @@ impl Roster {
         // Of a link that has ended.
         if !list.links.contains_key(server) {
             return Ok(());
+        }
+        // Those that are gone are known for a while.
+        if update.simulations.iter().any(|one| one.id.len() > LONGEST_ID) {
+            return Err(RosterTooLarge);
         }
         if update.all {
             let told: HashSet<&String> = update.simulations.iter().map(|one| &one.id).collect();
@@ -544,6 +550,11 @@ mod tests {
             world: "x".repeat(world),
             ..simulation(&id.to_string(), Stage::Running)
         };
+        let long = [simulation(&"1".repeat(LONGEST_ID + 1), Stage::Running)];
+        assert_eq!(
+            roster.update(&server, update(true, long.to_vec(), &[])),
+            Err(RosterTooLarge)
+        );
         let every_port = (0..usize::from(u16::MAX)).map(|id| one(id, 100)).collect();
         assert_eq!(roster.update(&other, update(true, every_port, &[])), Ok(()));
         let mut told = 0;

@@ -108,21 +108,16 @@ impl Docker {
         .map(drop)
     }
 
-    /// The failure of a command: Docker does not answer at this moment, its disk has less than `reserve` MiB left, or else
-    /// `otherwise`, with what the command has printed. What is printed decides nothing: a Dockerfile may print the message
+    /// The failure of a command: Docker does not answer at this moment, its disk has less than `reserve` MiB left, it was too
+    /// slow, or else `otherwise`, with what the command has printed. What is printed decides nothing: a Dockerfile may print the message
     /// of a daemon that is not there.
     pub async fn explain(&self, error: DockerError, reserve: u64, otherwise: Failure) -> Failure {
-        let output = match error {
-            DockerError::NotStarted(_) => return error.into(),
-            DockerError::Slow { .. } => String::new(),
-            DockerError::Failed { output, .. } => output,
-        };
         let fault = spawn_blocking(move || daemon_fault().or_else(|| docker_disk_fault(reserve)));
-        fault
-            .await
-            .ok()
-            .flatten()
-            .unwrap_or_else(|| otherwise.with_output(output))
+        let fault = fault.await.ok().flatten();
+        fault.unwrap_or_else(|| match error {
+            DockerError::Failed { output, .. } => otherwise.with_output(output),
+            error => error.into(),
+        })
     }
 
     /// The specification of a client program of the daemon. Dropping its process group ends only that program.
@@ -222,14 +217,11 @@ fn note(reason: &mut String, line: &str) {
 
 fn result(command: String, ran: Result<Ran, RunError>, output: String) -> Result<String, DockerError> {
     match ran {
-        Ok(Ran {
-            ending: ExitReason::NotStarted,
-            ..
-        }) => Err(DockerError::NotStarted(format!("there is no {command}"))),
         Ok(Ran { ending, answer }) => {
             let found = String::from_utf8_lossy(&answer).into_owned();
             match ending {
                 ExitReason::Code(0) => Ok(found),
+                // Also 127, as if `docker` were not there: a build ends with the code of the step that has failed.
                 _ => Err(DockerError::Failed { command, output, found }),
             }
         }

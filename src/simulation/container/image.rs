@@ -343,6 +343,9 @@ impl Images {
     /// Why an image with these bases was not built, in this step.
     async fn not_built(&self, bases: &[String], step: &str, error: DockerError) -> Failure {
         if let DockerError::Slow { limit, .. } = error {
+            if let Ok(Some(fault)) = spawn_blocking(daemon_fault).await {
+                return fault;
+            }
             let message = format!(
                 "Its image was not ready within {} seconds (timing.build)",
                 limit.as_secs()
