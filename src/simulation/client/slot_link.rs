@@ -109,7 +109,8 @@ impl SlotLink {
                 Ok(ToSimulationServer::KeepReady(KeepReady { keep_ready })) => {
                     self.server.spare_wishes.ask(*id, keep_ready);
                 }
-                Ok(ToSimulationServer::Wishes(wishes)) if self.server.takes_nobody() => {
+                // During a fault they are kept: the session server takes them for known, and a probe may miss a short one.
+                Ok(ToSimulationServer::Wishes(wishes)) if self.server.is_draining() => {
                     let nothing = Wishes {
                         first: Vec::new(),
                         all: 0,
