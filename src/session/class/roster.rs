@@ -139,7 +139,7 @@ pub struct Watching(watch::Sender<usize>);
 
 /// A simulation server tells of more simulations than it can have, or its texts are too long.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
-#[error("its list of simulations exceeds {} MiB", MAX_OF_SERVER >> 20)]
+#[error("its list of simulations exceeds {} MiB, or an id in it {LONGEST_ID} bytes", MAX_OF_SERVER >> 20)]
 pub struct RosterTooLarge;
 
 /// Most bytes that the entries of one server take; those of a simulation for each port take less.

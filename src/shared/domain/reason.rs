@@ -167,7 +167,7 @@ reasons! {
         LaunchFailed = "launch-failed", Server, Elsewhere;
         /// The disk of the server is full.
         DiskFull = "disk-full", Server, Elsewhere;
-        /// The Docker of the server does not answer, or has stopped.
+        /// The Docker of the server does not answer, has stopped, or is too slow.
         DockerUnavailable = "docker-unavailable", Server, Elsewhere;
         /// An error of the server, which its log has.
         ServerFault = "server-fault", Server, Elsewhere;

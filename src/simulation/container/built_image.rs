@@ -11,7 +11,7 @@ use std::time::Duration;
 use serde::Deserialize;
 use serde_json::Value;
 
-use super::docker::{Docker, SHORT_TIMEOUT};
+use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
 use super::dockerfile::NO_VOLUME;
 use super::failures::{of_project, on_thread};
 use super::owned_resources::REMOVE;
@@ -109,7 +109,9 @@ pub async fn export(
     let reserve = config.disk_reserve;
     let create = ["create", "--name", &name, "--network", "none", &image.name, "true"];
     if let Err(error) = docker.run(&create, SHORT_TIMEOUT).await {
-        let otherwise = of_project("Docker can't create a container of the image of this project");
+        let otherwise = error.unless_slow(of_project(
+            "Docker can't create a container of the image of this project",
+        ));
         return Err(docker.explain(error, reserve, otherwise).await);
     }
     let through = project.instance.path().join("copied");
@@ -126,8 +128,12 @@ pub async fn export(
     if let Err(error) = copied {
         let instance = project.instance.path().to_owned();
         let full = on_thread(move || Ok(disk_fault(&instance, reserve))).await?;
+        let why = match &error {
+            DockerError::Slow { limit, .. } => format!("that takes longer than {} seconds", limit.as_secs()),
+            _ => "its Dockerfile has to COPY the project there".to_owned(),
+        };
         let otherwise = of_project(format!(
-            "{} can't be copied out of the image of this project: its Dockerfile has to COPY the project there",
+            "{} can't be copied out of the image of this project: {why}",
             from.display()
         ));
         return Err(match full {

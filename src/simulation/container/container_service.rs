@@ -152,7 +152,7 @@ impl ContainerService {
             .follow(words.map(Into::into).collect(), CREATE_TIMEOUT, |_| ())
             .await;
         if let Err(error) = created {
-            let otherwise = refused_by_docker(is_projects);
+            let otherwise = error.unless_slow(refused_by_docker(is_projects));
             return Err(docker.explain(error, self.config.disk_reserve, otherwise).await);
         }
         drop(turn);

@@ -108,15 +108,16 @@ impl Docker {
         .map(drop)
     }
 
-    /// The failure of a command: Docker does not answer at this moment, its disk has less than `reserve` MiB left, it was too
-    /// slow, or else `otherwise`, with what the command has printed. What is printed decides nothing: a Dockerfile may print the message
+    /// The failure of a command: Docker does not answer at this moment, its disk has less than `reserve` MiB left, or else
+    /// `otherwise`, with what the command has printed. What is printed decides nothing: a Dockerfile may print the message
     /// of a daemon that is not there.
     pub async fn explain(&self, error: DockerError, reserve: u64, otherwise: Failure) -> Failure {
         let fault = spawn_blocking(move || daemon_fault().or_else(|| docker_disk_fault(reserve)));
         let fault = fault.await.ok().flatten();
         fault.unwrap_or_else(|| match error {
+            DockerError::NotStarted(_) => error.into(),
+            DockerError::Slow { .. } => otherwise,
             DockerError::Failed { output, .. } => otherwise.with_output(output),
-            error => error.into(),
         })
     }
 
@@ -232,6 +233,16 @@ fn result(command: String, ran: Result<Ran, RunError>, output: String) -> Result
             found: String::new(),
         }),
         Err(error) => Err(DockerError::NotStarted(error.to_string())),
+    }
+}
+
+impl DockerError {
+    /// The failure of a command whose time does not depend on a project: `otherwise`, unless Docker was too slow.
+    pub fn unless_slow(&self, otherwise: Failure) -> Failure {
+        match self {
+            Self::Slow { .. } => self.clone().into(),
+            _ => otherwise,
+        }
     }
 }
 
