@@ -177,8 +177,8 @@ impl Roster {
         self.list.lock().links.contains_key(server)
     }
 
-    /// The run of a simulation server that tells its simulations, by its own word. `None` if another one tells the same: one
-    /// of them lies.
+    /// The run of a simulation server that tells its simulations, by its own word. `None` if another one tells the same: it
+    /// is listed twice, or one of them lies.
     pub fn run_of(&self, server: &PublicAddress) -> Option<ServerRun> {
         let list = self.list.lock();
         let run = list.links.get(server)?.run;

@@ -95,7 +95,7 @@ type Socket = Framed<BoxedSocket, Codec>;
 const MAX_MESSAGE: usize = 1024 * 1024;
 /// Timeout of a new connection, and of the first messages on it.
 const CONNECT: Duration = Duration::from_secs(5);
-/// A server that sends or receives nothing for this long is gone. It pings more often.
+/// A server that sends nothing, or reads nothing, for this long is gone. By default it pings each 20 seconds.
 const SILENCE: Duration = Duration::from_mins(2);
 /// Pause after a connection has broken.
 const PAUSE: Duration = Duration::from_millis(500);

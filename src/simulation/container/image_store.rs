@@ -292,8 +292,11 @@ impl ImageStore {
             let Some(first) = candidates.min_by_key(|image| (self.last_use(image), Reverse(image.layers.len()))) else {
                 return Ok(());
             };
-            self.remove(first).await?;
             let Image { id, names, .. } = first.clone();
+            if !self.remove(first).await? {
+                stays.push(id);
+                continue;
+            }
             all = self.all().await?;
             // Its names, of which Docker removes some with others, tell more than the exit code.
             if all.iter().any(|image| image.id == id && !image.names.is_empty()) {
@@ -304,13 +307,13 @@ impl ImageStore {
         }
     }
 
-    /// Removes an image with all of its names, unless it is used.
-    async fn remove(&self, image: &Image) -> Result<(), DockerError> {
+    /// Removes an image with all of its names, unless it is used. Returns whether it has tried.
+    async fn remove(&self, image: &Image) -> Result<bool, DockerError> {
         let of_image = format!("ancestor={}", image.id);
         let users = ["ps", "--all", "--quiet", "--filter", &of_image];
         let has_containers = !self.docker.run(&users, SHORT_TIMEOUT).await?.trim().is_empty();
         if has_containers || image.names.iter().any(|name| self.is_in_use(name)) {
-            return Ok(());
+            return Ok(false);
         }
         let words: Vec<&str> = ["image", "rm"]
             .into_iter()
@@ -318,7 +321,7 @@ impl ImageStore {
             .collect();
         // It fails if a container has just been created. On a busy disk it takes minutes.
         self.docker.run(&words, self.config.timing.build).await.ok();
-        Ok(())
+        Ok(true)
     }
 
     fn prefix(&self) -> String {
