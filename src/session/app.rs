@@ -174,7 +174,7 @@ fn assemble(
         tokens: config.api_tokens.clone(),
         key: key.clone(),
         has_fleet: config.fleet_key.is_some(),
-        entered: None,
+        server_run: None,
         port: config.port,
         ssl: config.ssl,
         trusted_proxies: config.trusted_proxies.clone(),

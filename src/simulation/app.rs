@@ -532,7 +532,7 @@ fn admin_auth(config: &SimulationConfig, (fleet_key, run): (Option<&FleetKey>, S
         tokens: config.api_tokens.clone(),
         key: fleet_key.cloned().unwrap_or_else(|| FleetKey::new(sign_in)),
         has_fleet: fleet_key.is_some(),
-        entered: fleet_key.map(|_| run),
+        server_run: fleet_key.map(|_| run),
         port: config.port,
         ssl: config.ssl,
         trusted_proxies: config.trusted_proxies.clone(),

@@ -39,7 +39,7 @@ pub struct AuthSettings {
     /// Whether the key is that of a fleet.
     pub has_fleet: bool,
     /// The run of a simulation server with that key, to which session servers lead signed-in browsers.
-    pub entered: Option<ServerRun>,
+    pub server_run: Option<ServerRun>,
     /// The key `port`.
     pub port: u16,
     /// Whether browsers send the cookie over encrypted connections only.

@@ -91,7 +91,7 @@ async fn sign_in(request: HttpRequest, payload: web::Payload, auth: web::Data<Ad
         }
     }
     let to = destination(&to, &auth);
-    if let Some((entry, server)) = entry.zip(auth.settings.entered) {
+    if let Some((entry, server)) = entry.zip(auth.settings.server_run) {
         return enter(&auth, &entry, server, to);
     }
     match auth.reader(&request) {
