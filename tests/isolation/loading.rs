@@ -54,11 +54,11 @@ async fn whoever_joins_a_world_that_is_being_loaded_gets_its_scene() {
             let webots = Webots::launcher();
             let files = [
                 // Long enough that a busy machine asks while it downloads.
-                ("worlds/a.wbt", &*slow("download=2 load=1")),
-                ("worlds/b.wbt", &*slow("load=0.5")),
+                ("worlds/a.wbt", &*slow("download=2 load=1.5")),
+                ("worlds/b.wbt", &*slow("load=1.5")),
             ];
             stage.forge.commit("lab/arm", "slow", &files);
-            // The first load takes longer than a running Webots may hang.
+            // Each load takes longer than a running Webots may hang.
             let builder = stage
                 .builder(&webots, level)
                 .before(user)
