@@ -638,12 +638,13 @@ async fn an_upgrade_of_a_simulation_server_is_no_failure() {
         })
         .await;
     }
-    // One of the oldest process is stopped through the newest. Until that has a link, the list is still that of the one before.
+    // One of the oldest process is stopped through the newest, which has a link now: before, the list was that of the one before.
+    let links = || server.log().matches("is a session server, for whose line").count();
+    until("each process has had a link", async || links() == 4).await;
+    until_class(&session, 3).await;
     let path = format!("/simulations/{}/stop", students[0].id());
-    until("it is stopped", async || {
-        send(&session, &path, TOKEN, &json!({})).await.0 == 202
-    })
-    .await;
+    let (status, text) = send(&session, &path, TOKEN, &json!({})).await;
+    assert_eq!(status, 202, "{text}");
     students[0].until(TOLD).await;
     until_class(&session, 2).await;
     assert_eq!(session.status().await["changes"], changes);

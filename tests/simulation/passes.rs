@@ -9,7 +9,7 @@ use webots_fleet::shared::domain::{
 
 use super::readings::gpu_driver;
 use crate::support::program::{Builder, Server};
-use crate::support::{Client, SOON, arm, arm_at, demo_server, make_program, until, world};
+use crate::support::{Client, SOON, Webots, arm, arm_at, demo_server, make_program, until, world};
 
 const SECRET: &str = "a secret of this test";
 
@@ -312,6 +312,27 @@ async fn a_slot_that_was_reserved_is_given_although_the_load_has_risen() {
     assert_eq!(without.reason()["code"], "no-idle-time");
     let mut client = start(&server, &other, &link.pass_for(&other, slots[0].1)).await;
     client.until("session: ").await;
+}
+
+#[actix_rt::test]
+async fn who_comes_during_a_fault_gets_a_slot_after_it() {
+    let webots = Webots::launcher();
+    let server = reserving()
+        .set("maxConnections", 1)
+        .set("webots", webots.path().to_str());
+    let server = server.start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("webots:").await;
+    let away = webots.path().with_file_name("away");
+    std::fs::rename(webots.path(), &away).unwrap();
+    until("it is not ready", async || server.health().await.0 == 503).await;
+    let mut link = Link::open(&server).await;
+    link.want(&[(1, 0)]).await;
+    assert_eq!(link.offers().await.offers, []);
+    std::fs::rename(&away, webots.path()).unwrap();
+    until("it is ready", async || server.health().await.0 == 200).await;
+    client.leave().await;
+    assert_eq!(link.slots().await[0].0, 1);
 }
 
 #[actix_rt::test]

@@ -104,8 +104,8 @@ async fn one_late_answer_of_docker_refuses_nobody_and_two_do() {
 async fn a_docker_that_stops_when_it_is_asked_for_an_image_is_told_as_such() {
     let folder = tempfile::tempdir().unwrap();
     // Only a stub stops at a given command. From then on it answers no more, and notes what it is asked.
-    let program = "cd \"$(dirname \"$0\")\"\n[ \"$1 $2\" != 'network inspect' ] || exit 1\n[ \"$1 $2\" != 'image inspect' ] || touch stopped\n\
-                   [ -f stopped ] || exit 0\necho \"$*\" >>asked\nexit 1";
+    let program = "cd \"$(dirname \"$0\")\"\n[ \"$1 $2\" != 'network inspect' ] || exit 1\n\
+                   [ \"$1 $2\" != 'image inspect' ] || touch stopped\n[ -f stopped ] || exit 0\necho \"$*\" >>asked\nexit 1";
     make_program(&folder.path().join("docker"), program);
     let path = format!("{}:{}", folder.path().display(), std::env::var("PATH").unwrap());
     let server = demo_server(1).set("isolation", "container").set("webots", Value::Null);
